@@ -14,38 +14,38 @@ from numpy.typing import NDArray
 Scene: TypeAlias = Mapping[str, NDArray[Any]]
 
 DECIDED = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
-"""Colours by `stlc.controller.guard.guard.SOURCES`; told apart by the colour-blind, too."""
+"""Colours by `stlc.controller.guard.guard.SOURCES`; distinguishable for colour-blind readers."""
 DECIDERS = ("policy", "backup", "safest prefix", "polished plan")
-"""The same in words."""
+"""Labels of the colours."""
 VIOLATED = "#c4161c"
-"""Of what is violated, and of a plan that was rejected; far darker than the backup's orange."""
+"""Colour of violations and of rejected plans; far darker than the backup's orange."""
 GROUND, WALL, STONE, GOAL, WATER, BANK, CHARGE = (
     *("#f1f3f5", "#9aa0aa", "#8a8f98", "#009e73", "#e8f0f7", "#c9d2bf", "#f0d58a"),
 )
 """Colours of surroundings: floors, walls and obstacles in greys, goals in green."""
 ROAD, STOP_LIGHT = "#e3e5e8", "#e5383b"
 NOTE = "#4a4f57"
-"""Of small writing."""
+"""Colour of small text."""
 FADED = 0.75
-"""Opacity of a path behind an agent: weaker, the policy's would look like that of a repaired plan."""
+"""Opacity of an agent's past path; a weaker one would make the policy's colour look like plan repair's."""
 
 
 def deciders(scene: Scene, index: int, agents: int) -> NDArray[np.int64]:
-    """Sources of the decisions at frame `index`, (agents,); the policy where none was recorded."""
+    """Decision sources at frame `index`, (agents,); the policy where none was recorded."""
     if "decision" not in scene:
         return np.zeros(agents, dtype=np.int64)
     return np.asarray(scene["decision"][index], dtype=np.int64)
 
 
 def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, frames: int) -> None:
-    """Draw the last so many frames of every agent's path, each stretch in the colour of who decided it.
+    """Draw the last `frames` frames of every agent's path, coloured by the source of the decision.
 
     Args:
         axes: to draw on.
-        paths: where agents are in the picture, (frames, agents, 2); NaN breaks a path.
+        paths: picture coordinates of agents, (frames, agents, 2); NaN breaks a path.
         scene: for its `decision`.
         index: the present frame.
-        frames: how many are seen behind it.
+        frames: number of past frames.
     """
     first = max(0, index - frames)
     begin, end = paths[first:index], paths[first + 1 : index + 1]
@@ -65,13 +65,13 @@ Placed: TypeAlias = "Callable[[NDArray[np.float64]], NDArray[np.float64]]"
 
 
 def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> None:
-    """Draw what guards replaced at frame `index`: the rejected plan dashed, the one in its place solid.
+    """Draw the guard's interventions at frame `index`: the rejected plan dashed, its replacement solid.
 
     Args:
         axes: to draw on.
         scene: for its `rejected` and `taken`, (frames, agents, k, 2 or 3), where they were recorded.
         index: the present frame.
-        placed: places of the world, (agents, k, 2 or 3), in the picture, (agents, k, 2); NaN breaks a line.
+        placed: map from world (agents, k, 2 or 3) to picture coordinates (agents, k, 2); NaN breaks a line.
     """
     if "rejected" not in scene:
         return
@@ -86,7 +86,7 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
 
 
 def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int) -> None:
-    """A ring and the agent's number where what is driven is violated, of agents at places (agents, 2)."""
+    """Draw a ring and the number on each agent in violation, at places (agents, 2)."""
     if "violated" not in scene:
         return
     for agent in np.flatnonzero(scene["violated"][index]):
@@ -97,7 +97,7 @@ def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int)
 
 
 def scale_bar(axes: Any, left: float, height: float, length: float, unit: str = "m") -> None:
-    """Draw a line of that length, in units of the picture, from (left, height) on, with its length above."""
+    """Draw a scale bar of that length, in picture units, from (left, height), with its length above."""
     ends = (left, left, left, left + length, left + length, left + length)
     axes.plot(ends, height + 0.09 * length * np.array([-1, 1, 0, 0, 1, -1]), color=NOTE, lw=1.2, zorder=5)
     words = {"ha": "center", "va": "bottom", "size": 7.5, "color": NOTE}
@@ -106,11 +106,11 @@ def scale_bar(axes: Any, left: float, height: float, length: float, unit: str = 
 
 
 NUMBERED = 8
-"""Agents that carry their number; more of them are too many to be told apart by it."""
+"""Maximum number of agents that are labelled with their number."""
 
 
 def numbers(axes: Any, places: NDArray[np.float64]) -> None:
-    """Write the number of each agent on it, at places (agents, 2), where there are few."""
+    """Label agents at (agents, 2) with their numbers, where there are few."""
     if len(places) <= NUMBERED:
         for agent, (x, y) in enumerate(places):
             words = {"ha": "center", "va": "center", "size": 6.5, "weight": "bold", "color": "white"}
@@ -120,7 +120,7 @@ def numbers(axes: Any, places: NDArray[np.float64]) -> None:
 def outlines(
     axes: Any, shape: NDArray[np.float64], poses: NDArray[np.float64], who: NDArray[np.int64]
 ) -> None:
-    """Draw agents as polygons: `shape` (points, 2) ahead and aside, at poses (agents, 3) of x, y, heading."""
+    """Draw agents as polygons: `shape` (points, 2) forward and left, at poses (agents, 3): x, y, heading."""
     from matplotlib.collections import PolyCollection
 
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -131,7 +131,7 @@ def outlines(
 
 
 def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) -> None:
-    """Draw short lines (k, 2, 2), all as one with gaps."""
+    """Draw short lines (k, 2, 2) as one path with gaps."""
     gaps = np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
     axes.plot(*gaps.reshape(-1, 2).T, color=color, lw=width, zorder=2)
 
@@ -139,5 +139,5 @@ def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) ->
 def pieces(
     axes: Any, places: NDArray[np.float64], piece: NDArray[np.float64], color: str, width: float
 ) -> None:
-    """Draw one short line `piece` (2, 2) at many places (k, 2), for the worlds in older run folders."""
+    """Draw one short line `piece` (2, 2) at many places (k, 2); kept for the worlds in older run folders."""
     segments(axes, places[:, None] + piece, color, width)

@@ -1,4 +1,4 @@
-"""Robots in space: what a world says of its agents so that they can be seen as bodies, links and all."""
+"""Three-dimensional scenes: robots as bodies with their links, and balls for goals and obstacles."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Stage:
 
     Attributes:
         urdf: the description of the robot.
-        joints: angles of its movable joints in the order of the file, radians, (frames, agents, joints).
+        joints: angles of the movable joints in file order, radians, (frames, agents, joints).
         balls: goals and obstacles.
-        reach: metres from the base that are worth seeing.
-        meshes: link -> file of those that come with PyBullet, for a description that has none.
+        reach: radius of the visible space around the base, metres.
+        meshes: link -> mesh file of PyBullet, for a description without meshes.
     """
 
     urdf: Path
@@ -53,4 +53,4 @@ class Staged(Protocol):
 
     @staticmethod
     def stage(scene: Scene) -> Stage:
-        """The robots of snapshots stacked to (frames, …)."""
+        """The robots of stacked snapshots, (frames, …)."""

@@ -1,6 +1,6 @@
-"""Randomness of a world: a stream that its agents share, and one of each agent's own.
+"""Random streams of a world: one shared by its agents, and one per agent.
 
-So what an agent meets does not depend on how many others there are.
+So an agent's random numbers do not depend on the number of other agents.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """Generators of one world, all from the one that it was made with.
+    """Generators of one world, derived from its own generator.
 
     Attributes:
-        shared: for what all agents meet.
-        own: of each agent.
+        shared: generator for draws common to all agents.
+        own: one generator per agent.
     """
 
     shared: torch.Generator
@@ -31,18 +31,18 @@ class Streams:
 
     @classmethod
     def of(cls, generator: torch.Generator, agents: int) -> Streams:
-        """Streams for so many agents; the first ones are those of fewer agents."""
+        """Streams for `agents` agents; the first ones do not depend on their number."""
         base = int(torch.randint(2**62, (), generator=generator))
         made = [seeded(base, key) for key in range(agents + 1)]
         return cls(made[0], tuple(made[1:]))
 
     def states(self, system: System, count: int = 1) -> Tensor:
-        """Initial states as in training, `count` of each agent's own: (agents, count, n) float64."""
+        """Initial states from the training distribution, `count` per agent: (agents, count, n) float64."""
         drawn = [system.sample(count, generator=own, dtype=torch.float64) for own in self.own]
         return torch.stack(drawn)
 
 
 def seeded(base: int, key: int) -> torch.Generator:
-    """A generator that follows from a seed and a number, and shares nothing with those of other numbers."""
+    """Generator derived from a seed and a key, independent for different keys."""
     seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

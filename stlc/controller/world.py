@@ -1,8 +1,8 @@
-"""The world of a deployment: what is true outside the model that the policy plans with.
+"""The world of a deployment: the true environment, which the policy's model may not know.
 
-A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it
-that is imported only when that system is deployed. Without one, independent agents move as the model does and
-meet the `events` of the file.
+A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it,
+imported only when that system is deployed. Without one, independent agents follow the model and meet the
+`events` of the file.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
 
 
 class World(Protocol):
-    """Environment of the agents, with what they cannot plan for; states float64, without timers."""
+    """True environment of the agents, with effects that the model lacks; states float64, without timers."""
 
     def reset(self) -> Tensor:
-        """Begin; (agents, n) states."""
+        """Initial states, (agents, n)."""
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
-        """One step of the truth: (agents, n), (agents, m) -> (agents, n)."""
+        """One true step: (agents, n), (agents, m) -> (agents, n)."""
 
     def progress(self) -> Mapping[str, float]:
         """Progress of the task since `reset`, name -> number."""
 
     def snapshot(self) -> Scene:
-        """Arrays for a picture of this instant, whose shapes stay the same through a deployment.
+        """Arrays for a picture of this instant; their shapes stay constant.
 
-        What belongs to an agent has the agents first: (agents, …).
+        Arrays with an entry per agent have the agents first: (agents, …).
         """
 
     def units(self) -> Mapping[str, str]:
-        """Units of entries of `progress` that have one."""
+        """Units of the entries of `progress` that have one."""
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
@@ -58,40 +58,40 @@ class World(Protocol):
 class Choosing(Protocol):
     """World in which agents choose among options, such as the station to go to.
 
-    A choice is made whenever a plan is, and takes the one that can be planned for best.
+    Agents choose whenever they replan, and take the option with the best plan.
     """
 
     def options(self) -> Tensor:
-        """The present states under every choice, (agents, k, n); option 0 is how things are."""
+        """The present states under every option, (agents, k, n); option 0 is the present state."""
 
     def choose(self, pick: Tensor) -> Tensor:
-        """Every agent takes an option, (agents,) int64; returns the states, (agents, n)."""
+        """Apply every agent's option, (agents,) int64; return the states, (agents, n)."""
 
 
 @runtime_checkable
 class Redrawing(Protocol):
-    """World that can give an agent another start before anything has moved."""
+    """World that can redraw the start of an agent before the first step."""
 
     def redraw(self, rows: Tensor) -> Tensor:
-        """Draw the starts of some agents again, (k,) int64; returns all states, (agents, n).
+        """Redraw the starts of some agents, (k,) int64; return all states, (agents, n).
 
-        Other agents keep theirs, unless they depend on those.
+        Other agents keep theirs, unless they depend on the redrawn ones.
         """
 
 
 @runtime_checkable
 class Charting(Protocol):
-    """World into whose picture plans can be drawn."""
+    """World whose picture can show plans."""
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Places of planned states (agents, k, n) in the present picture, (agents, k, 2 or 3).
+        """Picture coordinates of planned states (agents, k, n): (agents, k, 2 or 3).
 
-        Row by row for the agents, from their present state on; NaN where the states are.
+        Row by row for the agents, from their present state on; NaN where the states are NaN.
         """
 
 
 class WorldType(Protocol):
-    """Constructor of a world, whose randomness comes from `generator` alone."""
+    """Constructor of a world; all its random numbers come from `generator`."""
 
     draw: Callable[[Any, Scene, int], None]
 
@@ -99,7 +99,7 @@ class WorldType(Protocol):
 
 
 class ModelWorld:
-    """Independent agents that move exactly as the model does, and the events of the system file."""
+    """Independent agents that follow the model exactly, with the events of the system file."""
 
     def __init__(self, system: System, agents: int, generator: torch.Generator) -> None:
         self._system, self._agents, self._generator = system, agents, generator
@@ -111,29 +111,29 @@ class ModelWorld:
         self._counts = {event.name: 0.0 for event in self._system.decl.test.events if event.when is not None}
 
     def reset(self) -> Tensor:
-        """Initial states as in training, (agents, n)."""
+        """Initial states from the training distribution, (agents, n)."""
         self._begin()
         self._drawn = self._sampled(self._agents)
         return self._happen(self._drawn)
 
     def redraw(self, rows: Tensor) -> Tensor:
-        """Other initial states for some agents, (k,) -> (agents, n); what happens at once, happens anew."""
+        """Redraw the initial states of some agents, (k,) -> (agents, n), and their events at step 0."""
         self._begin()
         self._drawn = self._drawn.index_copy(0, rows, self._sampled(len(rows)))
         return self._happen(self._drawn)
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
-        """One step of the model, then what happens to whom: (agents, n), (agents, m) -> (agents, n)."""
+        """One step of the model, then the events: (agents, n), (agents, m) -> (agents, n)."""
         moved = self._system.step(x, action)
         self._step += 1
         return self._happen(moved)
 
     def progress(self) -> Mapping[str, float]:
-        """Number of times that each event with a condition has happened, over all agents."""
+        """Number of firings of each conditional event, over all agents."""
         return dict(self._counts)
 
     def units(self) -> Mapping[str, str]:
-        """Counts have none."""
+        """Empty: counts have no unit."""
         return {}
 
     def snapshot(self) -> Scene:
@@ -146,7 +146,7 @@ class ModelWorld:
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
+        """Draw agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
         names, state = scene["names"][index], scene["state"]
         decided = deciders(scene, index, state.shape[1])
         second = min(1, state.shape[2] - 1)
@@ -172,10 +172,10 @@ _METHODS = ("reset", "advance", "progress", "units", "snapshot", "draw")
 
 
 def world_type(decl: SystemDecl) -> WorldType:
-    """The world that a system file names, else `ModelWorld`.
+    """Return the world class that a system file names, else `ModelWorld`.
 
     Raises:
-        SystemFileError: S206, the file or the class cannot be loaded or is no world.
+        SystemFileError: S206, the file or the class cannot be loaded or is not a world.
     """
     return cast(WorldType, ModelWorld) if decl.test.world is None else _load(decl.test.world)
 

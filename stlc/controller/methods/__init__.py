@@ -1,9 +1,4 @@
-"""Training methods and planners: a file each, whose name is that of `--method` and `train: {method: …}`.
-
-A file holds an object `METHOD` with the attributes of `Method`; `stlc.registry.METHODS` finds it by the name
-of the file. Schema, command line and tables read the names from there, without torch. Code that several
-methods share lies in files whose names begin with `_`.
-"""
+"""Training methods and planners, one per file, named as in `--method` and `train: {method: …}`."""
 
 from __future__ import annotations
 
@@ -21,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class Method(Protocol):
-    """A way to a policy."""
+    """A training method or planner."""
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """All numbers of a run, from what the user and the system file say.
+        """Resolve all options of a run from those of the user and the system file.
 
         `stlc.controller.training.config.base_config` gives those that do not depend on the method.
         """
@@ -32,10 +27,10 @@ class Method(Protocol):
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Trainer | None:
-        """The state of a training before its first step; None for a planner, which has nothing to learn."""
+        """The initial state of a training; None for a planner, which has nothing to learn."""
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> Policy:
-        """The policy of a run.
+        """Load the policy of a run.
 
         Raises:
             RunError: R101, the run is damaged or has no checkpoint yet; R102, it is of another task.

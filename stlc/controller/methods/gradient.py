@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 class Gradient(NetworkMethod):
-    """Gradient steps on log-sum-exp robustness with tanh switching; one plan, no search, no mirror."""
+    """Gradient descent on log-sum-exp robustness with tanh switching; one plan, no search, no mirror."""
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Fresh states, or the fixed set of `train: {samples: …}`."""
+        """Options for fresh states, or the fixed training set of `train: {samples: …}`."""
         found = base_config(task, config, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 
     def objective(self, learner: Trainer) -> Objective:
-        """The paper's, whose margin is the gamma of the system file."""
+        """The paper's objective; its margin is the gamma of the system file."""
         return paper_objective(learner.task)
 
 

@@ -1,6 +1,6 @@
-"""Search and distil: failing states are repaired by local search, and the repaired plans are imitated.
+"""Search and distil: plans of failing states are repaired by local search and imitated.
 
-Every few dozen steps fresh states are judged; the failing ones are repaired by a search that starts at the
+Every few dozen steps fresh states are judged; failing ones are repaired by a search that starts from the
 policy's own plan, and repaired plans are imitated for as long as their state still fails (decision 7).
 """
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 
 class Guided(NetworkMethod):
-    """Gradient steps on exact robustness, with local search beside them; several plans, the best is taken."""
+    """Gradient descent on exact robustness, supported by local search; best of several plans."""
 
     searches = True
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Four plans, and as many hard states a step as fresh ones."""
+        """Options for four plans, and as many hard states per step as fresh ones."""
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Exact operators and a saturating hinge at a margin that plans can reach."""
+        """Exact operators and a saturating hinge at a feasible margin."""
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance
         )

@@ -1,4 +1,4 @@
-"""Several trainings at a time, or one by several processes: jobs, Ray, ranks."""
+"""Parallel training: local jobs, Ray, and several ranks for one training."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ if TYPE_CHECKING:
 
 
 def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
-    """The executor of a command: processes of this machine, or a Ray cluster where one is named.
+    """Executor of a command: local processes, or a Ray cluster if an address is given.
 
     Args:
-        workers: processes at a time, here.
+        workers: number of local processes.
         cluster: its address; None for this machine.
-        cores: processors of a job on a cluster, which decides how many run at a time.
-        gpus: graphics processors of a job on a cluster.
+        cores: CPUs per job on a cluster, which limits how many run at a time.
+        gpus: GPUs per job on a cluster.
     """
     if cluster is None:
         from stlc.controller.parallel.jobs import LocalExecutor

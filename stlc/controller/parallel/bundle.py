@@ -1,7 +1,7 @@
-"""Jobs for other machines: what they read travels there, their runs travel back, as archives.
+"""Job bundles for other machines: inputs are sent, and runs returned, as archives.
 
-A worker that sees the caller's folders works in them. Any other makes a mirror of them in a temporary folder,
-in which every file lies under its whole path, so that what files say of one another stays true.
+A worker that shares the caller's file system runs in the caller's folders. Any other recreates them in a
+temporary folder, with every file under its whole path, so that references between files stay valid.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _OTHER_VERSION = 5
 
 @dataclass(frozen=True, slots=True)
 class JobBundle:
-    """A job on its way to a worker.
+    """A job with its input files, for a worker.
 
     Attributes:
         arguments: of `stlc train`.
-        folder: where the caller stands.
+        folder: the caller's working directory.
         runs: the folder of its runs.
-        inputs: files and folders that are read; all absolute.
+        inputs: input files and folders; absolute paths.
         files: an archive of them.
-        probe: a file that only who shares the caller's folders can see.
-        cores: that the job may use.
+        probe: a file visible only to machines that share the caller's file system.
+        cores: number of cores for the job.
         version: of the caller's stlc.
     """
 
@@ -58,7 +58,7 @@ class JobBundle:
 
     @classmethod
     def of(cls, job: Job, cores: int) -> JobBundle:
-        """A job made ready to travel. Raises MissingError (R201) where its runs cannot be written."""
+        """Bundle a job. Raises MissingError (R201) where its runs cannot be written."""
         folder, runs = Path.cwd(), _absolute(job.runs or RUNS)
         inputs = tuple(dict.fromkeys(map(_absolute, job.inputs)))
         probe = runs / f".probe-{secrets.token_hex(8)}"
@@ -70,26 +70,26 @@ class JobBundle:
 
     @property
     def shared(self) -> bool:
-        """True where the caller's folders are seen from here."""
+        """True if this machine shares the caller's file system."""
         seen = (self.folder, self.probe, *self.inputs)
         return all(Path(path).exists() for path in seen)
 
     def close(self) -> None:
-        """Remove the probe."""
+        """Remove the probe file."""
         with suppress(OSError):
             Path(self.probe).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)
 class BundleResult:
-    """Result of a job as a worker sends it back.
+    """Result of a job returned by a worker.
 
     Attributes:
         code: exit code of the training.
         out: its standard output.
         said: the end of its standard error.
-        cores: that it had.
-        run: the path of its run, as the caller would write it; None where nothing has to travel.
+        cores: number of cores it had.
+        run: path of its run on the caller's machine; None where nothing has to be transferred.
         files: an archive of that run.
     """
 
@@ -101,18 +101,18 @@ class BundleResult:
     files: bytes = b""
 
 
-# ---------------------------------------------------------------------- the caller
+# ---------------------------------------------------------------------- caller
 
 
 def _absolute(path: Path) -> Path:
-    """The whole path, without `..`; links stay as they are."""
+    """Absolute path without `..`; links are kept."""
     return Path(os.path.normpath(Path.cwd() / path))
 
 
 def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
-    """Enter the run that a worker sent into the caller's runs, under the next free number.
+    """Store a run sent by a worker among the caller's runs, under the next free number.
 
-    A run that was sent to be gone on with is written over.
+    A resumed run is overwritten.
     """
     document = document_of(found.out)
     if found.run is not None:
@@ -128,11 +128,11 @@ def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
     return JobResult(job, found.code, document, found.said, found.cores)
 
 
-# ---------------------------------------------------------------------- the worker
+# ---------------------------------------------------------------------- worker
 
 
 def run_bundle(bundle: JobBundle) -> BundleResult:
-    """Run a job on this machine, in the caller's folders or in a mirror of them."""
+    """Run a job on this machine, in the caller's folders or in a copy of them."""
     if bundle.version != __version__:
         said = f"{socket.gethostname()} has stlc {__version__}; {bundle.version} is needed"
         return BundleResult(_OTHER_VERSION, "", said, 0)
@@ -156,7 +156,7 @@ def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> Bund
         return back
     run = made[-1].path
     text = (run / RECORD).read_text(encoding="utf-8")
-    write_atomic(run / RECORD, text.replace(f"{root}{os.sep}", "/"))  # paths as the caller knows them
+    write_atomic(run / RECORD, text.replace(f"{root}{os.sep}", "/"))  # paths on the caller's machine
     first, *rest = sorted(run.iterdir(), key=lambda path: path.name == RECORD, reverse=True)
     files = pack({path.name: path for path in (*rest, first)})  # a folder becomes a run with its record
     return BundleResult(back.code, back.out, back.said, back.cores, f"/{run.relative_to(root)}", files)
@@ -165,19 +165,19 @@ def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> Bund
 def _ran(
     arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
 ) -> BundleResult:
-    """Train in a process of its own; one that is called off, or whose probe is gone, may save."""
+    """Train in a subprocess; on cancellation, or when the probe is gone, it may save and exit."""
     process = start(arguments, share, folder)
     try:
         out, said = _awaited(process, probe)
     except KeyboardInterrupt:
-        process.terminate()  # workers of Ray ignore SIGINT, and so would the process
+        process.terminate()  # workers of Ray ignore SIGINT; the process would inherit that
         out, said = process.communicate()
     tail = "\n".join(said.splitlines()[-TAIL:])
     return BundleResult(process.returncode, out, tail, len(share))
 
 
 def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:
-    """Output of a process, awaited in short steps: an interrupt by Ray is not seen within a long one."""
+    """Output of a process, polled in short steps so that an interrupt by Ray is noticed."""
     while True:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=0.5)
@@ -187,7 +187,7 @@ def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, s
 
 @contextmanager
 def claimed(count: int) -> Iterator[frozenset[int]]:
-    """Cores that no other job on this machine has claimed; all, where so many are not free."""
+    """Claim cores that no other job on this machine uses; all cores if too few are free."""
     everything = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     try:
         import fcntl
@@ -196,7 +196,7 @@ def claimed(count: int) -> Iterator[frozenset[int]]:
         return
     try:
         folder = private(Path(tempfile.gettempdir()) / f"stlc-cores-{os.getuid()}").folder
-    except Unusable:  # nothing is written where others may write too
+    except Unusable:  # the lock folder must not be writable by others
         yield frozenset(everything)
         return
     held = {}
@@ -221,12 +221,12 @@ def claimed(count: int) -> Iterator[frozenset[int]]:
 
 
 def mirrored(root: Path, path: str) -> Path:
-    """Place of an absolute path in a mirror."""
+    """Location of an absolute path in the worker's copy."""
     return root / Path(path).relative_to(Path(path).anchor)
 
 
 def pack(entries: dict[str, Path]) -> bytes:
-    """An archive of files and folders, each under its name. Links are followed."""
+    """Archive of files and folders under their names. Links are followed."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz", dereference=True, compresslevel=1) as archive:
         for name, path in entries.items():
@@ -235,22 +235,22 @@ def pack(entries: dict[str, Path]) -> bytes:
 
 
 def unpack(data: bytes, folder: Path) -> None:
-    """Write what an archive holds below a folder. Raises `tarfile.FilterError` for what leads out of it."""
+    """Extract an archive into a folder. Raises `tarfile.FilterError` for paths outside it."""
     with tarfile.open(fileobj=io.BytesIO(data), mode="r:gz") as archive:
         archive.extractall(folder, filter="data")
 
 
-# ---------------------------------------------------------------------- the files of a job
+# ---------------------------------------------------------------------- input files
 
 
 def input_files(
     path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
 ) -> tuple[Path, ...]:
-    """The files behind a training, as far as they can be read: who trains says what is wrong with the rest.
+    """Input files of a training, as far as they can be read; errors are reported by the training itself.
 
     Args:
         path: of the specification.
-        system: instead of the one that the specification names.
+        system: replaces the one named by the specification.
         overrides: of `--set`.
     """
     path = find_spec(path)

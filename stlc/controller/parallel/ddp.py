@@ -1,8 +1,8 @@
-"""Training shared by several processes, as `torchrun` starts them: who is who, and what they tell each other.
+"""Data-parallel training by several processes (`torchrun`): ranks, collectives, agreement.
 
-Every rank draws states of its own, searches on its own, and learns from the mean of all gradients, so that
-all have the same weights. What has to be one thing (steps, margin, when to save, when to stop) is agreed on,
-and the first rank alone writes the run. gloo carries what lies on processors, nccl what lies on GPUs.
+Every rank draws its own states, searches on its own, and learns from the mean of all gradients, so that all
+ranks have the same weights. Decisions that must be equal (steps, margin, when to save, when to stop) are
+agreed on, and only the first rank writes the run. gloo communicates tensors on CPUs, nccl those on GPUs.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from torch import Tensor, nn
 from stlc.diagnostics import Diagnostic, MissingError
 
 PATIENCE = timedelta(minutes=10)
-"""Time that a rank waits for another; building a kernel takes a minute at most."""
+"""Timeout of collective operations; building a kernel takes a minute at most."""
 _SPREAD = 0x9E3779B97F4A7C15
-"""Between the seeds of ranks: 2^64 over the golden ratio (D. Knuth, The Art of Computer Programming 6.4)."""
+"""Seed offset between ranks: 2^64 over the golden ratio (D. Knuth, The Art of Computer Programming 6.4)."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Ranks:
-    """One of several processes that train together; alone it has nobody to talk to.
+    """This process among the ranks of a training; a single one does not communicate.
 
     Attributes:
-        rank: of this process, from 0.
+        rank: index of this process, from 0.
         size: number of processes.
-        local: rank among those of this machine.
+        local: rank on this machine.
     """
 
     rank: int = 0
@@ -50,15 +50,15 @@ class Ranks:
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """The seed of this rank's states and searches; that of the run on the first."""
+        """Seed of this rank's states and searches; the first rank uses the run's seed."""
         return (seed + self.rank * _SPREAD) % 2**63
 
     def device(self, name: str) -> str:
-        """The device of this rank: of several GPUs each takes its own."""
+        """Device of this rank; each rank takes a GPU of its own."""
         return f"cuda:{self.local}" if name == "cuda" and self.size > 1 else name
 
     def learn(self, weights: Iterable[nn.Parameter], value: Tensor) -> Tensor:
-        """Replace the gradients of weights by their mean over ranks; returns the mean of `value`, ()."""
+        """All-reduce the gradients of weights to their mean over ranks; return the mean of `value`, ()."""
         if self.size == 1:
             return value
         slopes = [weight.grad for weight in weights if weight.grad is not None]
@@ -70,25 +70,25 @@ class Ranks:
         return mean.view(())
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """The means of numbers over ranks."""
+        """Means of numbers over ranks."""
         return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
 
     def any(self, flag: bool) -> bool:
-        """True where some rank says so."""
+        """True if the flag is set on any rank."""
         return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
 
     def agree(self, value: float) -> float:
-        """The first rank's number, for all."""
+        """Broadcast the first rank's number."""
         return self._reduced([value if self.first else 0.0], dist.ReduceOp.SUM)[0]
 
     def agree_on(self, module: nn.Module) -> None:
-        """Give a module of every rank the first one's weights."""
+        """Broadcast the first rank's weights of a module."""
         if self.size > 1:
             for part in module.state_dict().values():
                 self._together(lambda part=part: dist.broadcast(part, 0))  # type: ignore[misc]
 
     def agree_text(self, text: str) -> str:
-        """The first rank's text, for all."""
+        """Broadcast the first rank's text."""
         if self.size == 1:
             return text
         data = torch.tensor(list(text.encode()), dtype=torch.uint8)
@@ -98,7 +98,7 @@ class Ranks:
         return bytes(sent.tolist()).decode()
 
     def gather(self, tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
-        """Tensors of the ranks after the first, in their order; on the first alone, [] elsewhere."""
+        """Gather tensors of the ranks after the first, in order, on the first rank; [] elsewhere."""
         if self.first:
             return [self._received(rank) for rank in range(1, self.size)]
         data = save_tensors({name: part.detach().cpu().contiguous() for name, part in tensors.items()})
@@ -124,7 +124,7 @@ class Ranks:
         return found
 
     def _together(self, talk: Callable[[], T]) -> T:
-        """Do what all ranks do at the same time. Raises MissingError (R403) where one is gone."""
+        """Run a collective operation. Raises MissingError (R403) if another rank is gone."""
         try:
             return talk()
         except RuntimeError as error:
@@ -135,20 +135,20 @@ ALONE = Ranks()
 
 
 def expected() -> Ranks:
-    """This process among those that `torchrun` started, by the environment."""
+    """Ranks from the environment variables of `torchrun`."""
     rank, size, local = (int(os.environ.get(name, 0)) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     return Ranks(rank, size, local) if size > 1 else ALONE
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """The ranks of this training, connected while the context is open.
+    """Connect the ranks of this training while the context is open.
 
     Args:
         device: of torch; on `cuda` every rank of a machine takes a GPU of its own.
 
     Raises:
-        MissingError: R403, the others cannot be reached.
+        MissingError: R403, the other ranks cannot be reached.
     """
     ranks = expected()
     if ranks.size == 1:

@@ -1,4 +1,4 @@
-"""Training runs side by side, each in a process of its own: one that breaks off costs none of the others."""
+"""Training runs in parallel, each in a process of its own; a failed one does not affect the others."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from typing import Any, Protocol
 from stlc.stopping import CHILD, PATIENCE, leaving
 
 TAIL = 12
-"""Lines of what a process said that are kept."""
+"""Lines of a process's error output that are kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One run.
+    """A training job.
 
     Attributes:
-        name: by which it is told from the others.
+        name: identifies the job.
         arguments: of `stlc train`, without `--json`.
-        inputs: files and folders that it reads, for machines that do not see them.
+        inputs: input files and folders, for machines without shared file system.
         runs: the folder of its runs, for the same machines.
     """
 
@@ -44,11 +44,11 @@ class JobResult:
     """Result of a job.
 
     Attributes:
-        job: that was run.
+        job: the job.
         code: exit code; negative where a signal ended the process.
-        document: that it printed; None where it did not get so far.
+        document: its JSON output; None without one.
         said: the last lines of its standard error.
-        cores: that it had to itself.
+        cores: number of cores reserved for it.
     """
 
     job: Job
@@ -59,25 +59,25 @@ class JobResult:
 
     @property
     def result(self) -> dict[str, Any]:
-        """Entry of the document on the run; empty without one."""
+        """Entry of the document about the run; empty without one."""
         return (self.document or {}).get("result") or {}
 
     @property
     def why(self) -> str:
-        """Cause of a break-off: findings of the document, else the last words of the process."""
+        """Cause of a failure: findings of the document, else the last lines of the process."""
         findings = (self.document or {}).get("diagnostics") or []
         lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
         return "\n".join(lines) or self.said
 
 
 class Executor(Protocol):
-    """Runs jobs, on this machine or on others."""
+    """Executor of jobs, on this machine or on others."""
 
     def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = ...) -> Iterator[JobResult]:
         """Run jobs and give the result of each as it ends.
 
-        When the caller is interrupted, or wants no more, every process is asked to save and stop, and is
-        waited for.
+        When the caller is interrupted or closes the iterator, every process is asked to save and stop, and
+        awaited.
 
         Args:
             jobs: in order.
@@ -87,9 +87,9 @@ class Executor(Protocol):
 
 @dataclass(slots=True)
 class LocalExecutor:
-    """Processes of this machine, `workers` at a time; of several each keeps to its own share of the cores.
+    """Executor of `workers` local processes at a time; each is pinned to its share of the cores.
 
-    A second interruption ends all processes at once. One object runs one list of jobs.
+    A second interrupt kills all processes. One object runs one list of jobs.
     """
 
     workers: int
@@ -99,7 +99,7 @@ class LocalExecutor:
     shares: SimpleQueue[frozenset[int]] = field(default_factory=SimpleQueue)
 
     def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
-        """Run jobs and give the result of each as it ends; `begun` is called in another thread."""
+        """Run jobs and yield the result of each as it ends; `begun` is called in another thread."""
         for share in core_shares(self.workers):
             self.shares.put(share)
         with ThreadPoolExecutor(self.workers) as pool, leaving(self.kill):
@@ -114,7 +114,7 @@ class LocalExecutor:
                 raise
 
     def send(self, job: Job, begun: Callable[[Job], None]) -> JobResult:
-        """Run one job from beginning to end."""
+        """Run one job to its end."""
         share = self.shares.get()
         try:
             process = self._start(job, share)
@@ -130,7 +130,7 @@ class LocalExecutor:
         return JobResult(job, process.returncode, document_of(out), tail, len(share))
 
     def _start(self, job: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
-        """The process, on its share of the cores; None once everything is to stop."""
+        """Start the process on its share of the cores; None after `stop`."""
         with self.lock:
             if self.stopped:
                 return None
@@ -139,7 +139,7 @@ class LocalExecutor:
         return process
 
     def stop(self) -> None:
-        """Ask every process to save and stop, and wait for it; end it where that is interrupted too."""
+        """Ask every process to save and stop, and wait; a further interrupt kills them."""
         with self.lock:
             self.stopped = True
             going = tuple(self.live)
@@ -154,7 +154,7 @@ class LocalExecutor:
             raise
 
     def kill(self, _code: int = 0) -> None:
-        """End every process at once, with what it has started."""
+        """Kill every process with its children."""
         for process in tuple(self.live):
             with suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -163,12 +163,12 @@ class LocalExecutor:
 def start(
     arguments: Sequence[str], share: frozenset[int] | None = None, folder: Path | None = None
 ) -> subprocess.Popen[str]:
-    """A process that trains.
+    """Start a training process.
 
     Args:
         arguments: of `stlc train`.
-        share: cores that it keeps to; all if None.
-        folder: where it works; here if None.
+        share: cores to pin it to; all if None.
+        folder: working directory; the present one if None.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", "stlc", "train", *arguments, "--json"],
@@ -178,7 +178,7 @@ def start(
         encoding="utf-8",
         env={**os.environ, "PYTHONIOENCODING": "utf-8", CHILD: f"{0.7 * PATIENCE}"},
         cwd=folder,
-        start_new_session=True,  # Ctrl-C reaches it through who started it alone, once
+        start_new_session=True,  # Ctrl-C reaches it once, through the caller
     )
     if share and hasattr(os, "sched_setaffinity"):
         with suppress(OSError):
@@ -187,7 +187,7 @@ def start(
 
 
 def core_shares(jobs: int) -> list[frozenset[int]]:
-    """The cores of this process in `jobs` shares of one size; with more jobs than cores, all in each."""
+    """Equal shares of this process's cores for `jobs` jobs; with more jobs than cores, all cores for each."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     cores = cores or list(range(os.cpu_count() or 1))
     if jobs > len(cores):
@@ -197,7 +197,7 @@ def core_shares(jobs: int) -> list[frozenset[int]]:
 
 
 def document_of(text: str) -> dict[str, Any] | None:
-    """The JSON document that a process printed, if it did."""
+    """JSON document in a process's output; None without one."""
     with suppress(ValueError):
         found = json.loads(text)
         if isinstance(found, dict):

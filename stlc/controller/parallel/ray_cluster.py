@@ -1,4 +1,4 @@
-"""Training runs as tasks of a Ray cluster (`pip install 'stlc[cluster]'`): sent, awaited, brought back."""
+"""Training runs as tasks of a Ray cluster (`pip install 'stlc[cluster]'`)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.diagnostics import Diagnostic, MissingError
 
 LOST = -signal.SIGKILL
-"""Exit code of a job whose worker is gone."""
+"""Exit code of a job whose worker is lost."""
 
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 _PATIENCE = 60.0
-"""Seconds that interrupted trainings have to save."""
+"""Seconds for interrupted trainings to save."""
 
 
 @dataclass(frozen=True, slots=True)
 class RayExecutor:
-    """Tasks of a Ray cluster, as many at a time as it has processors for.
+    """Executor of jobs as Ray tasks, as many at a time as the cluster has CPUs for.
 
     Attributes:
         address: of the cluster; `auto` for the one that this machine belongs to, `local` for this machine.
-        cores: processors of a job.
-        gpus: graphics processors of a job.
+        cores: CPUs per job.
+        gpus: GPUs per job.
     """
 
     address: str
@@ -37,9 +37,9 @@ class RayExecutor:
     gpus: int = 0
 
     def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
-        """Run jobs, each of which names the folder of its runs, and give the result of each as it ends.
+        """Run jobs, each with its folder of runs, and yield the result of each as it ends.
 
-        When the caller is interrupted, or wants no more, what jobs have saved is brought back.
+        When the caller is interrupted or closes the iterator, saved results are fetched.
 
         Raises:
             MissingError: R301, Ray is not installed; R302, there is no such cluster.
@@ -66,7 +66,7 @@ class RayExecutor:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """A job on its way, and what was sent of it."""
+    """A submitted job and its bundle."""
 
     job: Job
     bundle: JobBundle
@@ -96,7 +96,7 @@ def _connected(address: str) -> Any:
 
 
 def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
-    """The result of a job, with its run among those of the caller."""
+    """Result of a job, with its run stored among the caller's runs."""
     try:
         found = ray.get(done)
     except ray.exceptions.RayError as error:
@@ -108,7 +108,7 @@ def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
 
 
 def _call_back(ray: Any, going: dict[Any, _Sent]) -> None:
-    """Ask every job to save and stop, and bring back what it saved."""
+    """Ask every job to save and stop, and fetch what it saved."""
     for each, sent in going.items():
         sent.bundle.close()
         with suppress(Exception):

@@ -1,1 +1,1 @@
-"""From a state to plans."""
+"""Policies: plan networks and policies made from actors."""

@@ -1,6 +1,6 @@
-"""A state becomes a plan: one network proposes several, the monitor picks one.
+"""Policies from states to plans: one network proposes several plans, the monitor selects one.
 
-A continuous function cannot jump from left of an obstacle to right of it; several can, and judging a few
+A continuous function cannot jump from left to right of an obstacle; a set of several can, and judging a few
 plans exactly costs well under a millisecond.
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Policy(Protocol):
-    """Anything that plans: a trained network, or a planner."""
+    """Interface of planners and trained networks."""
 
     def plan(self, x0: Tensor) -> Tensor:
         """Plans in physical units: (B, n) -> (B, T, m)."""
@@ -31,16 +31,16 @@ class Policy(Protocol):
 
 @runtime_checkable
 class SelfJudging(Protocol):
-    """A policy that judges its plan for a task while it chooses it."""
+    """A policy that judges its own plans for a task."""
 
     task: Task
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
+        """The selected plan and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
 
 
 def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-    """The plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
+    """Plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
     if isinstance(policy, SelfJudging) and policy.task is task:
         plans, judged = policy.plan_judged(x0)
         return plans.to(x0.dtype), judged
@@ -49,7 +49,7 @@ def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, PlanVer
 
 
 class ModelRollout:
-    """A policy out of an actor, which gives one action a step: its plan is what it does along the model.
+    """Policy from a one-step actor: the plan is its closed-loop action sequence on the model.
 
     Args:
         actor: states (B, n), timers included, -> actions (B, m) in physical units.
@@ -72,14 +72,14 @@ class ModelRollout:
 
 
 class PlanNetwork(nn.Module):
-    """An MLP from what the policy observes to `plans` open-loop plans of the whole horizon.
+    """MLP from the observation to `plans` open-loop plans over the horizon.
 
-    Where the system declares a mirror, the MLP sees states of one side only, and gives the others the images
-    of their images' plans.
+    Where the system declares a mirror symmetry, states of the other side are mirrored, and so are their
+    plans.
 
     Attributes:
         plans: number of plans.
-        mirror: the system's; None where it has none, or where the method does without.
+        mirror: the system's symmetry; None where it has none, or where the method does not use it.
         centre: mean of the observations over initial states, (k,).
         spread: their standard deviation, (k,).
     """
@@ -103,9 +103,9 @@ class PlanNetwork(nn.Module):
         self.register_buffer("spread", torch.ones(widths[0]))
 
     def normalise(self, x0: Tensor) -> None:
-        """Take the centre and the spread of the inputs from a sample of states, (n, dim).
+        """Set the centre and the spread of the inputs from a sample of states, (n, dim).
 
-        Those of timers are taken from their ranges: at first no mission gets far.
+        For timers they come from their ranges: early in training missions end early.
         """
         observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)
@@ -116,7 +116,7 @@ class PlanNetwork(nn.Module):
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
 
     def forward(self, x0: Tensor) -> Tensor:
-        """All plans, within the bounds of the controls: (B, n) -> (B, plans, T, m)."""
+        """All plans, within the control bounds: (B, n) -> (B, plans, T, m)."""
         x0, swapped = self._folded(x0)
         observed = self._task.system.observe(x0).to(self.centre.dtype)
         raw = self.body((observed - self.centre) / self.spread)
@@ -127,15 +127,15 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """States on the mirror's side, and which of them are images, (B,); as they are without a mirror."""
+        """States mirrored onto one side, and a mask of the mirrored, (B,); unchanged without a mirror."""
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 
 
 class BestOfKPolicy:
-    """The trained policy: the network's plans, and the monitor's choice among them.
+    """Trained policy: the network proposes plans, the monitor selects the best.
 
-    Among plans that satisfy the specification the one with the least performance cost is taken, otherwise the
-    one with the largest exact robustness.
+    Of the plans that satisfy the specification the one with the least performance cost is selected, otherwise
+    the one with the largest exact robustness.
     """
 
     def __init__(self, task: Task, network: PlanNetwork) -> None:
@@ -143,7 +143,7 @@ class BestOfKPolicy:
         self.network = network
 
     def for_task(self, task: Task) -> BestOfKPolicy:
-        """The same network, whose plans are chosen for another task of the same system."""
+        """The same network, selecting plans for another task of the same system."""
         return self if task is self.task else BestOfKPolicy(task, self.network)
 
     @torch.no_grad()
@@ -153,13 +153,13 @@ class BestOfKPolicy:
         return plans.to(x0.dtype)
 
     def plan(self, x0: Tensor) -> Tensor:
-        """The plan to follow, physical units: (B, n) -> (B, T, m)."""
+        """The selected plan, physical units: (B, n) -> (B, T, m)."""
         return self.plan_judged(x0)[0]
 
     __call__ = plan
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
+        """The selected plan and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
         plans = self.candidates(x0)
         batch, count, steps, controls = plans.shape
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.reshape(-1, steps, controls))

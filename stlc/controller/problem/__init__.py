@@ -1,1 +1,1 @@
-"""A task: specification and system joined, and its native kernels."""
+"""Tasks: specification and system joined, and their native kernels."""

@@ -1,8 +1,8 @@
 """Native code of a task, built from its dynamics and requirements: verdicts, local search and gradients.
 
-The verdicts are those of the torch graph, tens of times faster; one training step in torch is some thousand
-small array operations, here it is two calls. Without a compiler, on another device, or for formulas that have
-no C form, torch does the same work, and `torch_reasons` says why.
+Verdicts equal those of the torch graph and are tens of times faster: a training step in torch is about a
+thousand small array operations, here two calls. Without a compiler, on another device, or for formulas
+without C form, torch is used, and `torch_reasons` gives the reason.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Effort of a native local search.
+    """Options of a native local search.
 
     Attributes:
-        generations: of changed plans per row.
-        enough: a row is left alone once its robustness reaches this.
-        seed: of the changes.
-        threads: to share the rows among; the result does not depend on it.
-        stop: ends the climb before all rows are done.
+        generations: number of generations of changed plans per row.
+        enough: target robustness of a row.
+        seed: of the random changes.
+        threads: number of threads; the result does not depend on it.
+        stop: ends the search before all rows are done.
     """
 
     generations: int
@@ -46,18 +46,13 @@ class Effort:
 
 
 def motion_of(system: System) -> Motion:
-    """One exact step of a system, as the C emitters read it."""
+    """One exact step of a system, in the form that the C emitters read."""
     step = system.exact_step
     return Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
 
 
 class NativeJudge:
-    """Judges plans of one task on the processor.
-
-    Attributes:
-        kernel: built for the task's dynamics and requirements.
-        names: of the state columns.
-    """
+    """Native robustness kernel of one task on the CPU."""
 
     def __init__(self, kernel: Kernel, system: System, rules: Sequence[CompiledRequirement]) -> None:
         self.kernel = kernel
@@ -71,7 +66,7 @@ class NativeJudge:
 
     @classmethod
     def of(cls, system: System, rules: Sequence[CompiledRequirement]) -> NativeJudge | None:
-        """The kernel of a system and its requirements; None where torch has to do its work."""
+        """Build the kernel of a system and its requirements; None where torch has to be used."""
         try:
             library = load(emit(motion_of(system), [rule.formula for rule in rules]))
         except Untranslatable:
@@ -82,12 +77,12 @@ class NativeJudge:
         return cls(kernel, system, rules)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement (B, R), and the states (T+1, B) by name where they are wanted.
+        """Robustness per requirement (B, R), and, if `columns`, the states (T+1, B) by name.
 
         Args:
             x0: (B, n); the kernel computes in float64, the results have the dtype of `x0`.
             u: (B, T, m).
-            columns: whether the states are wanted.
+            columns: whether to return the states.
         """
         rho, seen = self.kernel.judge(
             x0.detach().double().numpy(),
@@ -107,13 +102,13 @@ class NativeJudge:
         bank: Tensor,
         effort: Effort,
     ) -> tuple[Tensor, Tensor]:
-        """Improve plans by hill climbing on the exact robustness.
+        """Improve plans by local search on the exact robustness.
 
         Args:
             x0: (B, n).
-            plans: where to start, (B, T, m).
+            plans: initial plans, (B, T, m).
             bank: plans that solved other states, (k, T, m); may be empty.
-            effort: how much is tried.
+            effort: options of the search.
 
         Returns:
             Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
@@ -133,11 +128,11 @@ class NativeJudge:
 
 
 class NativeGradient:
-    """Robustness and states of one task's plans, differentiable by the plans.
+    """Robustness and states of one task's plans, differentiable with respect to the plans.
 
     Attributes:
-        judge: gives the values.
-        adjoint: gives the gradient.
+        judge: computes the values.
+        adjoint: computes the gradient.
     """
 
     def __init__(self, judge: NativeJudge, adjoint: Adjoint) -> None:
@@ -148,7 +143,7 @@ class NativeGradient:
     def of(
         cls, system: System, rules: Sequence[CompiledRequirement], judge: NativeJudge | None
     ) -> NativeGradient | None:
-        """For a system and its requirements; None where torch has to differentiate."""
+        """Build for a system and its requirements; None where torch has to differentiate."""
         if judge is None:
             return None
         fixed = [timer.name for timer in system.timers]
@@ -164,14 +159,14 @@ class NativeGradient:
         Args:
             x0: (B, n), not differentiated.
             u: (B, T, m).
-            slope: of conditions, per unit, in the gradient.
+            slope: backward slope of conditions, per unit.
         """
         each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
         return each, dict(zip(self.judge.names, columns.unbind(0), strict=True))
 
 
 class _Judged(torch.autograd.Function):
-    """Values from `judge`, gradients from `pull`."""
+    """Autograd function: values from `judge`, gradients from `pull`."""
 
     @staticmethod
     def forward(
@@ -203,7 +198,7 @@ class _Judged(torch.autograd.Function):
 
 
 def reason(text: Callable[[], str]) -> str:
-    """Cause why there is no library of a C text."""
+    """Reason why a C text has no library."""
     if compiler() is None:
         return "there is no C compiler"
     try:

@@ -1,8 +1,8 @@
-"""Promises on the mission clock, and how much they are kept with to spare.
+"""Robustness margins of pending `eventually@` goals on the mission clock.
 
-A promise such as `eventually@[0 s, 18 s] [x, y] in b` is kept at the first sample that satisfies it, with
-hardly anything to spare, and from then on the next goal draws. So plans that keep an open promise are told by
-how far they get in, up to gamma, and one that was made to keep it is gone on with while it gets further.
+A goal such as `eventually@[0 s, 18 s] [x, y] in b` is reached at the first sample that satisfies it, with
+almost no margin, and from then on the next goal attracts. So plans that reach a pending goal are compared by
+their margin, up to gamma, and a previous plan that reaches it is kept while its margin increases.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stlc.compile.pipeline import Compiled
 
 HELD = 0.5
-"""A status between minus and plus this is open."""
+"""A status within plus and minus this is pending."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ class PendingGoal:
 
     Attributes:
         status: column of its status.
-        body: what has to hold once.
-        first: step of the mission from which on it counts.
+        body: state formula to be satisfied once.
+        first: first step of the mission at which it counts.
         last: the last such step.
     """
 
@@ -48,15 +48,15 @@ class PendingGoal:
 
 
 class PendingGoals:
-    """The promises of a mission.
+    """The pending goals of a mission.
 
     Attributes:
         clock: column of the mission clock; empty where there is none.
-        items: requirements that are one promise each; those inside other formulas are left alone.
+        items: requirements that are a single goal; goals nested in other formulas are ignored.
     """
 
     def __init__(self, compiled: Compiled, gamma: float) -> None:
-        """`gamma` is what should be spared."""
+        """Collect the goals; `gamma` is the required margin."""
         self._gamma = gamma
         self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
         statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
@@ -95,7 +95,7 @@ class PendingGoals:
         return found
 
     def _margins(self, columns: Mapping[str, Tensor], count: int) -> list[Tensor]:
-        """Of every promise at the first `count` samples, (count, batch) each."""
+        """Margin of every goal at the first `count` samples, (count, batch) each."""
         env = {name: column[:count] for name, column in columns.items()}
         found: list[Tensor] = evaluate([promise.body for promise in self.items], env, ops=TORCH, count=count)
         return found

@@ -1,4 +1,4 @@
-"""Specification and system joined: states to start from, plans to try, and how well they do."""
+"""Task: specification and system joined; initial states, rollouts, robustness and verdicts."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
 
 HARD = Hard()
 MOST_VALUES = 32_000_000
-"""Numbers that torch may hold at a time while it judges plans: 256 MB in float64."""
+"""Maximum number of values that torch holds while it judges plans: 256 MB in float64."""
 FLOAT32_SLACK = 1e-5
-"""Rounding that a float32 rollout may add to a margin that is 0 by construction."""
+"""Float32 rounding tolerated in a margin that is 0 by construction."""
 TIE = 1e-4
-"""Weight of cost where robustness does not differ: it is flat where a deadline cannot be met."""
+"""Weight of the cost between plans of equal robustness, which is flat where a deadline cannot be met."""
 PULL = 0.1
-"""Weight of the pull towards the next goal among the performance terms."""
+"""Weight of the guidance cost towards the next goal among the performance terms."""
 KEPT = 3.0
-"""Weight of what open promises are kept with less than gamma to spare, among the performance terms."""
+"""Weight of the margin shortfall of pending goals below gamma among the performance terms."""
 SHORT = 10.0
-"""Weight of what a mission's plan lacks of gamma among the costs that plans are chosen by."""
+"""Weight of a mission plan's margin shortfall below gamma in the cost that selects plans."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanVerdicts:
-    """Verdicts on a batch of plans, exact semantics, no gradient.
+    """Exact verdicts on a batch of plans, without gradient.
 
     Attributes:
         rho: robustness of the whole specification, (batch,).
-        safe: robustness of phi_safe, (batch,); +inf where nothing is tagged `@safety`.
+        safe: robustness of phi_safe, (batch,); +inf where no requirement is tagged `@safety`.
         requirements: robustness per requirement, before weight and scale, (batch, requirements).
-        plans: what was judged, (batch, T, m).
+        plans: the judged plans, (batch, T, m).
         columns: the predicted states, name -> (time, batch).
     """
 
@@ -65,7 +65,7 @@ class PlanVerdicts:
 
 
 def satisfied(rho: Tensor) -> Tensor:
-    """Satisfaction by robustness: rho >= -1e-6, with float32 rounding allowed for.
+    """Return whether rho >= -1e-6, with tolerance for float32 rounding.
 
     Args:
         rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
@@ -78,12 +78,12 @@ def satisfied(rho: Tensor) -> Tensor:
 
 
 class Task:
-    """Specification and system that a policy is trained for.
+    """A specification compiled for a system: the problem that a policy is trained for.
 
     Attributes:
-        compiled: the specification in steps, its timers included.
-        plain: the system as it is.
-        system: the system, with the timers as its last columns.
+        compiled: the specification in discrete time, with its timers.
+        plain: the system without timers.
+        system: the system with the timers as its last columns.
         graph: robustness of the whole specification.
         safety: robustness of phi_safe.
     """
@@ -109,9 +109,9 @@ class Task:
 
         Args:
             spec: as parsed.
-            system: that it speaks about.
+            system: plant of the specification.
             overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
-            values: parameters that have one value in all trajectories, and that the policy still sees.
+            values: parameters with one fixed value in all trajectories, still observed by the policy.
 
         Raises:
             UsageError: a value does not fit.
@@ -126,12 +126,12 @@ class Task:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Columns of a state: the system's, then the timers."""
+        """State columns: the system's, then the timers."""
         return self.system.names
 
     @property
     def dt(self) -> float:
-        """Step in seconds."""
+        """Time step in seconds."""
         return self.system.dt
 
     @property
@@ -162,9 +162,9 @@ class Task:
         return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """States under a plan: (B, n), (B, T, m) -> (B, T+1, n).
+        """States under plans: (B, n), (B, T, m) -> (B, T+1, n).
 
-        Where nothing is differentiated, plans of up to a horizon are rolled out by the native kernel.
+        Without gradient, plans of up to a horizon are rolled out by the native kernel.
         """
         differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
         apart = differentiated or not switch.exact or u.shape[1] > self.horizon
@@ -187,16 +187,16 @@ class Task:
 
     @cached_property
     def native(self) -> NativeJudge | None:
-        """The kernel that does what needs no gradient; None where torch has to."""
+        """The native kernel for work without gradient; None where torch is used."""
         return NativeJudge.of(self.system, self.rules)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
-        """Robustness and states differentiable by plans, natively; None where torch has to differentiate."""
+        """Native robustness and states, differentiable with respect to plans; None where torch is used."""
         return NativeGradient.of(self.system, self.rules, self.native)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Reasons why torch does the work, for each part of a training; "" where it runs as C.
+        """Reason why torch is used, for each part of a training; "" where it runs as C.
 
         The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.
 
@@ -218,12 +218,12 @@ class Task:
         return {"verdicts": judged, **({"search": judged} if searches else {}), "gradient": gradient}
 
     def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> PlanVerdicts:
-        """Roll plans out exactly and judge them, without gradient.
+        """Roll out and judge plans exactly, without gradient.
 
         Args:
             x0: initial states, (B, n).
             u: plans in physical units, (B, T, m).
-            states: whether the predicted states are wanted; `cost` needs them.
+            states: whether to return the predicted states, which `cost` needs.
 
         Returns:
             The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
@@ -241,7 +241,7 @@ class Task:
         return PlanVerdicts(rho, safe, each, u, columns)
 
     def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement and states, by the native kernel where it can."""
+        """Robustness per requirement and states, by the native kernel where possible."""
         if x0.device.type == "cpu" and self.native is not None:
             return self.native.judge(x0, u, columns=states)
         rows = max(1, MOST_VALUES // self._values_of_a_row)
@@ -262,15 +262,15 @@ class Task:
 
     @cached_property
     def _values_of_a_row(self) -> int:
-        """About how many numbers torch holds for a plan that is judged: every part of the formulas."""
+        """Approximate number of values that torch holds per judged plan: all subformulas."""
         parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
         return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
 
     def cost(self, judged: PlanVerdicts) -> Tensor:
-        """Cost by which satisfying plans are chosen, without gradient: (batch,).
+        """Cost to choose among satisfying plans, without gradient: (batch,).
 
-        These are the performance terms as if every plan were satisfying. On a mission the pull of the next
-        goal draws plans to the edge of what is allowed now, so there it also costs to spare less than gamma.
+        The performance terms as if every plan were satisfying. On a mission the guidance cost of the next
+        goal draws plans to the boundary of the present constraints, so a margin below gamma costs too.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)
@@ -280,7 +280,7 @@ class Task:
             return cost + SHORT * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Performance terms as if every plan were satisfying, with promises and pull of a mission: (batch,).
+        """Performance terms as if every plan were satisfying, with a mission's goals and guidance: (batch,).
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -297,32 +297,32 @@ class Task:
 
     @cached_property
     def promises(self) -> PendingGoals:
-        """Goals of the mission, and the margin that they are to be reached with."""
+        """Pending goals of the mission with their required margin."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _pull(self) -> Program | None:
-        """Distance to the next goal of the mission, sample by sample."""
+        """Guidance cost: distance to the next goal of the mission, per sample."""
         return None if self.compiled.guidance_cost is None else Program({"gap": self.compiled.guidance_cost})
 
     def alive(self, x: Tensor) -> Tensor:
-        """States whose mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""
+        """States from which the mission can still satisfy every requirement: (B, n) -> (B,) booleans."""
         env = {name: column[None] for name, column in zip(self.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
 
 
 def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
-    """One number to choose plans by: the cheapest that satisfies, else the most robust, safe ones first.
+    """Rank plans: the cheapest satisfying one, else the most robust, safe ones first.
 
     Args:
         rho: robustness, any shape.
         cost: performance terms, the same shape.
-        safe: robustness of phi_safe, the same shape; without it no plan is preferred for being safe.
+        safe: robustness of phi_safe, the same shape; without it safety is not considered.
 
     Returns:
         Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and
-        where that is flat falling with cost), 2 less where it is unsafe.
+            where that is flat falling with cost), 2 less where unsafe.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))

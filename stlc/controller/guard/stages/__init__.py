@@ -1,8 +1,8 @@
-"""Stages of guards: a file each, which says to which guards it belongs and when its turn comes.
+"""Stages of guards, one per file; each declares the guards it belongs to and its place in their order.
 
-A guard takes its stages in turn. Each proposes plans for the agents that it may still help, and the plan that
-ranks highest (`stlc.controller.guard.candidates.rank`) is kept. A file holds a class `STAGE`; files whose
-names begin with `_` hold none.
+A guard runs its stages in order. Each proposes plans for the agents that it may still help, and the
+highest-ranked plan (`stlc.controller.guard.candidates.rank`) is kept. A file holds a class `STAGE`; files
+whose names begin with `_` hold none.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ STAGES: PackageRegistry[type[GuardStage]] = PackageRegistry(
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """Everything that the stages of one guard share.
+    """Objects shared by the stages of one guard.
 
     Attributes:
         task: specification and system.
-        policy: finishes prefixes.
+        policy: continues prefixes.
         grid: values of the controls, and lengths of prefixes.
         limits: of a decision.
         guard: name of the guard.
-        generator: of the searches of all stages.
+        generator: random numbers for the searches of all stages.
     """
 
     task: Task
@@ -50,7 +50,7 @@ class Setup:
 
     @property
     def enough(self) -> float:
-        """Robustness at which a plan is left alone."""
+        """Target robustness at which the search for a plan ends."""
         return TO_SPARE * self.task.system.decl.objective.gamma
 
 
@@ -61,9 +61,9 @@ class Rejected:
     Attributes:
         x: states, (agents, n) float64.
         plan: the policy's plans, (agents, T, m); finite.
-        previous: remainders of the plans that were followed until now, (agents, T, m), or None.
+        previous: remainders of the previous plans, (agents, T, m), or None.
         best: the best plans so far, (agents,).
-        tried: plans that the stage before has judged, by groups of agents, where it keeps them.
+        tried: plans judged by the previous stage, by groups of agents, where it keeps them.
     """
 
     x: Tensor
@@ -75,14 +75,14 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """Plans of a group of agents: their rows (k,) among the rejected ones, and candidates (k, choices)."""
+    """Judged plans of a group of agents: rows (k,) among the rejected ones, candidates (k, choices)."""
 
     rows: Tensor
     candidates: Candidates
 
 
 class GuardStage(ABC):
-    """A way to find a better plan.
+    """A stage of a guard: one method to find a better plan.
 
     Attributes:
         turns: name of a guard -> place of the stage in its order.
@@ -92,7 +92,7 @@ class GuardStage(ABC):
 
     @abstractmethod
     def __init__(self, setup: Setup) -> None:
-        """Prepare everything that does not depend on the state."""
+        """Prepare everything that is independent of the state."""
 
     @abstractmethod
     def wanted(self, best: Candidates) -> Tensor:
@@ -100,13 +100,13 @@ class GuardStage(ABC):
 
     @abstractmethod
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The stage's choice for some of the rejected agents: rows (k,) -> candidates (k,).
+        """Propose a plan for some of the rejected agents: rows (k,) -> candidates (k,).
 
-        It may leave the plans that it has judged in `rejected.tried` for the next stage.
+        Judged plans may be left in `rejected.tried` for the next stage.
         """
 
 
 def stages_of(guard: str) -> tuple[type[GuardStage], ...]:
-    """The stages of a guard in their order."""
+    """The stages of a guard in order."""
     found = [stage for stage in map(STAGES.get, STAGES) if guard in stage.turns]
     return tuple(sorted(found, key=lambda stage: stage.turns[guard]))

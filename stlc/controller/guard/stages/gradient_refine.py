@@ -1,10 +1,10 @@
-"""Gradient refinement: gradient steps on the exact robustness, for many plans of a state at once.
+"""Gradient refinement: gradient ascent on the exact robustness, for a batch of plans per state.
 
-A gradient moves all of a plan at once, and a handful of steps mends most plans that miss by little. It sees
-nothing across an obstacle, so it starts from a batch: the plans at hand, and the same with a stretch of time
-changed. Where none of these comes to satisfy, the best are changed and raised again, beside plans that hold
-each control at an end of its range. Of what was found as much is done as is enough, and no more: the rest of
-it the policy's plan keeps.
+A gradient changes a whole plan at once, and a few steps repair most plans with a small violation. Gradients
+do not lead across an obstacle, so ascent starts from a batch: the given plans, and copies perturbed over a
+stretch of time. If none of these satisfies, the best are perturbed and refined again, together with plans
+that hold each control at an end of its range. A repaired plan is moved back towards the policy's plan as far
+as the target robustness allows.
 """
 
 from __future__ import annotations
@@ -34,37 +34,37 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 NEAR = 8
-"""Plans at hand and changes of them, of which a round makes its beginning."""
+"""Size of a round's batch: given plans and perturbations of them."""
 FAR = 24
-"""Plans of every later round that hold controls at ends of their ranges."""
+"""Plans with controls at ends of their ranges, added to every later round."""
 KEPT = 2
-"""Plans of a round that the next begins with, and that are handed on in the end."""
+"""Number of best plans of a round that start the next one or are returned."""
 STEPS = 30
 RATES = 0.1, 0.2, 0.2
-"""Share of its range that the first step of each round moves a control by; it falls to 0 with the last."""
+"""Initial step size of each round, as a share of the control range; it falls to 0 at the last step."""
 SHARES = 8
-"""In how many parts what was changed is tried."""
+"""Number of interpolation steps between the policy's plan and the repaired one."""
 SLOPE = 5.0
-"""Of conditions, per unit, in the gradient."""
+"""Backward slope of conditions, per unit."""
 STEEP = 1e100
-"""Largest slope that counts as a number."""
+"""Gradients of at least this magnitude are set to 0."""
 AGENTS = 256
-"""Agents whose plans are raised side by side, at most."""
+"""Maximum number of agents per batch."""
 SEED = 20_231
 APART = 1e6
-"""Between plans that satisfy phi, those that satisfy phi_safe alone, and the rest."""
+"""Offset between plans that satisfy phi, those that satisfy phi_safe alone, and the rest."""
 
 Numbers: TypeAlias = NDArray[np.float64]
 Pull: TypeAlias = Callable[[Numbers], Numbers]
 
 
 class GradientAscent:
-    """Raises plans of one task; what it gives depends on states and plans alone.
+    """Gradient ascent on plans of one task; deterministic in states and plans.
 
     Args:
         task: specification and system.
-        generator: of the changes, which are drawn once.
-        enough: a state is left alone once one of its plans has this robustness.
+        generator: random numbers of the perturbations, which are drawn once.
+        enough: target robustness; a state is done once one of its plans has it.
     """
 
     def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
@@ -85,12 +85,12 @@ class GradientAscent:
 
     @torch.no_grad()
     def rise(self, x: Tensor, places: Tensor, until: float = math.inf) -> Tensor:
-        """The best plans that gradient steps reach, best first, (agents, 2, T, m) float64.
+        """Refine plans and return the best, best first, (agents, 2, T, m) float64.
 
         Args:
             x: (agents, n) float64.
-            places: plans at hand, (agents, places, T, m); finite.
-            until: no step begins when `perf_counter()` has come to it.
+            places: starting plans, (agents, places, T, m); finite.
+            until: deadline on the clock `perf_counter()`.
         """
         if len(x) == 0:
             return places.new_zeros(0, KEPT, *places.shape[2:], dtype=torch.float64)
@@ -115,13 +115,13 @@ class GradientAscent:
         return best
 
     def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """The best plans (agents, KEPT, T, m) and what they are worth, best first."""
+        """Best plans of one round, (agents, KEPT, T, m), and their values, best first."""
         plans, value = self._raised(x, plans, rate, until)
         order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
         return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
-        """Plans as near to (agents, T, m) on the way to those that were found as still keep the margin."""
+        """Nearest plan to (agents, T, m), on the line to the repaired one, with the target robustness."""
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
         each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))
@@ -131,7 +131,7 @@ class GradientAscent:
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Every plan (agents, k, T, m) at its best, and what that is worth, (agents, k)."""
+        """Best iterate of every plan (agents, k, T, m) and its value, (agents, k)."""
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
         best, value = rows.copy(), np.full(len(rows), -np.inf)
@@ -158,7 +158,7 @@ class GradientAscent:
         return best.reshape(plans.shape), value.reshape(agents, count)
 
     def _worth(self, each: Numbers) -> Numbers:
-        """By robustness where phi holds, below that by robustness where phi_safe holds, else by phi_safe."""
+        """Robustness of phi, plus `APART` where phi holds; that of phi_safe minus `APART` where it fails."""
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
         below = np.where(safe >= -TOLERANCE, rho, safe - APART)
@@ -166,9 +166,9 @@ class GradientAscent:
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        """Robustness per requirement as it counts in the whole, (rows, R), and their gradient by plans.
+        """Scaled robustness per requirement, (rows, R), and its vector-Jacobian product by plans.
 
-        What is no number counts as violated without measure. The gradient is a function of weights (rows, R).
+        NaN counts as -inf. The product is a function of weights (rows, R).
         """
         if self._native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
@@ -187,7 +187,7 @@ class GradientAscent:
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
-        """The same by torch."""
+        """The same in torch."""
         with torch.enable_grad():
             u = u.requires_grad_()
             columns = self.task.system.rollout_columns(x, u, StraightThrough(SLOPE))
@@ -202,14 +202,14 @@ class GradientAscent:
         return each.detach().clone().numpy(), pull
 
     def _changed(self, plans: Numbers) -> Numbers:
-        """Each of the plans (agents, k, T, m), and changes of it, (agents, NEAR, T, m)."""
+        """The plans (agents, k, T, m) and perturbations of them, (agents, NEAR, T, m)."""
         agents, places, *shape = plans.shape
         changed = plans[:, :, None] + self._changes[: NEAR // places]
         changed[:, :, 1:] = self._bounded(changed[:, :, 1:])
         return changed.reshape(agents, -1, *shape)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
-        """Changes of plans, (count, T, m), the first of them none: shifts or noise over stretches of time."""
+        """Perturbations of plans, (count, T, m), the first zero: shifts or noise over stretches of time."""
         steps, controls = self.task.horizon, len(self._low)
         begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()
         length = torch.randint(1, steps + 1, (count, 1, controls), generator=generator).numpy()
@@ -232,7 +232,7 @@ class GradientAscent:
 
 
 class GradientRefine(GuardStage):
-    """Gradient steps from the policy's plan and from the one before, in half of the time."""
+    """Gradient ascent from the policy's plan and from the previous plan, within half of the time."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 10}
 
@@ -241,11 +241,11 @@ class GradientRefine(GuardStage):
         self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Everybody."""
+        """All agents."""
         return torch.ones_like(best.is_safe)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The better of two plans; both are left for the next stage."""
+        """The best refined plan; the two best are left for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
         raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))

@@ -1,4 +1,4 @@
-"""Local search: hill climbing on the exact robustness, from the plans of the stage before."""
+"""Local search on the exact robustness, starting from the plans of the previous stage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LocalSearch(GuardStage):
-    """A search for phi, and for phi_safe alone where that finds nothing safe."""
+    """Local search for phi; for phi_safe alone where that finds nothing safe."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 20}
 
@@ -31,11 +31,11 @@ class LocalSearch(GuardStage):
             self._safe = Searcher(safety_task(task), generator, enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents whose plan satisfies phi by too little."""
+        """Agents whose plan's robustness is below the target."""
         return best.rho < self.whole.enough
 
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
-        """The best plan from any start."""
+        """The best plan over all starts."""
         x, found = rejected.x[rows], rejected.best.of(rows)
         every = torch.arange(len(rows), device=rows.device)
         found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))
@@ -50,7 +50,7 @@ class LocalSearch(GuardStage):
 def best_climbed(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """The best plan an agent of searches from each of its starts, (agents, k, T, m) -> (agents,).
+    """Best plan per agent of local searches from each start: (agents, k, T, m) -> (agents,).
 
     `task`: judges the plans; that of the searcher if None.
     """
@@ -61,14 +61,14 @@ def best_climbed(
 def climbed_from(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """Plans of searches from each of the starts: (agents, k, T, m) -> candidates (agents, k)."""
+    """Results of local search from each start: (agents, k, T, m) -> candidates (agents, k)."""
     rows = x.repeat_interleave(starts.shape[1], 0)
     plans = searcher.at_once(rows, starts.flatten(0, 1), tries=tries).plans.to(x.device)
     return Candidates.judged(task or searcher.task, x, plans.view(starts.shape), REPAIRED)
 
 
 def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
-    """Plans that the stage before has tried for each of the rows, else those at hand: (k, starts, T, m)."""
+    """Starting plans: those tried by the previous stage, else the given ones: (k, starts, T, m)."""
     if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
         order = rejected.tried[0].rows.argsort()
         return rejected.tried[0].candidates.plans[order][rows]

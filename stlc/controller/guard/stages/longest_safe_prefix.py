@@ -1,4 +1,4 @@
-"""Longest safe prefix: the last resort of the paper, where no plan is safe to its end."""
+"""Longest safe prefix: the paper's last resort where no plan is safe over the whole horizon."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LongestSafePrefix(GuardStage):
-    """The plan with the longest safe prefix; of several the most robust, then the latest to fail."""
+    """Plan with the longest safe prefix; ties: the most robust, then the latest violation."""
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
 
@@ -33,14 +33,14 @@ class LongestSafePrefix(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """One plan an agent, of those that prefix shooting has tried."""
+        """One plan per agent, chosen among those of prefix shooting."""
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
         return found.of(rows)
 
     def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
-        """Plans of prefix shooting for all rows: those that it has handed on, and the others made again."""
+        """Plans of prefix shooting for all rows: stored ones, and the others recomputed."""
         missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
         missing[rows] = True
         for tried in rejected.tried:
@@ -56,7 +56,7 @@ class LongestSafePrefix(GuardStage):
     def _safest(self, x: Tensor, candidates: Candidates) -> Candidates:
         agents, choices = candidates.rho.shape
         starts, plans = x.repeat_interleave(choices, 0), candidates.plans.flatten(0, 1)
-        size = max(self.batch // self.task.horizon, 1)  # as every prefix is a trajectory of its own
+        size = max(self.batch // self.task.horizon, 1)  # every prefix is a trajectory of its own
         falls = torch.cat(
             [
                 prefix_robustness(self._formulas, self.task.system.rollout_columns(start, plan))

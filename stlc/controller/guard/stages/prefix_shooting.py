@@ -1,10 +1,9 @@
-"""Prefix shooting: sampled prefixes, finished by the policy (the paper, section "MPC-based Deployment").
+"""Prefix shooting: sampled prefixes, continued by the policy (the paper, section "MPC-based Deployment").
 
-For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), or a sample of
-them where they are too many, is followed from the present state, and the policy plans on from its end. The
-first T0 with a plan that satisfies phi, or else phi_safe, decides. One thing goes beyond the paper (decision
-37): what is left of the plan before is one more choice, so that a safe plan is not lost because its first
-action was taken.
+For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a sample of
+them if that is too many, is applied from the present state, and the policy plans from its end. The first T0
+with a plan that satisfies phi, or else phi_safe, is chosen. One addition to the paper (decision 37): the
+remainder of the previous plan is a candidate too, so that a safe plan is not lost after its first action.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 HANDED_ON = 65_536
-"""Trajectories that are kept for the stage behind, at most; it makes the others again."""
+"""Maximum number of trajectories stored for the next stage; it recomputes the others."""
 
 
 class PrefixShooting(GuardStage):
     """The shortest prefix with a satisfying plan, or else a safe one.
 
-    Among plans of the same rank robustness decides, then the performance terms of the objective, because
-    robustness is flat where a deadline cannot be met, and then closeness to the policy.
+    Ties are broken by robustness, then by the performance terms of the objective, because robustness is flat
+    where a deadline cannot be met, then by closeness to the policy.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
@@ -37,7 +36,7 @@ class PrefixShooting(GuardStage):
     def __init__(self, setup: Setup) -> None:
         self.task, self.policy, self.grid = setup.task, setup.policy, setup.grid
         self.patient = setup.guard != "paper"
-        if self.patient:  # the last resort of another guard: short, but never cut off
+        if self.patient:  # last resort of another guard: few prefixes, no deadline
             grid = setup.grid
             few = tuple(length for length in grid.lengths if grid.count(length) <= setup.limits.prefixes)
             self.grid = replace(grid, lengths=few or grid.lengths[:1])
@@ -47,7 +46,7 @@ class PrefixShooting(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan of the first T0 that has one; agents for which none has keep an unjudged plan."""
+        """The best plan of the first T0 that has one; agents without one get an unjudged plan."""
         deadline = Deadline() if self.patient else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
         todo = torch.arange(len(rows), device=rows.device)
@@ -74,7 +73,7 @@ class PrefixShooting(GuardStage):
     ) -> Iterator[tuple[Tensor, Candidates]]:
         """Candidates of one T0 for agents `rows[todo]`, group by group: positions (k,) and (k, choices).
 
-        Choice 0 begins as the policy's own plan does; the last one is what is left of the plan before.
+        Choice 0 has the prefix of the policy's own plan; the last one is the remainder of the previous plan.
         """
         prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
         for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
@@ -89,9 +88,9 @@ class PrefixShooting(GuardStage):
             yield group, found
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
-        """All plans of one T0, judged; at most `grid.batch` trajectories at a time.
+        """Judged plans of one T0, in batches of at most `grid.batch` trajectories.
 
-        For one agent alone those that there was time for, and at least as many as are judged at a time.
+        For a single agent the deadline is checked after each batch.
         """
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)

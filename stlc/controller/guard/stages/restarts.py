@@ -1,4 +1,4 @@
-"""Random restarts: a search for phi_safe alone that has nothing to do with the policy."""
+"""Random restarts: a search for phi_safe alone that does not use the policy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Restarts(GuardStage):
         return ~best.is_safe & self.rescue
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The plan of the search, whether it is safe or not."""
+        """The plan of the search, safe or not."""
         x = rejected.x[rows]
         plans = solve(self._safety, x, stop=lambda: deadline.over).plans
         return Candidates.judged(self.task, x, plans.to(x.device), REPAIRED)

@@ -1,7 +1,7 @@
-"""Sampled shooting: plans that begin with a few sampled actions and go on as the policy plans from there.
+"""Sampled shooting: a few sampled actions, then the policy's plan from there.
 
-The paper's backup policy tries all prefixes, T0 by T0. Here is a sample of each length, judged in one batch,
-and local search goes on from the best.
+The paper's backup policy tries all prefixes, T0 by T0. Here a sample of each length is judged in one batch,
+and local search starts from the best plans.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 class SampledPrefixes:
-    """Prefixes for one task and policy, drawn once.
+    """Prefixes sampled once for one task and policy.
 
     Args:
         task: specification and system.
-        policy: finishes them.
+        policy: continues them.
         grid: values of the controls, and lengths.
-        most: of one length; where the grid has more, a sample of them.
+        most: maximum number per length; a larger grid is sampled.
     """
 
     def __init__(self, task: Task, policy: Policy, grid: Grid, most: int) -> None:
@@ -48,7 +48,7 @@ class SampledPrefixes:
         self._most = max(grid.batch // max(len(self.heads), 1), 1)
 
     def finished(self, x: Tensor) -> Candidates:
-        """All plans from states (agents, n) float64, (agents, k); `grid.batch` trajectories at a time."""
+        """Judged plans of all prefixes from states (agents, n) float64: (agents, k); by `grid.batch`."""
         return Candidates.concatenated([self._finished(part) for part in torch.split(x, self._most)])
 
     def _finished(self, x: Tensor) -> Candidates:
@@ -70,7 +70,7 @@ class SampledPrefixes:
 
 
 class SampledShooting(GuardStage):
-    """The best of sampled prefixes, and of searches from some of them, for agents whose plan is only safe."""
+    """Best of sampled prefixes and of local searches from some of them, for agents with a plan only safe."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 40}
 
@@ -80,12 +80,12 @@ class SampledShooting(GuardStage):
         self._searcher = Searcher(setup.task, setup.generator, enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents whose plan does not satisfy phi, and is safe where that was searched for before."""
+        """Agents whose plan does not satisfy phi; after a search for phi_safe, only those with a safe one."""
         none = len(self.prefixes.heads) == 0
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan; what is not even safe is no better than nothing."""
+        """The best plan; unsafe plans are left unjudged."""
         found = Candidates.unjudged(rejected.plan[rows])
         if deadline.over:
             return found
