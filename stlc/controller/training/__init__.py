@@ -1,1 +1,1 @@
-"""Training: steps, validation, search for plans, checkpoints."""
+"""Training: gradient steps, validation, search for plans, checkpoints."""

@@ -1,9 +1,9 @@
-"""A time budget as a number of steps that is planned again while training goes on.
+"""Time budget of a training: the number of steps is replanned while it runs.
 
-How long a step takes is known only while it is taken: the machine may be busy, become busy, or become free.
-So the number of steps is re-planned whenever the measured pace says that the budget would be missed. The
-learning rate is a function of the step and of the number of steps planned at that moment, and of nothing
-else: the seed and the `StepSchedule`, which every run records, decide the weights, whatever the clock said.
+The duration of a step is known only from measurement, and the machine's load may change. So the number of
+steps is replanned whenever the measured pace would miss the budget. The learning rate depends only on the
+step and on the number of steps planned at that moment: the seed and the recorded `StepSchedule` determine the
+weights, independently of the clock.
 """
 
 from __future__ import annotations
@@ -22,37 +22,36 @@ if TYPE_CHECKING:
 
 
 Clock = Literal["wall", "processor"]
-"""Quantity that a budget counts: time that passes, or processor time as on an idle machine."""
+"""Clock of a budget: wall time, or processor time as on an idle machine."""
 
 PROVISIONAL = 10_000
-"""Steps that are planned until the first of them have been timed."""
+"""Planned number of steps until the first ones have been timed."""
 FIRST = 10
 """Steps that are timed before the first planning."""
 TOLERANCE = 0.015
-"""Share of the budget by which a run may be foreseen to miss it before it is planned again."""
+"""Predicted miss of the budget that is tolerated without replanning, as a share of the budget."""
 SLACK = 0.1
-"""Share of the time that is left by which a run may be foreseen to miss its budget."""
+"""Predicted miss of the budget that is tolerated, as a share of the remaining time."""
 PATIENCE, HASTE, SOON = 0.05, 0.01, 0.1
-"""Shares of the budget between plannings, and between those of the last share of it (`SOON`)."""
+"""Shares of the budget: between plannings, between those of the final phase, length of that phase."""
 WINDOW = 0.05
-"""Share of the budget over which a step is timed, and at least so many steps as `FIRST`."""
+"""Time window for measuring the step duration, as a share of the budget; at least `FIRST` steps."""
 ROUNDS = 3
-"""Search rounds over which the time that is spent on them is averaged."""
+"""Number of search rounds over which their duration is averaged."""
 FIRST_SEARCH = 1.0
-"""Intervals between search rounds that the first search is expected to take."""
+"""Expected duration of the first search, in intervals between search rounds."""
 
 
 def cores() -> int:
-    """Cores that this process may use: its share, where several of this machine train together."""
+    """Number of cores available to this process: its share, where several train on this machine."""
     found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def processor() -> float:
-    """Seconds that this would have taken on an idle machine.
+    """Seconds of work, as on an idle machine.
 
-    The training thread and the search beside it take their turns with the cores: whichever of the two has
-    more to do is what is waited for. So is a compiler.
+    The larger of this thread's time and all threads' time per core, plus the time of compilers.
     """
     ended = os.times()
     mine = max(time.thread_time(), time.process_time() / cores())
@@ -60,29 +59,29 @@ def processor() -> float:
 
 
 def clock_of(name: Clock) -> Callable[[], float]:
-    """The clock of that name, in seconds from any beginning."""
+    """The clock of that name, in seconds from an arbitrary origin."""
     return processor if name == "processor" else time.perf_counter
 
 
 def verdict_reserve(seconds: float) -> float:
-    """Seconds of a budget that are kept for the verdict on held-out states."""
+    """Seconds of a budget reserved for the evaluation on held-out states."""
     return min(0.08 * seconds, 3.0 + 0.02 * seconds)
 
 
 def simulation_reserve(seconds: float) -> float:
-    """Seconds of a budget that are kept for closed-loop simulations."""
+    """Seconds of a budget reserved for closed-loop simulations."""
     return min(0.15 * seconds, 3.0 + 0.08 * seconds)
 
 
 @dataclass(frozen=True, slots=True)
 class TimeBudget:
-    """Time of a training by its clock.
+    """Time budget of a training.
 
     Attributes:
         now: the clock, in seconds.
-        begun: its reading at the beginning; earlier sessions of the run count.
-        allowed: seconds that the user allows; 0: any number.
-        seconds: of these, those that the training is planned with.
+        begun: its reading at the start, moved back by the time of earlier sessions of the run.
+        allowed: the user's budget in seconds; 0: unlimited.
+        seconds: the part of it available to the training.
     """
 
     now: Callable[[], float]
@@ -98,19 +97,19 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Leave room for the seconds, `late`, by which what surrounds the training exceeds its budget."""
+        """Budget reduced by the predicted overrun `late` of what surrounds the training, in seconds."""
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, begun, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
 
     @property
     def spent(self) -> float:
-        """Seconds since the beginning."""
+        """Seconds since the start."""
         return self.now() - self.begun
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A planning: from `step` on, the run is meant to have `steps` steps."""
+    """A planning: from `step` on, the run has `steps` steps in total."""
 
     step: int
     steps: int
@@ -121,25 +120,25 @@ _TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
 
 @dataclass(frozen=True, slots=True)
 class StepSchedule:
-    """The plannings of a run, in their order; with the seed it decides the weights.
+    """The plannings of a run in order; with the seed they determine the weights.
 
     Attributes:
-        plannings: the first is of step 0; of two of the same step the later one counts.
+        plannings: the first is at step 0; of two at the same step the later one applies.
     """
 
     plannings: tuple[Planned, ...]
 
     @classmethod
     def of(cls, steps: int) -> StepSchedule:
-        """So many steps, known from the start."""
+        """Schedule of a fixed number of steps."""
         return cls((Planned(0, steps),))
 
     @classmethod
     def parse(cls, text: str) -> StepSchedule:
-        """`1200`, or `10000,1240@10,900@455`: 10000 steps, from step 10 on 1240, from step 455 on 900.
+        """Parse `1200`, or `10000,1240@10,900@455`: 10000 steps, from step 10 on 1240, from 455 on 900.
 
         Raises:
-            ValueError: it is no schedule, or its steps do not rise.
+            ValueError: not a schedule, or the steps do not increase.
         """
         if not _TEXT.fullmatch(text):
             raise ValueError("it is neither a number of steps nor a schedule")
@@ -158,7 +157,7 @@ class StepSchedule:
         return ",".join((str(first.steps), *(f"{each.steps}@{each.step}" for each in later)))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
-        """The schedule with a planning more."""
+        """The schedule with a further planning."""
         return StepSchedule((*self.plannings, Planned(step, steps)))
 
     @property
@@ -167,26 +166,26 @@ class StepSchedule:
         return self.plannings[-1].steps
 
     def at(self, step: int) -> int:
-        """Steps that are planned for the run when `step` of them have been done."""
+        """Planned number of steps of the run after `step` steps."""
         return [each.steps for each in self.plannings if each.step <= step][-1]
 
 
 class Pace:
-    """Pace of a run, and the number of steps that a budget allows at that pace.
+    """Measured pace of a run, and the number of steps that fit into the budget.
 
-    A search goes on beside the steps; the round after it, or a checkpoint, waits for its end. How long it
-    takes is counted in steps, and so is what a round itself costs: a machine that becomes twice as slow is
-    expected to be so in everything.
+    The search runs concurrently with the steps; the next round, or a checkpoint, waits for its end. The
+    durations of searches and rounds are measured in steps: a machine that becomes twice as slow is assumed to
+    be so in everything.
     """
 
     def __init__(self, *, every: int, searching: bool, now: float, seconds: float = 0.0) -> None:
-        """A run that begins `now`.
+        """Start measuring at `now`.
 
         Args:
             every: steps between search rounds.
-            searching: whether a search goes on beside the steps.
-            now: seconds, by the clock that all later times are given by.
-            seconds: of the budget; 0 where there is none.
+            searching: whether searches run concurrently with the steps.
+            now: reading of the clock used for all times, in seconds.
+            seconds: the budget; 0 without one.
         """
         self._every = every
         self._searching = searching
@@ -202,7 +201,7 @@ class Pace:
         self._left: float | None = None
 
     def stepped(self, step: int, now: float, *, search_runs: bool) -> None:
-        """A gradient step has ended: the `step`-th, at `now`; whether the search still goes on beside."""
+        """Record the end of gradient step `step` at `now`, and whether the search still runs."""
         self._marks.append((step, now - self._begun - self._apart))
         least = max(WINDOW * self._seconds, 1.0)
         while len(self._marks) > FIRST + 1 and self._marks[-1][1] - self._marks[1][1] >= least:
@@ -211,19 +210,19 @@ class Pace:
             self.searched(step, 0.0)
 
     def searched(self, step: int, waited: float) -> None:
-        """The search beside the steps has ended, at `step`, after so many seconds of waiting for it."""
+        """Record the end of the search at `step`, after `waited` seconds of waiting for it."""
         self._apart += waited
         if self._running and self._last_look is not None and self.per_step > 0.0:
             self._search = step - self._last_look + waited / self.per_step
         self._running = False
 
     def saved(self, seconds: float) -> None:
-        """A checkpoint was written."""
+        """Record the duration of a checkpoint."""
         self._apart += seconds
         self._since_look += seconds
 
     def looked(self, step: int, seconds: float) -> None:
-        """A search round was made at `step`, and the search that it asks for has begun."""
+        """Record the duration of a search round at `step`, which has started a search."""
         self.saved(seconds)
         if self.per_step > 0.0:
             self._rounds.append(self._since_look / self.per_step)
@@ -231,20 +230,20 @@ class Pace:
 
     @property
     def per_step(self) -> float:
-        """Seconds of a gradient step of late; 0 while none has been timed."""
+        """Recent duration of a gradient step in seconds; 0 before one was timed."""
         if len(self._marks) < 2:
             return 0.0
         (first, then), (last, now) = self._marks[0], self._marks[-1]
         return max(now - then, 0.0) / (last - first)
 
     def remaining(self, step: int, steps: int, next_look: int) -> float:
-        """Seconds until a run of `steps` steps ends that has done `step`, its next search round given."""
+        """Predicted seconds from `step` to the end at `steps`, with the next round at `next_look`."""
         if steps < step:
             return 0.0
         looks = max(0, -(-(steps - next_look) // self._every))
         last = next_look + (looks - 1) * self._every
         round_ = sum(self._rounds) / max(1, len(self._rounds))
-        # each round waits for the search of the one before, if that is still going on; the end does so too
+        # each round, and the end, waits for the search of the round before, if that still runs
         waits = max(0, looks - 1) * max(0.0, self._search - self._every)
         if looks and self._running and self._last_look is not None:
             waits += max(0.0, self._search - (next_look - self._last_look))
@@ -253,9 +252,9 @@ class Pace:
         return self.per_step * (steps - step + round_ * looks + waits)
 
     def plan(self, step: int, steps: int, next_look: int, left: float) -> int:
-        """Steps that the run should have, `left` seconds before it must end; `steps` where that is well.
+        """Number of steps of a run with `left` seconds remaining; `steps` unchanged if the prediction fits.
 
-        Never fewer than those that are done, and one at least.
+        At least the steps already done, and at least one.
         """
         cost = self.per_step
         if left > 0.0 and (cost <= 0.0 or (steps > step and not self._due(left))):
@@ -277,11 +276,11 @@ class Pace:
 
     @property
     def planned(self) -> bool:
-        """True once a number of steps was planned for a budget."""
+        """True once steps were planned for a budget."""
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """True once enough has been timed since the last planning to plan anew."""
+        """True once enough was timed since the last planning to replan."""
         if self._left is None:
             first = self._marks[0][1]
             return len(self._marks) > FIRST or self._marks[-1][1] - first >= WINDOW * self._seconds

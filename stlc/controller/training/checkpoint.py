@@ -1,7 +1,7 @@
-"""Checkpoints: tensors as safetensors, facts as JSON, and a pointer that moves last.
+"""Checkpoints: tensors as safetensors, facts as JSON, and a pointer to the latest, updated last.
 
-`ckpt/step-NNNNNN.safetensors` and its `.json` are written whole before `ckpt/last.json` is replaced to name
-them, so a kill or a full disk at any moment leaves the last good checkpoint in place. Nothing is unpickled.
+`ckpt/step-NNNNNN.safetensors` and its `.json` are complete before `ckpt/last.json` is replaced to name them,
+so a kill or a full disk at any moment leaves the last good checkpoint in place. No pickle is used.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 FOLDER = "ckpt"
 POINTER = "last.json"
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RuntimeError)
-"""Errors of reading a text or a tensor that is not what was written."""
+"""Errors raised by damaged JSON or tensor files."""
 _NAME = re.compile(r"step-\d{6,}\.safetensors")
 
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """Saved state of a training: tensors by name, and plain facts."""
+    """Saved state of a training: tensors by name, and scalars."""
 
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
@@ -46,10 +46,10 @@ class Checkpoint:
 def save_checkpoint(
     run: RunDir, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int
 ) -> Path:
-    """Write a checkpoint and point at it; older ones are removed afterwards.
+    """Write a checkpoint, make it the latest, and remove older ones.
 
     Raises:
-        MissingError: R201, there is no room or no right to write; the last good checkpoint stays.
+        MissingError: R201, the disk is full or not writable; the last good checkpoint stays.
     """
     folder = run.path / FOLDER
     folder.mkdir(exist_ok=True)
@@ -67,16 +67,16 @@ def save_checkpoint(
 
 
 def never_saved(run: RunDir) -> bool:
-    """True where no checkpoint of a run was ever written."""
+    """True if the run has never had a checkpoint."""
     return not (run.path / FOLDER).exists()
 
 
 def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:
-    """Read the last checkpoint of a run.
+    """Load the latest checkpoint of a run.
 
     Args:
         run: its folder.
-        spec_hash: SHA-256 of the specification that the weights are for.
+        spec_hash: SHA-256 of the specification.
         system_hash: SHA-256 of the system file.
 
     Raises:
@@ -105,7 +105,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
 
 @contextmanager
 def restoring(run: RunDir) -> Iterator[None]:
-    """Raise RunError (R101) where what a checkpoint holds does not fit what is made of it."""
+    """Raise RunError (R101) where a checkpoint's content does not fit the objects restored from it."""
     try:
         yield
     except _DAMAGE as error:
@@ -113,7 +113,7 @@ def restoring(run: RunDir) -> Iterator[None]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
-    """The facts and the bytes that the pointer names, checked against each other."""
+    """Facts and tensor bytes of the latest checkpoint, verified against each other."""
     try:
         facts = json.loads((folder / POINTER).read_text())
         name = facts["file"]
@@ -142,7 +142,7 @@ def _damaged(folder: Path, why: str) -> Diagnostic:
 
 
 def _shown(folder: Path) -> str:
-    """The folder as it is printed."""
+    """The folder as printed in messages."""
     return f"{RunDir(folder.parent).shown}/{folder.name}"
 
 

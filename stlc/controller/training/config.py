@@ -1,4 +1,4 @@
-"""Options of a training, and the numbers that a method makes of them."""
+"""Training options of the user, and the options of a run resolved from them by a method."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 ENGINE_VERSION = 2
-"""Raised with every change of what the engine reaches; figures that another one made are taken anew."""
+"""Version of the training engine; results of older versions are recomputed."""
 
 DRIVES = 400
-"""Drives under one guard after a training, at most."""
+"""Maximum number of closed-loop runs per guard after a training."""
 HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
-"""Seed of the held-out states: used for reports only, never while training or tuning."""
+"""Seed of the held-out states: used for the final evaluation only, never during training or tuning."""
 
 MISSION_HOLD = 0.7
-"""On missions the states to learn from change while a policy gets further: the rate falls late."""
+"""Share of steps at peak learning rate on missions, whose training states change as the policy improves."""
 MISSION_MOST = 128
-"""Failing states of missions are alike: many stand where nothing can be done any more."""
+"""Maximum number of repaired states on missions, whose failing states are often infeasible and alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +34,17 @@ class TrainConfig:
 
     Attributes:
         method: a name of `stlc.registry.METHODS`.
-        budget: seconds, the verdict included; planned as steps again and again.
+        budget: seconds, final evaluation included; converted to steps repeatedly.
         clock: of the budget.
-        steps: of the optimiser, or the schedule of a run with a budget; wins over `budget`.
-        seed: of everything random in training.
-        device: of torch.
-        threads: of torch; None leaves a core to the search beside it.
+        steps: optimiser steps, or the schedule of a run with a budget; takes precedence over `budget`.
+        seed: of all random numbers in training.
+        device: torch device.
+        threads: of torch; None leaves one core to the concurrent search.
         plans: number of plans of the network.
         lr: peak learning rate.
-        batch: fresh states a step.
-        held_out: states of the last verdict.
-        drives: after the training, under one guard at most; 0: none.
+        batch: fresh states per step.
+        held_out: number of held-out states.
+        drives: maximum closed-loop runs per guard after the training; 0: none.
     """
 
     method: str | None = None
@@ -63,33 +63,34 @@ class TrainConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedConfig:
-    """All numbers of a run. They are saved with it.
+    """Resolved options of a run, saved with it.
 
     Attributes:
-        method: as told.
-        seed: as told.
+        method: its name.
+        seed: of all random numbers.
         hidden: widths of the network.
         plans: number of plans of the network.
-        batch: fresh states a step.
-        hard: solved hard states a step, once there are any.
+        batch: fresh states per step.
+        hard: solved hard states per step, once there are any.
         lr: peak learning rate.
-        warmup: share of the steps over which it rises.
-        hold: share of the steps over which it stays at its peak; it rises in a fixed number of steps then.
-        clip: bound of the gradient's norm.
-        average: decay of the average of the weights.
-        pool: fresh states that a search round judges.
-        every: steps between search rounds, twice as many where a round repaired little.
-        most: failing states that a round repairs at most.
+        warmup: share of the steps over which the learning rate rises.
+        hold: share of the steps at the peak learning rate; if positive, the rise takes a fixed number of
+            steps.
+        clip: bound on the norm of the gradient.
+        average: decay of the moving average of the weights.
+        pool: fresh states judged per search round.
+        every: steps between search rounds, doubled where a round repaired little.
+        most: maximum number of failing states repaired per round.
         slope: backward slope of switches, per unit.
         imitation: weight of the distance to a repaired plan.
         share: weight of the mean over plans beside the winner's loss.
         performance: factor of the performance terms.
-        held_out: states of the last verdict.
-        threads: of torch; sums over other numbers of them round otherwise. 0 leaves what is set.
+        held_out: number of held-out states.
+        threads: of torch; rounding of sums depends on their number. 0: unchanged.
         samples: size of a fixed training set; 0: fresh states in every step.
-        clock: of budgets and of the times on record.
-        ranks: processes that train together, each with so many states a step.
-        drives: after the training, under one guard at most; 0: none.
+        clock: of budgets and recorded times.
+        ranks: number of processes that train together, each with its own batch.
+        drives: maximum closed-loop runs per guard after the training; 0: none.
     """
 
     method: str
@@ -124,12 +125,12 @@ _MOST = {
     **dict.fromkeys(("warmup", "average"), 1.0),
     "hold": 0.999,
 }
-"""Greatest values, of shares and of what decides how much memory is taken."""
+"""Upper bounds on shares and on options that determine memory use."""
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 
 
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
-    """The same numbers. Raises ValueError where one is of another kind than it must be, or too large."""
+    """Return the options unchanged. Raises ValueError where one has the wrong type or is too large."""
     words = {"method": METHODS.names, "clock": get_args(Clock)}
     for field in fields(ResolvedConfig):
         value = getattr(config, field.name)
@@ -152,7 +153,7 @@ def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
 
 
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
-    """The numbers of a run: the user's words, then the system file's, then those of the method.
+    """Resolve the options of a run: the user's, then the system file's, then those of the method.
 
     Raises:
         UsageError: U101, there is no such method.
@@ -165,14 +166,14 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
 def base_config(
     task: Task, config: TrainConfig, *, batch: int = 1, plans: int = 1, searches: bool = False
 ) -> ResolvedConfig:
-    """The numbers that do not depend on the method.
+    """Resolve the options that do not depend on the method.
 
     Args:
-        task: what is trained for.
-        config: what the user said.
-        batch: fresh states a step, by default.
-        plans: number of plans of the network, by default.
-        searches: whether a search goes on beside the steps: torch leaves a core to it.
+        task: problem to train for.
+        config: the user's options.
+        batch: default number of fresh states per step.
+        plans: default number of plans of the network.
+        searches: whether a search runs concurrently: torch leaves a core to it.
     """
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)
@@ -196,6 +197,6 @@ def base_config(
 
 
 def _threads(*, searching: bool) -> int:
-    """Threads of torch: as they are set, or one less than there are cores where a search runs beside it."""
+    """Threads of torch: the present setting, or the cores less one for a concurrent search."""
     most = int(torch.get_num_threads())
     return max(1, min(most, cores() - 1)) if searching else most

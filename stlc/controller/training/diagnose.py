@@ -1,9 +1,9 @@
-"""Diagnosis of trainings: asymmetric mirrors, steps that are not finite, requirements without a plan.
+"""Divergence diagnosis: mirrors that are no symmetry, non-finite steps, requirements without a plan.
 
 The chain of a training step is network -> plans -> states -> robustness of each requirement and performance
-terms -> gradient; the first link that is no number is named. A search for plans proves nothing where it finds
-none. Bounds do: interval arithmetic over all that a plan may do says how far the states can come within the
-horizon, and so how robust a requirement can be at most.
+terms -> gradient; the first non-finite link is reported. A search that finds no plan proves nothing. Bounds
+do: interval arithmetic over all plans encloses the states reachable within the horizon, and so bounds the
+robustness of a requirement from above.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 HARD = Hard()
 SHOWN = 6
-"""Numbers of a plan that are told."""
+"""Maximum number of entries of a plan in messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,11 @@ class TrainingStep:
     """Inputs of a training step.
 
     Attributes:
-        task: that is trained for.
-        objective: what was minimised.
-        x0: where plans start, (B, n).
+        task: problem that is trained for.
+        objective: the minimised loss.
+        x0: initial states, (B, n).
         u: the network's plans, (B, T, m).
-        number: of the step.
+        number: index of the step.
     """
 
     task: Task
@@ -67,14 +67,14 @@ class TrainingStep:
     def of(
         cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task
     ) -> TrainingStep:
-        """The step with all plans of the network for states (B, n)."""
+        """Step with all plans of the network for states (B, n)."""
         with torch.no_grad():
             plans = network(x0)
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
 
 
 def diagnose(step: TrainingStep) -> StlcError:
-    """The first of what a training step needs that is no number, and where."""
+    """Find the first non-finite link of a training step, and its place."""
     for look in (_plans, _motion, _robustness, _cost):
         found = look(step)
         if found is not None:
@@ -126,9 +126,9 @@ def _motion(step: TrainingStep) -> StlcError | None:
 
 
 def _robustness(step: TrainingStep) -> StlcError | None:
-    """A requirement whose value, or else whose gradient, is no finite number on states that are.
+    """Error for a requirement with non-finite value, or else non-finite gradient, on finite states.
 
-    A value that is infinite spoils the gradients of all requirements, so values come first.
+    An infinite value spoils the gradients of all requirements, so values are checked first.
     """
     looks = [
         _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
@@ -152,7 +152,7 @@ def _robustness(step: TrainingStep) -> StlcError | None:
 
 
 def _cost(step: TrainingStep) -> StlcError | None:
-    """A performance term whose value or gradient is no number."""
+    """Error for a performance term with non-finite value or gradient."""
     declared = step.task.system.decl
     for term in declared.objective.terms:
         alone = replace(declared, objective=replace(declared.objective, terms=(term,)))
@@ -179,7 +179,7 @@ def _cost(step: TrainingStep) -> StlcError | None:
 
 
 def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness per requirement (B, R) and states (T+1, B), differentiable as training has them."""
+    """Robustness per requirement (B, R) and states (T+1, B), differentiable as in training."""
     native = native_rolled(step.task, step.objective, step.x0, u)
     if native is not None:
         return native
@@ -189,7 +189,7 @@ def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """A value per plan (B,) and its gradient by the plan, (B, T, m)."""
+    """Value per plan (B,) and its gradient by the plan, (B, T, m)."""
     u = step.u.detach().requires_grad_()
     value = value_of(u)
     if not value.requires_grad:
@@ -209,7 +209,7 @@ _WRONG: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor], str], ...] = (
     ("robustness of `{}` is minus infinity", lambda value, _: value == -torch.inf, _ENDLESS),
     ("gradient of `{}` is not a number", lambda _, slope: ~_finite(slope), _ROOT),
 )
-"""Faults of the value and the gradient of a requirement, each with its test and the way out."""
+"""Possible faults of a requirement's value and gradient: test, message and remedy of each."""
 
 
 def _first(marks: Tensor) -> int | None:
@@ -240,10 +240,10 @@ TRIES = 4000
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
-    """Diagnostic R404 of a task that no plan was found for, with the requirements that are to blame.
+    """Diagnostic R404 of a task without a known plan, with the conflicting requirements.
 
-    Those that are proved to have no plan, else what is left where requirements are left out one after the
-    other as long as no plan is found for the rest; that ends where `enough` says so.
+    Those proved to have no plan; otherwise a core, found by removing requirements as long as no plan is found
+    for the rest, until `enough` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -261,7 +261,7 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
 
 
 def refuted(task: Task) -> bool:
-    """True where it is proved of some requirement that no plan from any of `STARTS` starts satisfies it."""
+    """True if bounds prove for some requirement that no plan from any of `STARTS` starts satisfies it."""
     return any(_impossible(task, rule) for rule in task.rules)
 
 
@@ -270,19 +270,19 @@ def _alone(task: Task, rules: Sequence[CompiledRequirement]) -> Task:
 
 
 def _starts(task: Task) -> torch.Tensor:
-    """Starts that are always the same, (STARTS, n)."""
+    """Fixed initial states, (STARTS, n)."""
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
 def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
-    """The best plans for these requirements alone."""
+    """Best plans for these requirements alone, by local search."""
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
     return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """True where exploration finds a plan for these requirements alone."""
+    """True if exploration finds a plan for these requirements alone."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
@@ -330,7 +330,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Note on the effort of the search, which is no proof."""
+    """Note on the effort of the search, which is not a proof."""
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
@@ -346,12 +346,12 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _impossible(task: Task, rule: CompiledRequirement) -> bool:
-    """True where bounds prove that no plan from any of the starts satisfies a requirement."""
+    """True if bounds prove that no plan from any of the starts satisfies a requirement."""
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
 
 def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
-    """Between which values every state lies after each number of steps, whatever the controls do."""
+    """Bounds on every state after each number of steps, over all controls."""
     step, system = task.system.exact_step, task.system
     low, high = system.control_low.tolist(), system.control_high.tolist()
     controls = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
@@ -373,19 +373,19 @@ def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
 
 
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
-    """The greatest robustness that a formula can have at first; inf where the bounds do not say."""
+    """Upper bound on the robustness of a formula at time 0; inf where the bounds are undecided."""
     return _Most(reached).at(formula, 0)
 
 
 class _Most:
-    """Greatest robustness at every instant of what is reached."""
+    """Upper bounds on robustness over the reachable sets."""
 
     def __init__(self, reached: Sequence[Mapping[str, Bounds]]) -> None:
         self._reached = reached
         self._known: dict[tuple[ir.Formula, int], float] = {}
 
     def at(self, formula: ir.Formula, now: int) -> float:
-        """At one instant; beyond the last one anything can be."""
+        """Upper bound at one instant; inf beyond the last one."""
         if now < 0 or now >= len(self._reached):
             return math.inf
         key = formula, now
@@ -430,13 +430,13 @@ class _Most:
 
 SAMPLES = 1024
 NEAR = 1e-6
-"""Difference by rounding, relative to 1 or to the value, whichever is larger."""
+"""Rounding tolerance, relative to 1 or to the value, whichever is larger."""
 ODD = 0.02
-"""Share of samples that may disagree: rounding decides where a switch is nearly tied."""
+"""Share of samples that may disagree: rounding decides nearly tied switches."""
 
 
 def check_mirror(task: Task) -> None:
-    """Drive random states and their images, and compare.
+    """Check the mirror symmetry on random states and their images.
 
     Raises SystemFileError (S304) where they differ: the mirror is no symmetry of system and specification.
     """
@@ -461,7 +461,7 @@ def check_mirror(task: Task) -> None:
 
 
 def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:
-    """Report the column that differs most, where more of its rows do than a near-tie explains."""
+    """Report the column that differs most, where more of its rows differ than near-ties explain."""
     found, wanted = found.reshape(-1, len(names)), wanted.reshape(-1, len(names))
     off = ~torch.isclose(found, wanted, rtol=NEAR, atol=NEAR, equal_nan=True)
     shares = off.double().mean(0)

@@ -1,12 +1,11 @@
-"""Plans found by exploration: a tree of beginnings, grown from where something new was reached.
+"""Plans found by exploration: a tree of plan prefixes, extended from those that reached something new.
 
-A climb changes whole plans, and where many things have to be done one after the other hardly any change
-does one more of them without undoing the rest. So plans are put together from their beginnings here. Of
-every beginning it is known, from bounds over all that may follow it, which parts of the specification it
-has violated for good, which it has satisfied already, and which are open. What has violated one is
-dropped. The rest is kept layer by layer (one for every step of the plan), the best of every cell: which
-parts are satisfied, and where in the state space it ended. Beginnings that have come far, or that stand
-where few others do, are gone on with first (Ecoffet et al. 2021, "First return, then explore").
+Local search changes whole plans; where many goals have to be reached in order, hardly any change reaches one
+more without losing others. So plans are built from prefixes here. For every prefix, bounds over all
+continuations tell which parts of the specification are violated for good, which are satisfied, and which are
+open. Prefixes with a violated part are dropped. The others are kept in layers (one per step of the plan), the
+best per cell: satisfied parts and region of the state space. Prefixes that are advanced, or in rarely visited
+cells, are extended first (Ecoffet et al. 2021, "First return, then explore").
 """
 
 from __future__ import annotations
@@ -38,31 +37,31 @@ if TYPE_CHECKING:
 Numbers = NDArray[np.float64]
 
 CHILDREN = 512
-"""Beginnings that are gone on with together."""
+"""Number of prefixes extended per batch."""
 KEPT = 512
-"""Beginnings that a layer holds, at most."""
+"""Maximum number of prefixes per layer."""
 FINE, COARSE = 24, 5
-"""Cells along a state that the specification reads, and along another one that moves."""
+"""Cells per state that the specification reads, and per other moving state."""
 COUNTED = 6
 """Cells along a timer."""
 GROWTH = 0.1
-"""Mean share of the horizon by which a beginning grows in one go."""
+"""Mean share of the horizon by which a prefix is extended at once."""
 NEAR = 8.0
 """Preference of the nearest prefixes over the farthest, as a power of e."""
 EFFORTS = (8, 24, 72)
-"""Sweeps of a plan over `USUAL` steps: what is tried first, and what is tried where that found nothing."""
+"""Sweeps for a plan of `USUAL` steps: first attempt, and increased effort after failures."""
 USUAL = 30
-"""Steps; what a sweep takes grows with the square of them."""
+"""Plan length in steps to which `EFFORTS` refers; the cost of a sweep grows with its square."""
 BATCH = 8
-"""Sweeps from one start before the next has its turn."""
+"""Sweeps from one start before the next start's turn."""
 TAILS = 8
-"""Instants of a plan that was found, from which its rest is a plan too."""
+"""Number of instants of a found plan whose remainder is tried as a plan too."""
 RAISED = 250
-"""Generations of a climb that give a plan that was found more to spare."""
+"""Generations of the local search that increases the margin of a found plan."""
 
 
 def pieces(formula: ir.Formula) -> list[ir.Formula]:
-    """Formulas whose conjunction it is: what can be satisfied or violated one by one."""
+    """Conjuncts of a formula: parts that can be satisfied or violated separately."""
     match formula:
         case ir.BoolOp("and", items):
             return [piece for item in items for piece in pieces(item)]
@@ -74,15 +73,15 @@ def pieces(formula: ir.Formula) -> list[ir.Formula]:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Beginnings of the same length, a row each.
+    """Prefixes of equal length, one per row.
 
     Attributes:
-        states: on their way, (rows, steps + 1, n).
+        states: their trajectories, (rows, steps + 1, n).
         plans: (rows, steps, m).
-        met: which pieces are satisfied whatever follows, (rows, pieces).
-        kind: the same for beginnings that satisfy the same pieces and whose timers agree, (rows, columns).
-        worth: how near the open ones are, (rows,).
-        visits: how often each was gone on with, (rows,).
+        met: pieces satisfied by every continuation, (rows, pieces).
+        kind: equal for prefixes with the same satisfied pieces and timers in the same cells, (rows, columns).
+        worth: sum of the lower bounds of the open pieces, (rows,).
+        visits: number of times each was extended, (rows,).
     """
 
     states: Numbers
@@ -96,11 +95,11 @@ class Layer:
         return len(self.worth)
 
     def rows(self, index: NDArray[np.int64]) -> Layer:
-        """Some of them."""
+        """Select rows."""
         return Layer(*(getattr(self, name)[index] for name in Layer.__slots__))
 
     def joined(self, other: Layer) -> Layer:
-        """The rows of both."""
+        """Concatenate the rows of both."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in Layer.__slots__)
         return Layer(*map(np.concatenate, pairs))
 
@@ -110,8 +109,8 @@ class ExplorationResult:
     """Result of the exploration from one start.
 
     Attributes:
-        plan: satisfying, (T, m) float64; None where none was found.
-        sweeps: that were made.
+        plan: satisfying plan, (T, m) float64; None where none was found.
+        sweeps: number of sweeps made.
     """
 
     plan: Tensor | None
@@ -119,7 +118,7 @@ class ExplorationResult:
 
 
 class Exploration:
-    """Explores the plans of one task, from one start at a time.
+    """Exploration of the plans of one task, from one start at a time.
 
     Attributes:
         task: specification and system.
@@ -151,12 +150,12 @@ class Exploration:
         generator: torch.Generator,
         enough: Callable[[], bool] = lambda: False,
     ) -> ExplorationResult:
-        """A satisfying plan from the state (n,), as far as one was found.
+        """Search for a satisfying plan from the state (n,).
 
         Args:
             x: the start.
-            sweeps: how often the beginnings of every length are gone on with, at most.
-            generator: of the choices.
+            sweeps: maximum number of times that each layer is extended.
+            generator: random numbers of the exploration.
             enough: asked before each sweep after the first; True gives up.
         """
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
@@ -185,17 +184,17 @@ class Exploration:
         spare: float,
         enough: Callable[[], bool] = lambda: False,
     ) -> SearchResult:
-        """Plans that were found from some of the starts (k, n), and what is left of them on their way.
+        """Find plans from some of the starts (k, n), with their remainders from states on the way.
 
-        Every start has its turn while there is effort left. Where the specification has memory, states on the
-        way of a plan are starts of their own, and the rest of the plan may solve them.
+        Starts are tried in order while sweeps remain. Where the specification has memory, states along a plan
+        are further starts, which the remainder of the plan may solve.
 
         Args:
             starts: (k, n).
-            sweeps: in all, for a plan over `USUAL` steps; fewer of a longer one.
-            generator: of the choices.
-            spare: robustness up to which the plans are raised.
-            enough: asked now and then; True ends it.
+            sweeps: total for plans of `USUAL` steps; fewer for longer ones.
+            generator: random numbers of the exploration.
+            spare: target robustness of the found plans.
+            enough: called repeatedly; True ends the exploration.
         """
         sweeps = max(math.ceil(sweeps * min(1.0, (USUAL / self.task.horizon) ** 2)), 2)
         found = [
@@ -212,17 +211,17 @@ class Exploration:
             *(torch.cat([getattr(part, name) for part in found]) for name in SearchResult.__slots__)
         )
 
-    # ------------------------------------------------------------------ plans that were found
+    # ------------------------------------------------------------------ found plans
 
     def _raised(self, x: Tensor, plan: Tensor, spare: float) -> Tensor:
-        """The plan (T, m), or a change of it that has more to spare."""
+        """The plan (T, m), improved by local search towards robustness `spare`."""
         if self.task.native is None:
             return plan
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
     def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """The start with its plan, and those states on its way whose rest of the plan solves them."""
+        """The start with its plan, and the states on the way that the remainder of the plan solves."""
         states, plans = [x], [plan]
         if self.task.compiled.timers:
             path = self.task.rollout(x[None], plan[None])[0]
@@ -239,10 +238,10 @@ class Exploration:
         rho = self.task.judge(x.double().cpu().expand(len(plans), -1), plans, states=False).rho
         return plans[int(rho.argmax())]
 
-    # ------------------------------------------------------------------ beginnings
+    # ------------------------------------------------------------------ prefixes
 
     def _grown(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Continuations of some prefixes of a layer that may still satisfy the specification."""
+        """Extend some prefixes of a layer; keep those that may still satisfy the specification."""
         chosen = self._chosen(layer, random)
         np.add.at(layer.visits, chosen, 1.0)
         horizon, before = self.task.horizon, layer.plans[chosen]
@@ -253,7 +252,7 @@ class Exploration:
         return self._begun(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _begun(self, states: Numbers, plans: Numbers) -> Layer:
-        """Prefixes, of some, that may still satisfy the specification."""
+        """Layer of the prefixes that may still satisfy the specification."""
         good = np.isfinite(states).all((1, 2))
         states, plans = states[good], plans[good]
         whole = states.shape[1] == self.task.horizon + 1
@@ -268,7 +267,7 @@ class Exploration:
         return Layer(states, plans, met, kind, worth, np.zeros(len(worth)))
 
     def _bounds(self, states: Numbers, end: Boundary) -> Numbers:
-        """Of the robustness of every piece, over all that may follow: (rows, samples, n) -> (rows, k)."""
+        """Bounds on the robustness of every piece over all continuations: (rows, samples, n) -> (rows, k)."""
         if not len(states):
             return np.empty((0, len(self.pieces)))
         env = dict(zip(self.task.names, np.moveaxis(states, (0, 1, 2), (2, 1, 0)), strict=True))
@@ -277,7 +276,7 @@ class Exploration:
         return np.stack([np.broadcast_to(each[0], len(states)) for each in found], 1)
 
     def _chosen(self, layer: Layer, random: np.random.Generator) -> NDArray[np.int64]:
-        """Prefixes to continue, (CHILDREN,): those with more pieces met, the nearest and the rarest first."""
+        """Draw prefixes to extend, (CHILDREN,), preferring satisfied pieces, high worth and few visits."""
         kind = _numbered(layer.kind)
         rank = np.empty(len(layer))
         for each in range(kind.max() + 1):
@@ -290,7 +289,7 @@ class Exploration:
         return chosen
 
     def _drawn(self, plans: Numbers, more: int, random: np.random.Generator) -> Numbers:
-        """Controls that may follow, (rows, more, m): levels, ends of ranges, changes of the last, noise."""
+        """Draw continuations, (rows, more, m): levels, ends of ranges, changes of the last control, noise."""
         rows, steps, controls = plans.shape
         span, shape = self._high - self._low, (rows, 1, controls)
         level = self._low + span * random.random(shape)
@@ -304,7 +303,7 @@ class Exploration:
         return drawn
 
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """The nearest of every cell, and `KEPT` at most, as many of each kind as there is room for."""
+        """Best prefix per cell, thinned to at most `KEPT`, with equal shares for the kinds."""
         if not len(layer):
             return layer
         parts = [layer.kind]
@@ -323,6 +322,6 @@ class Exploration:
 
 
 def _numbered(kinds: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A number per row, the same for equal rows."""
+    """Index of the distinct row that each row equals."""
     numbers: NDArray[np.int64] = np.unique(kinds, axis=0, return_inverse=True)[1].reshape(-1)
     return numbers

@@ -1,4 +1,4 @@
-"""Evaluation at the end of a training: held-out states, conflicts, closed-loop simulations."""
+"""Evaluation at the end of a training: held-out states, conflict diagnosis, closed-loop simulations."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
 
 VERDICT_OVER = 0.04
-"""Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
+"""Share of a budget by which the evaluation may exceed it before the feasibility search is stopped."""
 SIMULATION_SHARE = 0.15
-"""Share of the seconds that a training without a budget took, for which its policy is simulated."""
+"""Time for closed-loop simulations after a training without budget, as a share of its duration."""
 VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
-"""Seconds, and share of the seconds that the steps took, which the verdict of a run without a budget has."""
+"""Time for the evaluation of a run without budget: seconds, and share of the duration of its steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,11 @@ class TrainingOutcome:
         run: the run with its policy.
         score: on held-out states; None where training was interrupted, and on ranks after the first.
         seconds: of training, held-out verdict included.
-        interrupted: ended by `Watch.stop`.
-        ranks: that trained together.
-        why: requirements that no plan was found for, where none was found for any start.
-        steps: that were made in all.
-        driven: the policy in closed loop; None where it was not simulated.
+        interrupted: whether `Watch.stop` ended it.
+        ranks: number of processes that trained together.
+        why: diagnosis of the conflicting requirements, where no plan was found for any start.
+        steps: total number of steps.
+        driven: closed-loop results; None where not simulated.
     """
 
     run: Run
@@ -54,14 +54,14 @@ class TrainingOutcome:
 
 @dataclass(slots=True)
 class FinalEvaluation:
-    """Evaluation of a policy within what is left of its training's time.
+    """Evaluation of a policy within the remaining time of its training.
 
     Attributes:
         writer: of the run.
-        task: what was trained for.
-        config: numbers of the run.
-        time: of the training.
-        trained: reading of the clock when the evaluation began.
+        task: problem of the training.
+        config: resolved options of the run.
+        time: budget of the training.
+        trained: clock reading at the start of the evaluation.
     """
 
     writer: RunWriter
@@ -72,7 +72,7 @@ class FinalEvaluation:
 
     @property
     def reserve(self) -> float:
-        """Seconds of the budget for the whole evaluation."""
+        """Seconds of the budget reserved for the whole evaluation."""
         return verdict_reserve(self.time.seconds) + self._for_simulations
 
     @property
@@ -80,7 +80,7 @@ class FinalEvaluation:
         return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
 
     def of(self, policy: Policy, steps: int) -> TrainingOutcome:
-        """Judge a policy after so many steps, keep the verdict in the run, and close its record."""
+        """Evaluate a policy after `steps` steps, store the result in the run, and close its record."""
         self.trained = self.time.now()
         result = score(self.task, policy, n=self.config.held_out, enough=self._out_of_time)
         self.writer.held_out(self.task, result)
@@ -96,7 +96,7 @@ class FinalEvaluation:
         return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, driven=driven)
 
     def _simulated(self, run: Run) -> ClosedLoop | None:
-        """The policy in closed loop, for as long as there is time."""
+        """Closed-loop results of the policy, within the remaining time."""
         if not self.config.drives:
             return None
         time, begun = self.time, self.time.now()
@@ -108,16 +108,16 @@ class FinalEvaluation:
         return closed_loop(run, lambda: end - time.now(), self.config.drives)
 
     def _out_of_time(self) -> bool:
-        """True once the verdict has to end."""
+        """True once the evaluation on held-out states has to end."""
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once everything behind the verdict has to end, too."""
+        """True once the closed-loop simulations have to end, too."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property
     def _verdict_seconds(self) -> float:
-        """Seconds of the budget left for the verdict; without a budget a share of what the steps took."""
+        """Seconds left for the held-out evaluation; without budget a share of the duration of the steps."""
         spent = self.trained - self.time.begun
         if not self.time.allowed:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)

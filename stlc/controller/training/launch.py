@@ -1,4 +1,4 @@
-"""A run's folder before the first step: exact inputs, options, versions, machine."""
+"""Run folder before the first step: exact inputs, options, versions, machine."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Launch:
 
     Attributes:
         root: folder of all runs.
-        name: words of the run; drawn if None.
-        overrides: what `--set` changed.
-        command: as typed.
+        name: name of the run; random if None.
+        overrides: values of `--set`.
+        command: command line.
     """
 
     root: Path = RUNS
@@ -42,12 +42,12 @@ class Launch:
 
 
 def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -> RunDir:
-    """Make the folder of a new run and fill it with everything that repeats it.
+    """Create the folder of a new run with everything needed to reproduce it.
 
     Args:
-        task: what is trained for.
-        config: what the user said.
-        launch: where, and under which name.
+        task: problem to train for.
+        config: the user's options.
+        launch: place and name of the run.
 
     Raises:
         MissingError: R201, the folder cannot be written.
@@ -102,10 +102,10 @@ def train_here(
     """Train a policy in a new folder below `runs/` and return the run.
 
     Args:
-        task: what to train for; see `stlc.compile`.
-        budget: seconds; 60 where neither this nor `steps` nor the system file says otherwise.
-        steps: of the optimiser; wins over `budget`.
-        seed: of everything random; None takes the system file's.
+        task: problem to train for; see `stlc.compile`.
+        budget: seconds; by default that of the system file, else 60.
+        steps: optimiser steps; take precedence over `budget`.
+        seed: of all random numbers; None takes the system file's.
         method: `guided` (search and distil) or `gradient` (the paper's); None takes the system file's.
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)

@@ -1,9 +1,9 @@
-"""State of a training of a plan network, and its moves: a gradient step, an exploration, a validation.
+"""Training state of a plan network: gradient steps, exploration, validation, checkpoint contents.
 
-Search and distil: every few dozen steps fresh states are judged, the failing ones are repaired by search that
-starts at the policy's own plan, and repaired plans are imitated for as long as their state still fails. Each
-gradient step mixes fresh states with such hard ones. Of the network's plans the one that does best is trained
-(winner takes all), with a little of the mean so that none starves.
+Search and distil: every few dozen steps fresh states are judged, failing ones are repaired by a search that
+starts from the policy's own plan, and repaired plans are imitated for as long as their state still fails.
+Each gradient step mixes fresh states with such hard ones. Of the network's plans the best one is trained
+(winner takes all), with a small weight on the mean so that none stays untrained.
 """
 
 from __future__ import annotations
@@ -45,28 +45,28 @@ MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
 TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
-"""States and plans of the searches of a training where torch does their work: some hundred times slower."""
+"""Limits for searches in torch, which are some hundred times slower: states for the margin, states, tries."""
 BARREN = 0.05
-"""Share of the failing states that a climb solves, below which plans are looked for by exploration too."""
+"""Share of failing states solved by local search below which exploration is used too."""
 LEARNT = 0.5
-"""Share of fresh states that a policy satisfies, from which on nothing is explored any more."""
+"""Accuracy on fresh states from which on exploration is not used."""
 EXPLORED = 4
-"""Starts that are explored before a round, at most."""
+"""Maximum number of starts explored before a round."""
 RISE = 30
-"""Steps to the peak of the learning rate where it is held; independent of how many there will be."""
+"""Steps of the rise to a held peak learning rate; independent of the total number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Shares and counts on fresh states, of all ranks.
+    """Shares and counts on fresh states, over all ranks.
 
     Attributes:
         accuracy: share whose plan satisfies the specification.
         requirements: share per requirement, in the order of the task's rules.
         feasible: share for which a satisfying plan is known after the search (None: no search was made).
-        failing: states that the search worked on.
-        repaired: how many of them it solved.
-        explored: plans that exploration found, those from states on their way among them.
+        failing: number of states searched.
+        repaired: number of them solved.
+        explored: plans found by exploration, including those from states on their way.
     """
 
     accuracy: float
@@ -78,7 +78,7 @@ class Validation:
 
 
 class Trainer:
-    """Everything that changes while training. Same seed and steps: same weights on the same machine."""
+    """State of a training. The same seed and steps give the same weights on the same machine."""
 
     def __init__(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
@@ -117,7 +117,7 @@ class Trainer:
         self.learnt = torch.empty(0, len(task.names), device=device)
 
     def advance(self) -> float:
-        """One gradient step; returns its loss. Where that or its gradient is not finite, NaN, and no step."""
+        """Make one gradient step and return its loss; NaN and no step if loss or gradient is not finite."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate
         value = self._loss()
@@ -141,7 +141,7 @@ class Trainer:
 
     @property
     def rate(self) -> float:
-        """Learning rate of the next step: a short rise, a while at the peak, then half a cosine to 0."""
+        """Learning rate of the next step: linear rise, constant peak, half a cosine to 0."""
         config, hold = self.config, self.config.hold
         rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, config.warmup * self.steps)))
         fallen = max(0.0, self.step / self.steps - hold) / (1.0 - hold)
@@ -149,18 +149,18 @@ class Trainer:
 
     @property
     def policy(self) -> BestOfKPolicy:
-        """The policy that is handed out: the averaged weights, on the processor as verdicts are."""
+        """The resulting policy: averaged weights, on the CPU."""
         on_processor = self.device.type == "cpu"
         return BestOfKPolicy(self.task, self.average if on_processor else deepcopy(self.average).cpu())
 
     @property
     def searches(self) -> bool:
-        """True where failing states are repaired beside the steps."""
+        """True if the method repairs failing states concurrently with the steps."""
         return self.method.searches
 
     @property
     def searching(self) -> bool:
-        """True while a repair goes on."""
+        """True while a repair search runs."""
         return self.repairing is not None and not self.repairing.done()
 
     @property
@@ -169,16 +169,16 @@ class Trainer:
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Part of the training -> why torch does its work, or "" where it runs as C."""
+        """Part of the training -> reason why torch is used, or "" where it runs as C."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
     def wait(self, stop: Stop = never) -> bool:
-        """Let the repair come to its end; False where `stop` came first."""
+        """Wait for the end of the repair search; False where `stop` came first."""
         return self.repairing is None or self.repairing.result(stop) is not None
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a step that was not finite, of whichever rank, and whether the weights before it are."""
+        """Cause of a non-finite step on any rank, and whether the weights before it give finite plans."""
         theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
         x0 = torch.cat((self.learnt, *theirs))
         step = TrainingStep.of(self.network, self.objective, x0, self.step, self.task)
@@ -187,10 +187,10 @@ class Trainer:
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Validation for plans by exploration, where the round before has shown that climbing leads nowhere.
+        """Search for plans by exploration, if local search solved hardly any failing state last round.
 
-        The effort grows with every time that nothing is found. False where `stop` came first; then nothing
-        has changed.
+        The effort increases whenever nothing is found. False where `stop` came first; then nothing has
+        changed.
         """
         if not self.barren:
             return True
@@ -211,14 +211,14 @@ class Trainer:
 
     @property
     def exhausted(self) -> bool:
-        """True once exploration was tried with all the effort there is, and found nothing."""
+        """True once exploration with the largest effort has found nothing."""
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Judge fresh states; a method that searches also repairs what fails.
+        """Judge fresh states; a method that searches also starts to repair failing ones.
 
-        The repair goes on beside the training steps; the next validation takes what it has found.
+        The repair runs concurrently with the training steps; the next validation collects its results.
         """
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
@@ -238,18 +238,18 @@ class Trainer:
         return self._of_all(Validation(accuracy, shares, feasible, failing, repaired, explored))
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
-        """A search beside the steps until the next round."""
+        """Start a search that runs until the next round."""
         tries, steps = self._effort[1], self.config.every
         return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
 
     @property
     def _effort(self) -> tuple[int, int]:
-        """Failing states of a search round at most, and plans that are tried for each."""
+        """Maximum number of failing states per search round, and evaluations per state."""
         native = self.task.native is not None
         return (self.config.most, THOROUGH) if native else (min(self.config.most, TORCH_MOST), TORCH_TRIES)
 
     def close(self) -> None:
-        """End the search that goes on beside the steps."""
+        """Cancel the running search."""
         if self.repairing is not None:
             self.repairing.cancel()
 
@@ -269,11 +269,10 @@ class Trainer:
         )
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
-        """Put what the search round before this one has found where it is learnt from.
+        """Store the plans found by the previous search round in replay buffer and supply.
 
         Returns:
-            How many states it worked on, how many it solved, and the share of all states of that
-            time known to be feasible.
+            Number of states searched, number solved, and the share of states then known to be feasible.
         """
         if self.repairing is None:
             return 0, 0, None
@@ -287,7 +286,7 @@ class Trainer:
         rate = repaired / max(1, failing)
         return failing, repaired, self.accuracy + (1.0 - self.accuracy) * rate
 
-    # ------------------------------------------------------------------ pieces
+    # ------------------------------------------------------------------ loss and supply
 
     def _loss(self) -> Tensor:
         config = self.config
@@ -316,7 +315,7 @@ class Trainer:
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the best plan, which is trained, (B,), and whether it satisfies the specification."""
+        """Index of the best plan, which is trained, (B,), and whether any plan satisfies, (B,)."""
         batch, count = plans.shape[:2]
         if count == 1 and self.config.hard == 0:
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
@@ -326,13 +325,13 @@ class Trainer:
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
-        """Distance of the nearest plan to the repaired one, where the state still fails."""
+        """Weighted distance of the nearest plan to the repaired one, over states that still fail."""
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
         return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
-        """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
+        """A feasible gamma: a share of the robustness that search reaches on the median state."""
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
         x0 = self.supply.take(min(count, MARGIN_STATES))
@@ -348,14 +347,14 @@ class Trainer:
         return Searcher(self.task, self.generator, enough=enough, device=self.device)
 
     def _supply(self) -> Supply:
-        """States that missions pass through where the specification has memory, else independent ones."""
+        """Source of training states: along missions where the specification has memory, else independent."""
         if not self.task.compiled.timers:
             return Draws(self.task, self.generator, self.device)
         policy = BestOfKPolicy(self.task, self.network)
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
     def _network(self) -> PlanNetwork:
-        """A network whose first weights depend on the seed alone."""
+        """A network whose initial weights depend on the seed alone."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
             return self.method.network(self.task, self.config).to(self.device)
@@ -363,9 +362,9 @@ class Trainer:
     # ------------------------------------------------------------- checkpoints
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that a resumed run needs to go on bit for bit; on the first of several ranks, of all.
+        """State for an exact resumption, bit for bit; on the first of several ranks, of all ranks.
 
-        All of them have to ask at the same time.
+        All ranks have to call this at the same time.
         """
         found: dict[str, Tensor] = self._own()
         for index, theirs in enumerate(self.ranks.gather(found), start=1):
@@ -377,7 +376,7 @@ class Trainer:
         return found
 
     def _own(self) -> dict[str, Tensor]:
-        """Tensors that every rank has for itself."""
+        """State of this rank alone."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
@@ -397,7 +396,7 @@ class Trainer:
         return found
 
     def facts(self) -> dict[str, float | int]:
-        """The plain numbers that go with `tensors`."""
+        """Scalars stored with `tensors`."""
         last = {"loss": self.loss} if math.isfinite(self.loss) else {}
         return last | {
             "step": self.step,
@@ -411,7 +410,7 @@ class Trainer:
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Go on where `tensors` and `facts` were taken."""
+        """Restore the state of `tensors` and `facts`."""
         tensors, facts = self._restored(tensors, facts)
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
@@ -445,7 +444,7 @@ class Trainer:
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """State that this rank goes on with: its own part in the place of the first one's."""
+        """State for this rank: its own entries in place of the first rank's."""
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")
@@ -457,21 +456,21 @@ class Trainer:
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The entries under `prefix.`, without it."""
+    """Entries under `prefix.`, without the prefix."""
     return {
         name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
     }
 
 
-# ------------------------------------------------------------------ the methods that train it
+# ------------------------------------------------------------------ methods with a plan network
 
 
 class NetworkMethod(ABC):
     """Training and loading of a network that proposes `config.plans` plans.
 
     Attributes:
-        searches: whether failing states are repaired by local search beside the steps.
-        mirrored: whether the network uses the mirror of the system.
+        searches: whether failing states are repaired by local search concurrently with the steps.
+        mirrored: whether the network uses the system's mirror symmetry.
     """
 
     searches = False
@@ -479,20 +478,20 @@ class NetworkMethod(ABC):
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
-        """The loss of plans, at the margin of a training."""
+        """The loss at the margin of the training."""
 
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Trainer:
-        """A training before its first step."""
+        """Training state before the first step."""
         return Trainer(task, config, steps=steps, device=device, ranks=ranks)
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
-        """The network of a run, its weights drawn from torch's own generator."""
+        """The network of a run, with weights drawn from torch's global generator."""
         return PlanNetwork(task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str = "cpu") -> BestOfKPolicy:
-        """The policy of a run: the averaged weights. Raises RunError: R101 or R102, see `Method.load`."""
+        """Load the policy of a run: averaged weights. Raises RunError: R101 or R102, see `Method.load`."""
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         network = self.network(task, config)
         try:

@@ -1,9 +1,9 @@
-"""Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
+"""Plan repair by batched local search on the exact robustness, starting from the policy's own plan.
 
-Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each generation tries a
-batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a
+Gradients vanish outside a stop zone and do not lead across an obstacle; a search does. Each generation tries
+a batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a
 constant shift of a stretch, a stretch held at one random level, and plans that solved other states. The
-native kernel does it where there is one, torch elsewhere.
+native kernel does it if there is one, otherwise torch.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from stlc.native import Stop
 
 THOROUGH = 4000
-"""Plans that are tried per state at most, unless told otherwise."""
+"""Default maximum number of evaluations per state."""
 TRIES = 64
-"""Plans of a generation where torch does the work."""
+"""Plans per generation in torch."""
 MOST_TRIED = 4_000_000
-"""Numbers in the plans that torch tries at a time: what bounds its memory."""
+"""Maximum number of plan entries evaluated at a time in torch, which bounds its memory."""
 LOOK = 0.1
-"""Seconds between two looks at whether waiting is to end."""
+"""Polling interval of a wait in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class SearchResult:
     """Result of a search.
 
     Attributes:
-        states: where plans start, (B, n).
+        states: initial states, (B, n).
         plans: the best plan per state, (B, T, m).
         rho: its exact robustness, (B,).
     """
@@ -55,23 +55,23 @@ class SearchResult:
 
     @property
     def solved(self) -> Tensor:
-        """States whose plan satisfies the specification by more than rounding, (B,) booleans."""
+        """Mask of the states whose plan satisfies the specification by more than rounding, (B,)."""
         return self.rho >= FLOAT32_SLACK
 
     def to(self, device: torch.device) -> SearchResult:
-        """The same on another device."""
+        """Copy on another device."""
         return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
 
 
 class Search:
-    """A search for better plans that goes on beside whatever else is done.
+    """A local search that runs concurrently with other work.
 
-    What it gives depends on its states, plans, seed and bank alone, not on when it is asked or stopped and
-    begun again. The native kernel works on a thread of its own; torch in `advance`.
+    Its result depends on states, plans, seed and plan library alone, not on timing, interruption or restart.
+    The native kernel runs on a thread of its own; torch runs in `advance`.
 
     Attributes:
-        states: where plans start, (B, n).
-        plans: that it begins with, (B, T, m).
+        states: initial states, (B, n).
+        plans: initial plans, (B, T, m).
         seed: of its random numbers.
     """
 
@@ -84,18 +84,18 @@ class Search:
 
     @classmethod
     def of(cls, found: SearchResult) -> Search:
-        """A search that has come to its end."""
+        """A finished search with the given result."""
         search = cls(found.states, found.plans, 0)
         search._found.set_result(found)
         return search
 
     def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
-        """This search, begun on a thread."""
+        """Start on a thread of `pool`."""
         self._found = pool.submit(climb, self._cancelled.is_set)
         return self
 
     def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
-        """This search, to be done in so many equal shares."""
+        """Run in `steps` equal shares, one per `advance`."""
         self._climb, self._share = climb, -(-climb.left // max(1, steps))
         return self
 
@@ -104,7 +104,7 @@ class Search:
         return self._found.done()
 
     def advance(self) -> None:
-        """Do a share of the work, where that is not done on another thread."""
+        """Do one share of the work, unless another thread does it."""
         if self._climb is not None and not self.done():
             for _ in range(self._share):
                 if not self._climb.generation():
@@ -112,7 +112,7 @@ class Search:
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
-        """Result at the end of the search; None where `stop` ends the waiting first."""
+        """Wait for the result; None where `stop` ends the waiting first."""
         while not self.done():
             if stop():
                 return None
@@ -124,12 +124,12 @@ class Search:
         return self._found.result()
 
     def cancel(self) -> None:
-        """End it; it gives nothing then."""
+        """Cancel the search."""
         self._cancelled.set()
 
 
 class Searcher:
-    """A hill climber over open-loop plans of one task."""
+    """Local search over open-loop plans of one task."""
 
     def __init__(
         self,
@@ -139,9 +139,9 @@ class Searcher:
         enough: float,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Search plans of `task`; a state is left alone once its robustness reaches `enough`.
+        """Search plans of `task` up to the target robustness `enough`.
 
-        The generator is of the processor, and so is the native search; states and plans are on `device`.
+        The generator and the native search are on the CPU; states and plans are on `device`.
         """
         self.task = task
         self.generator = generator
@@ -153,14 +153,14 @@ class Searcher:
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
     ) -> SearchResult:
-        """Improve plans until they satisfy the specification or the effort is spent.
+        """Improve plans until they reach the target robustness or the evaluations are used up.
 
         Args:
             x0: states, (B, n).
-            plans: where to start, (B, T, m).
+            plans: initial plans, (B, T, m).
             bank: plans that solved other states, (k, T, m); may be empty.
-            tries: plans per state at most.
-            stop: ends the search early, with what was found until then.
+            tries: maximum evaluations per state.
+            stop: ends the search early, with the best plans so far.
         """
         if self.task.native is not None:
             return self._climbing(x0, plans, bank, tries, cores(), self._seed())(stop).to(x0.device)
@@ -177,9 +177,9 @@ class Searcher:
         steps: int = 1,
         seed: int | None = None,
     ) -> Search:
-        """`repair` beside whatever else goes on.
+        """Start `repair` concurrently.
 
-        The native kernel leaves what it found on the processor; torch works in `steps` shares.
+        The native kernel leaves its result on the CPU; torch works in `steps` shares.
         """
         seed = self._seed() if seed is None else seed
         search = Search(x0, plans, seed)
@@ -189,7 +189,7 @@ class Searcher:
 
     @torch.no_grad()
     def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> SearchResult:
-        """`repair` without a bank on the caller's own thread, as many threads of the kernel as torch has."""
+        """`repair` without plan library on the calling thread, with as many kernel threads as torch has."""
         bank = plans.new_zeros(0, *plans.shape[1:])
         if self.task.native is None:
             return self._climb(x0, plans, bank, tries, self._seed()).finish()
@@ -201,7 +201,7 @@ class Searcher:
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
-        """A native climb that is ready to go; it has its own copies and its own random numbers."""
+        """Prepare a native search with its own copies and random numbers."""
         native = self.task.native
         assert native is not None
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
@@ -222,11 +222,11 @@ class Searcher:
 
 
 class _TorchClimb:
-    """The same climb in torch, a generation at a time.
+    """The same local search in torch, one generation at a time.
 
     Attributes:
         found: the best plans so far.
-        left: generations that are still to come, at most.
+        left: maximum number of remaining generations.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class _TorchClimb:
 
     @torch.no_grad()
     def generation(self, stop: Stop = never) -> bool:
-        """Try `TRIES` changed plans for every state that needs it; False once there is nothing left to do."""
+        """Try `TRIES` changed plans for every unfinished state; False once nothing is left to do."""
         still = (self.found.rho < self.enough).nonzero()[:, 0]
         if self.left == 0 or not len(still):
             return False
@@ -257,7 +257,7 @@ class _TorchClimb:
         return self.left > 0
 
     def finish(self, stop: Stop = never) -> SearchResult:
-        """Result at the end of the search."""
+        """Run to the end and return the result."""
         while not stop() and self.generation(stop):
             pass
         return self.found
@@ -297,7 +297,7 @@ class _TorchClimb:
         return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
 
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:
-        """1 on a random stretch of time per plan and control, else 0; (B, tries, T, m)."""
+        """Mask of a random stretch of time per plan and control: (B, tries, T, m)."""
         states, tries, steps, controls = shape
         first = self._randint(0, steps, states, tries, 1, controls)
         length = self._randint(1, steps + 1, states, tries, 1, controls)
@@ -315,5 +315,5 @@ class _TorchClimb:
 
 
 def idle_cores() -> int:
-    """Cores that torch leaves to a search beside it, at least one."""
+    """Cores that torch leaves to a concurrent search, at least one."""
     return max(1, cores() - int(torch.get_num_threads()))

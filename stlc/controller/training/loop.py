@@ -1,4 +1,4 @@
-"""Training from beginning to end: steps, validations, rows, checkpoints, and the final evaluation."""
+"""Training loop: steps, validations, log rows, checkpoints, and the final evaluation."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 
 DEFAULT_BUDGET = 60.0
 BARREN_LOOKS, BARREN_SHARE = 5, 0.1
-"""After so many looks, and this share of the steps, a search that never found a plan is given up.
+"""Validations, and share of the steps, after which a search that never found a plan is given up.
 
-It has explored with all the effort there is by then; where it is proved that there is no plan, the first look
-is the last.
+By then exploration has used its largest effort. If a plan is proved not to exist, the first validation ends
+it.
 """
 SAVE_EVERY = 500
-"""Steps between checkpoints at most."""
+"""Maximum number of steps between checkpoints."""
 SAVE_SECONDS = 10.0
-"""Seconds between checkpoints at most: what a kill can cost."""
+"""Maximum seconds between checkpoints: the loss from a kill."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class Watch:
     """Callbacks of a training.
 
     Attributes:
-        begun: called once with what the engine chose, the margin and the number of steps among it.
+        begun: called once with the resolved options, including margin and number of steps.
         row: called with every row of `train.jsonl`.
-        stop: asked after every step; True saves and ends.
-        deferring: holds while steps are made: who asks to stop then has the step finished and saved.
-            Otherwise an interruption may be raised anywhere.
-        late: seconds by which what is done before and after the training would exceed a budget of wall time.
+        stop: called after every step; True saves and ends the training.
+        deferring: context of the steps, in which an interrupt waits until the step is finished and saved.
+            Outside of it an interrupt may be raised anywhere.
+        late: wall-time budget -> seconds by which work before and after the training would exceed it.
     """
 
     begun: Callable[[dict[str, Any]], None] = lambda _chosen: None
@@ -75,19 +75,19 @@ def train(
     """Train a policy in a new run folder that already holds its specification and system.
 
     Args:
-        task: what to train for.
-        config: what the user said.
+        task: problem to train for.
+        config: the user's options.
         folder: of the run.
-        watch: progress and interruption.
-        ranks: that train together; each calls this at the same time, and the first one writes.
+        watch: callbacks.
+        ranks: processes that train together; all call this at the same time, the first one writes.
 
     Raises:
-        SystemFileError: S301, hardly any initial state is possible; S304, the mirror of the policy is no
+        SystemFileError: S301, hardly any initial state is admissible; S304, the mirror of the policy is no
             symmetry.
-        MissingError: R201, a checkpoint cannot be written; R302, there is no such device; R403, a rank
-            is gone.
+        MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, a rank is
+            gone.
         RunError: R401, the loss or its gradient is not finite.
-        SystemFileError: S302, states are not.
+        SystemFileError: S302, states are not finite.
     """
     now = clock_of(config.clock)
     begun = now()
@@ -123,20 +123,20 @@ def resume(
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
 ) -> TrainingOutcome:
-    """Go on with a run that was interrupted; the weights become those of an uninterrupted run, bit for bit.
+    """Resume an interrupted run; the weights become those of an uninterrupted run, bit for bit.
 
     Args:
         folder: of the run.
-        steps: a new total of steps.
-        budget: seconds more; where neither is given, what is left of the budget of the run is used, or its
-            schedule of steps is followed to its end.
+        steps: new total number of steps.
+        budget: additional seconds; if neither is given, the rest of the run's budget is used, or its step
+            schedule is completed.
         device: of torch.
-        watch: progress and interruption.
-        ranks: that train together: as many as before.
+        watch: callbacks.
+        ranks: processes that train together: as many as before.
 
     Raises:
-        RunError: R101, R102, or R103 when there is nothing left to do.
-        UsageError: R104, the run was trained by another number of ranks.
+        RunError: R101, R102, or R103 where nothing is left to do.
+        UsageError: R104, the run was trained with another number of ranks.
     """
     keep_freed_memory()
     config = load_config(folder)
@@ -190,7 +190,7 @@ def resume(
 def _without_steps(
     method: Method, task: Task, config: ResolvedConfig, writer: RunWriter, time: TimeBudget, watch: Watch
 ) -> TrainingOutcome:
-    """The outcome of a planner, which is judged as it is."""
+    """Outcome of a planner, which is evaluated without training."""
     margin = task.system.decl.objective.gamma
     writer.note({"margin": margin, "steps": 0, "schedule": None})
     watch.begun({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
@@ -200,7 +200,7 @@ def _without_steps(
 
 
 def _require_as_many(before: int, now: int) -> None:
-    """Raise UsageError (R104) where a run is not gone on with by as many ranks as it was begun by."""
+    """Raise UsageError (R104) where a run is resumed with another number of ranks."""
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
         raise UsageError(
@@ -214,7 +214,7 @@ def _require_as_many(before: int, now: int) -> None:
 
 
 def find_device(name: str) -> torch.device:
-    """A torch device. Raises MissingError R302 where it is not there."""
+    """Return a torch device. Raises MissingError R302 where it does not exist."""
     try:
         best = "cuda" if torch.cuda.is_available() else "cpu"
         device = torch.device(best if name == "auto" else name)
@@ -230,12 +230,12 @@ def find_device(name: str) -> torch.device:
 
 
 class _Session:
-    """A session of training: from wherever the learner stands to the end, or to an interruption."""
+    """A training session: from the learner's present state to the end, or to an interruption."""
 
     def __init__(
         self, writer: RunWriter, learner: Trainer, watch: Watch, time: TimeBudget, schedule: StepSchedule
     ) -> None:
-        """`schedule` is followed to its end; with a budget it is planned again as the pace demands."""
+        """`schedule` is completed; with a budget it is replanned as the pace demands."""
         self.writer = writer
         self.learner = learner
         self.watch = watch
@@ -251,9 +251,9 @@ class _Session:
         self.exhausted = False
 
     def finish(self) -> TrainingOutcome:
-        """Train to the end, judge, and close the record.
+        """Train to the end, evaluate, and close the record.
 
-        Whatever interrupts it leaves the last checkpoint, from which `resume` goes on.
+        An interruption leaves the last checkpoint, from which `resume` continues.
         """
         learner = self.learner
         reasons = dict(learner.torch_reasons())
@@ -274,7 +274,7 @@ class _Session:
             learner.close()
 
     def _trained(self) -> bool:
-        """Make all steps; False where the run is to stop before."""
+        """Make all steps; False where the run is to stop earlier."""
         learner, saved = self.learner, time.perf_counter()
         while (more := self._goes_on()) and not self._hopeless():
             if not math.isfinite(learner.advance()):
@@ -292,10 +292,10 @@ class _Session:
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
-        """True where there is a step to make, after a validation where one is due; None: the run is to stop.
+        """True if another step follows, after a validation if one is due; None: the run is to stop.
 
-        Both the end and a validation wait for the search that goes on beside the steps. Where at the end that
-        takes less than was expected there is time for more steps.
+        The end and a validation wait for the concurrent search. If that takes less time than expected,
+        further steps may fit into the budget.
         """
         learner = self.learner
         ends = self._planned() <= learner.step
@@ -311,7 +311,7 @@ class _Session:
         return True
 
     def _planned(self) -> int:
-        """The steps of the run as they are planned at this moment: by its budget, or by its schedule."""
+        """Number of steps planned at this moment: by the budget, or by the schedule."""
         learner = self.learner
         if self.time.allowed:
             left = self.time.begun + self.time.seconds - self.evaluation.reserve - self.now()
@@ -325,14 +325,14 @@ class _Session:
 
     @property
     def _known_steps(self) -> int | None:
-        """Steps of the whole run; None until those of a budget have been planned."""
+        """Total number of steps; None until those of a budget have been planned."""
         return None if self.time.allowed and not self.pace.planned else self.schedule.steps
 
     def _note_schedule(self) -> None:
         self.writer.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
     def _validate(self, began: float) -> None:
-        """A validation that began at a time, and its row."""
+        """Validate and write the row; `began`: clock reading before the round."""
         learner = self.learner
         found = learner.validate()
         self.pace.looked(learner.step, self.now() - began)
@@ -343,7 +343,7 @@ class _Session:
             self.refuted = learner.ranks.any(refuted(learner.task))
 
     def _wait_for_search(self) -> bool:
-        """Let the search beside the steps come to its end; False where the run is to stop before."""
+        """Wait for the concurrent search; False where the run is to stop earlier."""
         began = self.now()
         came = self.learner.wait(self.watch.stop)
         if self.learner.searches:
@@ -351,7 +351,7 @@ class _Session:
         return not self.learner.ranks.any(not came)
 
     def _hopeless(self) -> bool:
-        """True where neither the policy nor the search has ever satisfied the specification for any state."""
+        """True if policy and search never satisfied the specification, after all effort or by proof."""
         learner = self.learner
         enough = max(BARREN_LOOKS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:
@@ -359,7 +359,7 @@ class _Session:
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
-        """The outcome of a session that does not judge its policy."""
+        """Outcome of a session without evaluation."""
         learner = self.learner
         run = Run(self.writer.folder, learner.task, learner.policy)
         return TrainingOutcome(
@@ -367,7 +367,7 @@ class _Session:
         )
 
     def _save(self) -> None:
-        """Write a checkpoint; of a search that goes on beside the steps it keeps what that begins with."""
+        """Write a checkpoint; of a running search it keeps the inputs."""
         began = self.now()
         facts = {
             **self.learner.facts(),
@@ -399,7 +399,7 @@ class _Session:
         self.watch.row(row)
 
     def _broken(self) -> StlcError:
-        """Cause of a step that was not finite. The weights are those before it: they are kept if good."""
+        """Cause of a non-finite step. The weights before it are saved if finite."""
         error, good = self.learner.diagnose()
         if good:
             self._save()

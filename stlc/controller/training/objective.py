@@ -1,4 +1,4 @@
-"""Loss of a training: the paper's truncated robustness and its performance terms (Eq. 8 to 10)."""
+"""Training loss: the paper's truncated robustness and performance terms (Eq. 8 to 10)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """The numbers of a loss.
+    """Parameters of the loss.
 
     Attributes:
-        margin: the paper's gamma; robustness beyond it earns nothing more.
-        smoothing: the paper's k; None trains on exact min and max with subgradients.
-        switch: how jumps and indicators become differentiable.
+        margin: the paper's gamma, at which robustness is truncated.
+        smoothing: the paper's k; None: exact min and max with subgradients.
+        switch: differentiable form of jumps and indicators.
         saturation: s of `s log(1 + hinge / s)`, so that infeasible states do not dominate; None: plain hinge.
         stl_weight: the paper's lambda.
         performance_weight: factor of the performance terms.
@@ -44,8 +44,8 @@ class Loss:
     """Losses per plan, (batch,) each, differentiable.
 
     Attributes:
-        total: what is averaged over the batch.
-        stl: the part that the specification adds, before lambda.
+        total: the loss, to be averaged over the batch.
+        stl: the part of the specification, before lambda.
         cost: the performance terms as if every plan were satisfying, without gradient.
         satisfied: exact verdicts of the plans that were rolled out.
     """
@@ -57,7 +57,7 @@ class Loss:
 
 
 def paper_objective(task: Task) -> Objective:
-    """The paper's own: hinge at gamma on the log-sum-exp robustness, tanh switching (Eq. 6 to 10)."""
+    """The paper's objective: hinge at gamma on log-sum-exp robustness, tanh switching (Eq. 6 to 10)."""
     declared = task.system.decl.objective
     return Objective(
         margin=declared.gamma,
@@ -69,7 +69,7 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """The engine's: exact operators, a margin of the size that is feasible, a saturating hinge."""
+    """Objective of the `guided` method: exact operators, a feasible margin, a saturating hinge."""
     return Objective(
         margin=margin,
         smoothing=None,
@@ -80,11 +80,11 @@ def guided_objective(margin: float, *, slope: float, performance_weight: float) 
 
 
 def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
-    """Loss of plans (Eq. 10: L_perf + lambda L_STL).
+    """Compute the loss of plans (Eq. 10: L_perf + lambda L_STL).
 
     Args:
-        task: to be solved.
-        objective: its numbers.
+        task: specification and system.
+        objective: parameters of the loss.
         x0: initial states, (B, n).
         u: plans in physical units, (B, T, m), differentiable.
 
@@ -107,9 +107,9 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
 def native_rolled(
     task: Task, objective: Objective, x0: Tensor, u: Tensor
 ) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, from emitted C.
+    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, by generated C.
 
-    None where that is not what the objective means, or where torch has to do the work.
+    None where the objective has another meaning, or where torch has to be used.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
@@ -119,7 +119,7 @@ def native_rolled(
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that means the same."""
+    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where the meaning is the same."""
     native = native_rolled(task, objective, x0, u)
     if native is not None:
         return task.graph.overall(native[0]), native[1]

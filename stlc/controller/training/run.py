@@ -1,4 +1,4 @@
-"""A finished or unfinished training run: its folder, its task, its policy."""
+"""A finished or unfinished training run: its folder, task and policy."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ CONFIG = "config.resolved.yaml"
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run.
+    """A training run.
 
     Attributes:
         dir: its folder.
-        task: what was trained for.
+        task: problem of the training.
         policy: the trained policy; call it with states (B, n) for plans (B, T, m) in physical units.
     """
 
@@ -67,11 +67,11 @@ class Run:
     ) -> Run:
         """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
 
-        `overrides` change constants and give values to parameters, as `--set` does, and a `scenario` of
-        the system file is laid over it; the policy stays.
+        `overrides` change constants and set parameters, as `--set` does, and a `scenario` of the system file
+        is applied; the policy is unchanged.
 
         Raises:
-            UsageError: there is no such run.
+            UsageError: the run does not exist.
             RunError: R101, it is damaged or has no checkpoint yet; R102, its checkpoint is of another task.
             SpecError, SystemFileError: its specification or system is invalid.
         """
@@ -82,7 +82,7 @@ class Run:
 
     @property
     def network_policy(self) -> BestOfKPolicy:
-        """The policy, which is a network. Raises RunError (R101) where the run's method trains none."""
+        """The policy as a network policy. Raises RunError (R101) where the run's method trains none."""
         if not isinstance(self.policy, BestOfKPolicy):
             message = f"the policy of `{self.dir.shown}` is no network"
             raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
@@ -94,34 +94,34 @@ class Run:
         return self.network_policy.network
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The policy's plans from states (B, n) and their verdicts."""
+        """Plans of the policy from states (B, n), and their verdicts."""
         return plan_judged(self.task, self.policy, x0)
 
 
 @dataclass(frozen=True, slots=True)
 class RunWriter:
-    """Writer of a run's folder while it is trained. Of several ranks the first alone writes.
+    """Writer of a run's folder during training. Of several ranks only the first writes.
 
     Attributes:
         folder: of the run.
-        writes: whether this process keeps it.
+        writes: whether this process writes.
     """
 
     folder: RunDir
     writes: bool = True
 
     def config(self, config: ResolvedConfig) -> None:
-        """Keep the numbers of the run."""
+        """Write the resolved options of the run."""
         if self.writes:
             save_config(self.folder, config)
 
     def note(self, facts: Mapping[str, object]) -> None:
-        """Enter facts into `run.json`."""
+        """Add facts to `run.json`."""
         if self.writes:
             self.folder.update(facts)
 
     def before(self, look: int) -> None:
-        """Keep the rows of validations before the one at step `look`, which is still to come."""
+        """Drop the rows from the validation at step `look` on, which will be repeated."""
         if self.writes:
             self.folder.keep_rows(lambda row: row.get("step", 0) < look)
 
@@ -131,18 +131,18 @@ class RunWriter:
             self.folder.append_row(row)
 
     def checkpoint(self, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int) -> None:
-        """Write a checkpoint of a step. Raises MissingError (R201); the last good one stays."""
+        """Write a checkpoint at a step. Raises MissingError (R201); the last good one stays."""
         if self.writes:
             hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
             save_checkpoint(self.folder, tensors, {**facts, **hashes}, step=step)
 
     def held_out(self, task: Task, score: Score) -> None:
-        """Keep the held-out states and their verdicts."""
+        """Save the held-out states and their verdicts."""
         if self.writes:
             save_states(self.folder.path / "eval" / "held_out.npz", task, score)
 
     def close(self, status: Status, result: object = None) -> None:
-        """Say how the training ended."""
+        """Record how the training ended."""
         if self.writes:
             self.folder.finish(status, result)
 
@@ -150,9 +150,9 @@ class RunWriter:
 def load_task(
     folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
 ) -> Task:
-    """Compile the specification and the system that lie in a run's folder, changed as `overrides` say.
+    """Compile the specification and the system of a run's folder, with `overrides` applied.
 
-    A parameter that the policy was trained with keeps its column: it has the value that is given.
+    A parameter that the policy was trained with keeps its column, with the given value.
     """
     trained = folder.record().get("overrides") or {}
     spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
@@ -166,19 +166,20 @@ def load_task(
 
 
 def spec_hash(folder: RunDir) -> str:
-    """SHA-256 of the specification in a run's folder and of what `--set` changed in it."""
+    """SHA-256 of the specification in a run's folder and of its `--set` changes."""
     return _hash(folder, SPEC, read_library(folder))
 
 
 def system_hash(folder: RunDir) -> str:
-    """SHA-256 of the system file in a run's folder and of what `--set` changed in it."""
+    """SHA-256 of the system file in a run's folder and of its `--set` changes."""
     return _hash(folder, SYSTEM)
 
 
 def trained_on(folder: RunDir) -> str:
-    """The hash of the system that a policy was trained on, if it may be deployed on the one in the folder.
+    """Hash of the system that a policy was trained on, if it may be deployed on the one in the folder.
 
-    What a policy learns from must be as it was; worlds, scenarios and the backup may be edited since.
+    The fields that determine what a policy learns must be unchanged; worlds, scenarios and backup may be
+    edited.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")
@@ -195,7 +196,7 @@ def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -
 
 
 def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
-    """Keep what a specification imports: the texts in a folder of their own, and which is which."""
+    """Save the imports of a specification: the texts in a folder of their own, and an index."""
     for key, text in library.items():
         write_atomic(folder.path / below / file_of(key), text)
     if library:
@@ -203,7 +204,7 @@ def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -
 
 
 def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
-    """The texts that `save_library` kept, by key. Raises RunError (R101) where one is damaged."""
+    """Read the texts saved by `save_library`, by key. Raises RunError (R101) where one is damaged."""
     if not (folder.path / below / INDEX).is_file():
         return {}
     index = folder.read_json(f"{below}/{INDEX}")
@@ -214,12 +215,12 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
 
 
 def save_config(folder: RunDir, config: ResolvedConfig) -> None:
-    """Write the numbers of a run; JSON is YAML too."""
+    """Write the resolved options of a run; JSON is YAML too."""
     write_atomic(folder.path / CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
 def load_config(folder: RunDir) -> ResolvedConfig:
-    """Read the numbers of a run. Raises RunError R101 when they are damaged."""
+    """Read the resolved options of a run. Raises RunError R101 where they are damaged."""
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
         known = {field.name for field in fields(ResolvedConfig)}

@@ -1,10 +1,10 @@
-"""Training states: fresh ones, a fixed set, those that missions pass through, and solved hard ones.
+"""Sources of training states: independent draws, a fixed set, states along missions, solved hard states.
 
-Where a specification has memory (clock, statuses, timers), a state is worth training on only if a mission
-gets there: the memory must fit the position. So many missions are simulated side by side with the plans of
-the policy as it is, and the states on their way are handed out. A mission ends when it is over or lost, and
-often where no plan satisfies the specification; another one begins in its place. At first missions end early;
-as a policy learns they get further, and plans that search has found for failing states carry some on.
+Where a specification has memory (clock, statuses, timers), a state is useful for training only if a mission
+reaches it: the memory must fit the position. So many missions are simulated in parallel with the plans of the
+present policy, and the states on the way are returned. A mission ends when it is over or lost, and often
+where no plan satisfies the specification; a new one starts in its place. Early in training missions end
+early; later they get further, and plans that search found for failing states continue some of them.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ BLOCK = 8192
 
 
 class Supply(Protocol):
-    """Source of training states."""
+    """Interface of a source of training states."""
 
     def take(self, n: int) -> Tensor:
-        """The next `n` states, (n, dim), float32."""
+        """Return the next `n` states, (n, dim), float32."""
 
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Take note of plans that solve states which a policy fails on: (k, n), (k, T, m)."""
+        """Use plans that solve states on which the policy fails: (k, n), (k, T, m)."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """All that goes on counting, by name."""
+        """State of the source, by name."""
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on where `tensors` were taken."""
+        """Restore the state of `tensors`."""
 
 
 class Draws:
     """Independent initial states.
 
     Attributes:
-        block: drawn and not yet handed out, (k, n).
+        block: drawn states not yet returned, (k, n).
     """
 
     def __init__(self, task: Task, generator: torch.Generator, device: torch.device) -> None:
@@ -62,7 +62,7 @@ class Draws:
         self.block = torch.empty(0, len(task.names), device=device)
 
     def take(self, n: int) -> Tensor:
-        """`n` fresh states, (n, dim), float32."""
+        """Return `n` fresh states, (n, dim), float32."""
         while self.block.shape[0] < n:
             drawn = self._task.sample(max(n, BLOCK), generator=self._generator, device=self._device)
             self.block = torch.cat((self.block, drawn))
@@ -73,20 +73,20 @@ class Draws:
         """Ignored: draws are independent."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """States drawn and not yet handed out."""
+        """States drawn and not yet returned."""
         return {"block": self.block}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on where `tensors` were taken."""
+        """Restore the state of `tensors`."""
         self.block = tensors["block"].to(self._device)
 
 
 class FixedSet:
-    """A training set: states of another supply, handed out in a new order each time it has been used up.
+    """A fixed training set: states of another source, reshuffled after each pass.
 
     Attributes:
         states: all of them, (size, n).
-        queue: indices of those that are still to come, (k,).
+        queue: indices that remain in this pass, (k,).
     """
 
     def __init__(self, fresh: Supply, size: int, generator: torch.Generator) -> None:
@@ -95,7 +95,7 @@ class FixedSet:
         self.queue = torch.empty(0, dtype=torch.int64, device=self.states.device)
 
     def take(self, n: int) -> Tensor:
-        """The next `n` states, (n, dim), float32."""
+        """Return the next `n` states, (n, dim), float32."""
         size = self.states.shape[0]
         while self.queue.shape[0] < n:
             order = torch.randperm(size, generator=self._generator)
@@ -107,35 +107,35 @@ class FixedSet:
         """Ignored: the set is fixed."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """The set, and what of it is still to come."""
+        """The set, and the rest of the present pass."""
         return {"states": self.states, "queue": self.queue}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on where `tensors` were taken."""
+        """Restore the state of `tensors`."""
         self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))
 
 
 Planner: TypeAlias = Callable[[Tensor], "PlanVerdicts"]
-"""States (B, n) -> the plans that are followed from there, judged."""
+"""States (B, n) -> verdicts on the followed plans."""
 
 POOL = 2048
 GLIMPSES = 4
-"""States that are handed out of every leg of a mission."""
+"""Number of states returned per leg of a mission."""
 STARTS = 0.1
-"""Share of mission starts among the states that are handed out."""
+"""Share of mission starts among the returned states."""
 ROUNDS = 5
-"""Rounds over which a mission without end is simulated."""
+"""Number of periods for which a mission without end is simulated."""
 GIVE_UP = 0.3
-"""Chance that a mission ends with a leg whose plan fails."""
+"""Probability that a mission ends after a leg whose plan fails."""
 
 
 class Missions:
-    """States on the way of missions that are driven by a planner.
+    """States along missions simulated with a planner.
 
     Attributes:
-        block: visited and not yet handed out, (k, n).
-        pool: where missions stand, (POOL, n); none before the first state is asked for.
-        age: how many steps each of them is old, (POOL,).
+        block: visited states not yet returned, (k, n).
+        pool: present states of the missions, (POOL, n); empty before the first call of `take`.
+        age: steps since the start of each mission, (POOL,).
     """
 
     def __init__(self, task: Task, generator: torch.Generator, device: torch.device, plan: Planner) -> None:
@@ -146,7 +146,7 @@ class Missions:
         self.age = torch.empty(0, device=device)
 
     def take(self, n: int) -> Tensor:
-        """`n` states that were not handed out before, (n, dim), float32."""
+        """Return `n` states not returned before, (n, dim), float32."""
         while self.block.shape[0] < n:
             self.block = torch.cat((self.block, self._visited()))
         taken, self.block = self.block[:n], self.block[n:]
@@ -154,7 +154,7 @@ class Missions:
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Some missions go on where plans lead that solve states which the policy fails on."""
+        """Continue some missions from states reached by plans that solve states on which the policy fails."""
         if len(states) and len(self.pool):
             judged = self._task.judge(states, plans)
             reached = self._at(judged, self._legs(len(states)))
@@ -163,20 +163,20 @@ class Missions:
             self.pool[place], self.age[place] = reached[: len(place)], 0.0
 
     def tensors(self) -> dict[str, Tensor]:
-        """States of all missions."""
+        """State of all missions."""
         return {"block": self.block, "pool": self.pool, "age": self.age}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on where `tensors` were taken."""
+        """Restore the state of `tensors`."""
         self.block, self.pool, self.age = (
             tensors[name].to(self._device) for name in ("block", "pool", "age")
         )
 
-    # ------------------------------------------------------------------ driving
+    # ------------------------------------------------------------------ simulation
 
     @torch.no_grad()
     def _visited(self) -> Tensor:
-        """Drive every mission for one leg, and return states on the way in random order, (k, n)."""
+        """Simulate every mission for one leg, and return states on the way in random order, (k, n)."""
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self._device)
         judged = self._plan(self.pool)
@@ -192,19 +192,19 @@ class Missions:
         return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
-        """New missions for those that are over or lost, and for some whose plan failed."""
+        """Restart missions that are over or lost, and some whose plan failed."""
         given_up = ~good & (self._rand(len(good)) < GIVE_UP)
         ended = (self.age > mission_steps(self._task)) | ~self._task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
-        """Steps over which plans are followed, up to half of the horizon, (n,) int64."""
+        """Random number of steps for which plans are followed, up to half of the horizon, (n,) int64."""
         most = max(self._task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self._generator).to(self._device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
-        """Predicted states after so many steps, one number a row: (n, dim)."""
+        """Predicted states after `steps`, one number per row: (n, dim)."""
         return torch.stack([judged.columns[name].gather(0, steps[None])[0] for name in self._task.names], 1)
 
     def _starts(self, n: int) -> Tensor:
@@ -218,7 +218,7 @@ class Missions:
 
 
 def mission_steps(task: Task) -> int:
-    """Steps of a mission: past the last one that is named; of one without end, some rounds."""
+    """Steps of a mission: up to a horizon past the last named one; without end, some periods."""
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
         return task.horizon * 4
@@ -229,9 +229,9 @@ def mission_steps(task: Task) -> int:
 
 @torch.no_grad()
 def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
-    """`n` states that missions pass through when the policy drives them, (n, dim) float64.
+    """`n` states along missions simulated with the policy, (n, dim) float64.
 
-    Missions are driven no further once `enough` says so.
+    The simulation stops once `enough` returns True.
     """
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)
@@ -257,7 +257,7 @@ CAPACITY = 20_000
 
 @dataclass(slots=True)
 class ReplayBuffer:
-    """A ring of solved hard states.
+    """Ring buffer of solved hard states.
 
     Attributes:
         states: (capacity, n).
@@ -271,7 +271,7 @@ class ReplayBuffer:
 
     @classmethod
     def empty(cls, state: int, steps: int, controls: int, device: torch.device) -> ReplayBuffer:
-        """A buffer without entries for states of `state` columns and plans of `steps` x `controls`."""
+        """An empty buffer for states of `state` columns and plans of `steps` x `controls`."""
         return cls(
             torch.zeros(CAPACITY, state, device=device), torch.zeros(CAPACITY, steps, controls, device=device)
         )
@@ -285,12 +285,12 @@ class ReplayBuffer:
         return self.plans[: len(self)]
 
     def add(self, states: Tensor, plans: Tensor) -> None:
-        """Append (k, n) states and (k, T, m) plans, the oldest go first."""
+        """Append (k, n) states and (k, T, m) plans; the oldest are dropped."""
         index = (torch.arange(states.shape[0], device=states.device) + self.count) % CAPACITY
         self.states[index], self.plans[index] = states, plans
         self.count += states.shape[0]
 
     def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """`n` entries with replacement: (n, dim), (n, T, m)."""
+        """Draw `n` entries with replacement: (n, dim), (n, T, m)."""
         index = torch.randint(len(self), (n,), generator=generator).to(self.states.device)
         return self.states[index], self.plans[index]

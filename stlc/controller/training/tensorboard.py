@@ -1,4 +1,4 @@
-"""The rows of a training as TensorBoard reads them (`pip install 'stlc[log]'`)."""
+"""TensorBoard log of a training (`pip install 'stlc[log]'`)."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ class Writer(Protocol):
     """Subset of `SummaryWriter` that is used here."""
 
     def add_scalar(self, tag: str, value: float, step: int, /) -> None:
-        """Enter a number."""
+        """Log a number."""
 
     def add_text(self, tag: str, text: str, step: int, /) -> None:
-        """Enter a text."""
+        """Log a text."""
 
     def close(self) -> None:
-        """Write all that is left."""
+        """Write pending events and close."""
 
 
 Opener: TypeAlias = "Callable[[Path], TensorBoardLogger]"
-"""The folder of a run -> its log."""
+"""Constructor of a log from a run folder."""
 
 
 class TensorBoardLogger:
-    """Events of one run."""
+    """TensorBoard logger of one run."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
 
     def begun(self, chosen: Mapping[str, Any]) -> None:
-        """Enter what the engine chose."""
+        """Log the resolved options."""
         lines = "\n".join(f"| {markdown(key)} | {markdown(str(value))} |" for key, value in chosen.items())
         self._writer.add_text("engine", f"| | |\n|---|---|\n{lines}", 0)
 
     def row(self, row: Mapping[str, Any]) -> None:
-        """Enter a row of `train.jsonl`: each number under its name, requirements in a group of theirs."""
+        """Log a row of `train.jsonl`: each number under its name, requirements in a group."""
         step = int(row["step"])
         for key in _PLAIN:
             if row.get(key) is not None:
@@ -57,12 +57,12 @@ class TensorBoardLogger:
             self._writer.add_scalar("repaired", row["repaired"] / row["failing"], step)
 
     def close(self) -> None:
-        """Write all that is left."""
+        """Write pending events and close."""
         self._writer.close()
 
 
 def find_writer() -> Opener:
-    """Opener of logs: tensorboardX, else torch with tensorboard.
+    """Return the log constructor of tensorboardX, else of torch with tensorboard.
 
     Raises:
         MissingError: R301, neither is installed.
