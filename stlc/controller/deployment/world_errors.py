@@ -112,7 +112,7 @@ def _raised_at(error: BaseException, file: str) -> Span | None:
 
 
 def _defined_at(world: object, method: str) -> Span | None:
-    """Line of a world's file where a method begins; None for an inherited method."""
+    """Line of a world's file where a method begins; None for a method of stlc."""
     code = getattr(getattr(_class_of(world), method, None), "__code__", None)
     if not isinstance(code, CodeType) or Path(__file__).parents[1] in Path(code.co_filename).parents:
         return None

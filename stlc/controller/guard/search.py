@@ -112,8 +112,8 @@ class RelaxedSearch:
 
         Returns:
             One plan per agent: that of the full guard; where its margin is too small, the safe plan with the
-                largest margin found. Where already the present state lacks the margin, so does every plan,
-                and this search starts from plans that satisfy or are safe without margin.
+            largest margin found. Where already the present state lacks the margin, so does every plan, and
+            this search starts from plans that satisfy or are safe without margin.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)

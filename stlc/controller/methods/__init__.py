@@ -1,4 +1,9 @@
-"""Training methods and planners, one per file, named as in `--method` and `train: {method: …}`."""
+"""Training methods and planners, one per file, named as in `--method` and `train: {method: …}`.
+
+A file holds an object `METHOD` with the attributes of `Method`; `stlc.registry.METHODS` finds it by file name.
+Schema, command line and tables read the names from there, without torch. Code shared by several methods lies
+in files whose names begin with `_`.
+"""
 
 from __future__ import annotations
 

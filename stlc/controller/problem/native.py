@@ -52,7 +52,12 @@ def motion_of(system: System) -> Motion:
 
 
 class NativeJudge:
-    """Native robustness kernel of one task on the CPU."""
+    """Native robustness kernel of one task on the CPU.
+
+    Attributes:
+        kernel: built for the task's dynamics and requirements.
+        names: of the state columns.
+    """
 
     def __init__(self, kernel: Kernel, system: System, rules: Sequence[CompiledRequirement]) -> None:
         self.kernel = kernel

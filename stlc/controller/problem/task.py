@@ -322,7 +322,7 @@ def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
 
     Returns:
         Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and
-            where that is flat falling with cost), 2 less where unsafe.
+        where that is flat falling with cost), 2 less where unsafe.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))

@@ -103,7 +103,7 @@ def train_here(
 
     Args:
         task: problem to train for; see `stlc.compile`.
-        budget: seconds; by default that of the system file, else 60.
+        budget: seconds; None takes the system file's, else 60 without `steps`.
         steps: optimiser steps; take precedence over `budget`.
         seed: of all random numbers; None takes the system file's.
         method: `guided` (search and distil) or `gradient` (the paper's); None takes the system file's.

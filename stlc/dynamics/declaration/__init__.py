@@ -1,1 +1,1 @@
-"""The sections of a system file: their records, and how they are read."""
+"""Sections of a system file: their records and readers."""

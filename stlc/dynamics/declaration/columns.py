@@ -44,11 +44,11 @@ class ControlDecl:
 
     Attributes:
         name: as written.
-        unit: of the numbers that are stored.
+        unit: of the stored numbers.
         low: lower end of its range, in `unit`.
         high: upper end.
         squash: map from a network output to a value in the range.
-        levels: the values that a search may try; empty where the range is sampled evenly.
+        levels: the values for searches; if empty the range is sampled evenly.
     """
 
     name: str
@@ -105,7 +105,7 @@ class ControlKeys:
 
 
 def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, StateKeys]:
-    """The section `state`; gives back the keys of every state."""
+    """Read the section `state`; return the keys of every state."""
     if node is None:
         reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
     described: dict[str, StateKeys] = {}
@@ -129,13 +129,13 @@ def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, St
 
 
 def _add(columns: tuple[Column, ...], names: Names) -> None:
-    """Add the columns of one state; the components of a vector share its place."""
+    """Add the columns of one state; the components of a vector have the same source location."""
     names.columns.extend(columns)
     names.place_components(base_name(columns[0].name), [column.name for column in columns])
 
 
 def name_columns(names: Names, about: str) -> None:
-    """Make the columns names that expressions may use, and their members with them."""
+    """Declare the columns, and members of enums, as names for expressions."""
     known = column_entries(names.columns, about=about)
     names.entries |= {name: entry for name, entry in known.items() if name not in names.entries}
     names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
@@ -177,7 +177,7 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
 
 
 def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
-    """The range `[low, high]` of every component, in its unit; an end is a number for all or a vector."""
+    """Range `[low, high]` of every component, in its unit; an end is a number for all or a vector."""
     node, reader, here = keys.ends, cx.reader, cx.here
     if node is None:
         return None
@@ -202,7 +202,7 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
 
 
 def read_params(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
-    """The section `param`: columns after the states, and their distributions, in order.
+    """Read the section `param`: columns after the states, and their distributions, in order.
 
     `r: {unit: m, range: [0.6, 1.2]}` is uniform on its range; `draw` gives another distribution, and may
     stand alone: `r: normal(1 m, 0.1 m)`. Later parameters may read earlier ones.
@@ -231,7 +231,7 @@ def read_params(node: Node | None, reader: Reader, names: Names) -> tuple[Assign
 
 
 def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
-    """The keys of a parameter; an expression alone is its `draw`, and gives its unit."""
+    """Keys of a parameter; an expression alone is its `draw`, and determines its unit."""
     if isinstance(entry.value, Scalar):
         number = replace(cx.here, reader=Reader(cx.reader.source)).number(entry.value, "")
         unit = Unit() if number is None or number.bare else number.unit
@@ -250,7 +250,7 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 
 
 def _even(column: Column) -> tuple[ir.Num, str]:
-    """The uniform distribution on the values of a column, and its text."""
+    """Uniform distribution on the values of a column, and its text."""
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
         return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"
@@ -261,7 +261,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """The column with the range of its distribution, where none is written."""
+    """The column; without a written range it gets that of its distribution."""
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])
@@ -271,7 +271,7 @@ def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
 
 
 def read_controls(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `control`."""
+    """Read the section `control`."""
     if node is None:
         advice = "control: {u: {range: [-1, 1]}}"
         reader.report("S102", "the file lacks `control`", reader.source.span(0, 1), advice)
@@ -305,7 +305,7 @@ def _controls(name: str, keys: ControlKeys, where: str, cx: Context) -> tuple[Co
 def read_levels(
     node: Node | None, where: str, unit: Unit, bounds: tuple[float, float], cx: Context
 ) -> tuple[float, ...]:
-    """The values of a control that a search may try, within its range."""
+    """Read the values of a control that a search may try, within its range."""
     items = cx.reader.items(node, f"`levels` of {where}")
     levels = [cx.here.constant(item, f"a level of {where}", unit) for item in items]
     low, high = bounds

@@ -1,4 +1,4 @@
-"""The declaration of a system: names bound, units checked, expressions in the IR. No torch."""
+"""Declaration of a system: bound names, checked units, expressions in the IR. No torch."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ LEARNT = (
     *("dt", "horizon", "substeps", "integrator", "discrete", "constants", "signature", "controls"),
     *("flow", "jumps", "clamps", "init", "objective", "policy", "feedback"),
 )
-"""The fields of a system that decide what a policy learns."""
+"""Fields of a system that determine what a policy learns."""
 _HASHED_AS = {
     **{"Const": "Lit", "Signal": "Col", "ShiftedSignal": "At", "FrozenVar": "Held"},
     **{"Indicator": "Ind", "Predicate": "Atom", "BoolOp": "Join"},
 }
-"""Nodes under the names that they had when the first hashes were made: runs keep theirs."""
+"""Earlier class names of nodes, used in hashes so that those of existing runs stay valid."""
 
 
 @dataclass(frozen=True)
@@ -48,21 +48,21 @@ class SystemDecl:
         horizon: planning horizon in steps.
         substeps: integration steps within one step.
         integrator: name of the integrator.
-        discrete: `flow` holds next-state maps instead of derivatives.
+        discrete: whether `flow` holds next-state maps instead of derivatives.
         constants: name -> (value in SI units, unit).
         signature: the state columns, in order.
-        controls: what is planned, in order: the inputs, or how far they are from what `feedback` gives.
-        flow: derivative (or next value) a column, in its unit per second; unlisted ones are constant.
+        controls: planned variables, in order: the inputs, or their deviations from `feedback`.
+        flow: derivative (or next value) per column, in its unit per second; unlisted ones are constant.
         jumps: in file order.
-        clamps: columns that are kept within (low, high).
-        feedback: beneath the plans; None where actuators get what is planned.
+        clamps: column -> (low, high) to which it is limited.
+        feedback: inner feedback law; None where plans are the actuator commands.
         scenarios: named overlays.
-        scenario: the one that is laid over, if any.
-        functions: from outside, for specifications.
-        bases: the texts of the files that it extends, the nearest first.
-        overrides: what `--set` changed.
+        scenario: the applied overlay, if any.
+        functions: external functions for specifications.
+        bases: texts of the extended files, the nearest first.
+        overrides: values of `--set`.
         places: name of a state, control, constant or definition -> where it is declared.
-        warnings: findings that do not stop anything.
+        warnings: findings that are not errors.
     """
 
     name: str
@@ -98,14 +98,14 @@ class SystemDecl:
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the text and of what was overridden, in hexadecimal."""
+        """SHA-256 of the text and the overrides, in hexadecimal."""
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
         texts = "".join(base.text for base in self.bases)
         return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
 
     @property
     def learnt(self) -> str:
-        """SHA-256 of the parts that a policy learns from, in hexadecimal."""
+        """SHA-256 of the fields that determine what a policy learns, in hexadecimal."""
         text = repr([getattr(self, name) for name in LEARNT])
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -123,16 +123,16 @@ class SystemDecl:
         return tuple(judge for judge in named if judge is not None)
 
     def judges_by(self, spec: Path) -> bool:
-        """Whether closed-loop runs are judged by this specification, so that it is for recorded traces."""
+        """True if this specification judges closed-loop runs, so that it applies to recorded traces."""
         return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
 
     @property
     def grid(self) -> Grid:
-        """The steps that formulas are compiled for."""
+        """Time grid that formulas are compiled for."""
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:
-        """The interface that specifications are compiled against; no function is loaded."""
+        """Interface that specifications are compiled against; no function is loaded."""
         names = frozenset(function.name for function in self.functions)
         known = {function.name: function for function in self.functions if function.body is not None}
         path = self.source.name

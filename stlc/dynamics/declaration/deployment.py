@@ -1,4 +1,4 @@
-"""The sections `backup`, `test` and `scenario`: a deployment, its events, its world, and its overlays."""
+"""Sections `backup`, `test` and `scenario`: deployment, events, world, and scenario overlays."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ METRICS = ("stl_accuracy", "safety", "progress", "latency")
 SPECS = (".stl", ".stlc")
 Edge = Literal["rise", "fall"]
 Starts = Literal["any", "savable", "feasible"]
-"""Initial states of agents: all that are drawn, or those from which a search finds a safe plan, or a plan
-that satisfies everything."""
+"""Admitted initial states of agents: all, those with a known safe plan, or a known satisfying plan."""
 
 
 # ------------------------------------------------------------------------------------ backup
@@ -56,7 +55,7 @@ that satisfies everything."""
 
 @reads(mapping_of({"type": "array", "items": EXPRESSION}))
 def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
-    """Values of controls, in the place of what those declare themselves."""
+    """Values of controls that replace the declared ones."""
     found = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -72,7 +71,7 @@ def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ..
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """The prefixes that the backup policy tries."""
+    """Prefixes that the backup policy tries."""
 
     bins: int = key(integer(2), "values of a control, evenly over its range", 5)
     levels: Mapping[str, tuple[float, ...]] = key(_levels, "values by control, in place of `bins`", {})
@@ -83,7 +82,7 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """The section `backup`, or that of a scenario; prefixes end at the horizon."""
+    """Read the section `backup`, or that of a scenario; prefixes end at the horizon."""
     backup, horizon = read(BackupDecl, cx, node, label), cx.clock.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
     if lengths is not None and 0 < horizon < max(backup.lengths):
@@ -99,7 +98,7 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 
 @reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """A state formula, or `rise(…)`, `fall(…)` of one."""
+    """Trigger condition: a state formula, or `rise(…)`, `fall(…)` of one."""
     expr = cx.here.parse(node, label)
     match expr:
         case None:
@@ -112,7 +111,7 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 
 @reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """A step of the deployment; 0 is its start."""
+    """Step of the deployment; 0 is its start."""
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 
@@ -133,7 +132,7 @@ class EventDecl:
 
 @reads(items_of(json_schema(EventDecl)), EventDecl)
 def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
-    """Events, each with exactly one of `when`, `at` and `every`."""
+    """Read events, each with exactly one of `when`, `at` and `every`."""
     found = []
     for index, item in enumerate(cx.reader.items(node, label)):
         event = read(EventDecl, cx, item, "an event")
@@ -151,7 +150,7 @@ def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
 
 @dataclass(frozen=True, slots=True)
 class WorldRef:
-    """The class of a world, in a Python file beside the system file."""
+    """Class of a world, in a Python file beside the system file."""
 
     path: Path
     name: str
@@ -160,12 +159,12 @@ class WorldRef:
 
 @dataclass(frozen=True, slots=True)
 class JudgeRef:
-    """The specification that closed-loop runs are judged by.
+    """Specification that judges closed-loop runs.
 
     Attributes:
         path: of its file.
-        written: the path as the system file has it, by which a run knows its copy.
-        span: where that stands.
+        written: the path as written in the system file, which identifies a run's copy.
+        span: source location of the path.
     """
 
     path: Path
@@ -175,7 +174,7 @@ class JudgeRef:
 
 @reads({"type": ["string", "null"]})
 def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
-    """`file.py:Class`, relative to the system file."""
+    """Read `file.py:Class`, relative to the system file."""
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`world`")
     if text is None:
         return None
@@ -188,7 +187,7 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
 
 @reads({"type": ["string", "null"]})
 def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
-    """A specification, relative to the file that names it."""
+    """Read the path of a specification, relative to the file that names it."""
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
     if text is None:
         return None
@@ -201,7 +200,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
 
 @reads(items_of({"type": "string"}))
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
-    """Constants, by name; a vector has one."""
+    """Read names of constants; a vector has one."""
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
     items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]
     for item in items:
@@ -212,7 +211,7 @@ def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TestDecl:
-    """A deployment: its length, the number of agents, when they plan, and the events that they meet."""
+    """Deployment: number of steps and agents, replanning period, and events."""
 
     __test__ = False
 
@@ -236,8 +235,8 @@ class TestDecl:
 class ErrorsDecl:
     """Errors of actuators, parameters and sensors, as shares.
 
-    A direction (squash `angle`) is off by a share of a radian instead. Parameters are the numbers in the
-    dynamics (`stlc.dynamics.scenarios.perturbed`). Clocks, which are states in seconds, are known exactly.
+    For a direction (squash `angle`) the error is a share of a radian. Parameters are the numbers in the
+    dynamics (`stlc.dynamics.scenarios.perturbed`). Clocks, which are states in seconds, are exact.
     """
 
     actuator_gain: float = key(fraction, "constant relative error of every control of an agent", 0.0)
@@ -248,7 +247,7 @@ class ErrorsDecl:
 
 @reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
-    """Constants and their other values, as text."""
+    """Constants and their changed values, as text."""
     found: dict[str, str] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -266,7 +265,7 @@ def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @reads(mapping_of(VECTOR))
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
-    """Additions to derivatives (or next values), in the unit of the state per second."""
+    """Terms added to derivatives (or next values), in the unit of the state per second."""
     found: list[Assign] = []
     here = cx.amounts().here
     for entry in cx.reader.entries(node, label):
@@ -282,7 +281,7 @@ def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
-    """A named overlay of a deployment."""
+    """Named overlay of a deployment."""
 
     name: str
     doc: str = key(LINE, "one line for people", "")
@@ -307,7 +306,7 @@ class ScenarioDecl:
 
 
 def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
-    """The section `scenario`: all overlays, in order, each checked whether it is chosen or not."""
+    """Read the section `scenario`: all overlays, in order; each is checked, whether applied or not."""
     return tuple(
         _scenario(entry, cx)
         for entry in cx.reader.entries(node, "`scenario`")

@@ -1,4 +1,4 @@
-"""A system file as tables of text: states, controls, flow, jumps and scenarios. No torch."""
+"""Description of a system as tables of text: states, controls, flow, jumps and scenarios. No torch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Row = tuple[str, ...]
 
 
 def describe(decl: SystemDecl) -> str:
-    """States, controls, flow, jumps, initial situations and scenarios of a system, as lines of text."""
+    """Describe states, controls, flow, jumps, initial situations and scenarios as lines of text."""
     head = visible(f"{decl.name}: {decl.doc}" if decl.doc else decl.name)
     substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
     kind = "discrete" if decl.discrete else decl.integrator
@@ -46,7 +46,7 @@ def _state(column: Column, flow: str | None, rate: str) -> Row:
 
 
 def _values(column: Column) -> str:
-    """The values that a column takes, in words."""
+    """Values of a column in words."""
     if column.kind == "bool":
         return "bool"
     if column.labels:
@@ -63,7 +63,7 @@ def _control(decl: SystemDecl, index: int) -> Row:
 
 
 def _feedback(decl: SystemDecl) -> list[Row]:
-    """The feedback law, a row a control: `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`."""
+    """Feedback law, one row per control: `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`."""
     feedback = decl.feedback
     rows: list[Row] = []
     for i, control in enumerate(decl.controls if feedback is not None else ()):

@@ -1,4 +1,4 @@
-"""The section `functions`: Python functions, named and not loaded, and kinematics from robot descriptions."""
+"""Section `functions`: references to Python functions, not loaded, and kinematics from robot descriptions."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", 
 
 @dataclass(frozen=True, slots=True)
 class FunctionDecl:
-    """A function that specifications may call: in Python, on arrays, or known as numbers.
+    """External function for specifications: in Python, or given as IR expressions.
 
     Attributes:
-        name: by which `extern fn` knows it.
+        name: its name in `extern fn`.
         module: the module, or the file beside the system file, that holds it.
         attribute: its name there.
-        library: the arrays that it takes; None takes what the caller has.
-        span: where it is named.
-        body: what it computes, from one vector to one, where the file says that; None for Python.
+        library: array library of its arguments; None accepts the caller's arrays.
+        span: source location of its name.
+        body: IR expressions from one vector to one, where the file defines them; None for Python.
         base: of kinematics, the link that positions are relative to; "" is the root.
     """
 
@@ -45,7 +45,7 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """The function with declared sizes. Raises SystemFileError (S208) where they differ."""
+        """The function with declared sizes. Raises SystemFileError (S208) for other sizes."""
         assert self.body is not None
         takes, gives = len(self.body.formals), len(self.body.outputs)
         if (arguments, result) == ((takes,), gives):
@@ -59,7 +59,7 @@ class FunctionDecl:
 
 @dataclass(repr=False, eq=False)
 class FunctionKeys:
-    """The keys of a function from outside."""
+    """Keys of an external function."""
 
     kind: str | None = key(word(_OWN), "origin of the function", required=True)
     target: str | None = key(TEXT, "of `python`: `package.module:function` or `file.py:function`")
@@ -72,7 +72,7 @@ class FunctionKeys:
 
 
 def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
-    """Functions from outside; those known as numbers become names that expressions may call.
+    """Read external functions; those with IR expressions become names that expressions may call.
 
     `f: {kind: python, target: "package.module:function"}`, or `"file.py:function"` beside the file;
     `ee: {kind: urdf, file: arm.urdf, tip: flange}`: the position of that link, from those of its joints.

@@ -1,4 +1,4 @@
-"""The section `init`: the distribution of initial states, as a mixture of situations, a grid, or a file."""
+"""Section `init`: distribution of initial states, as a mixture of situations, a grid, or a file."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ _DRAWS = raw(mapping_of(VECTOR))
 
 @dataclass(frozen=True, slots=True)
 class GridDecl:
-    """Every combination of a few values: name of a column -> its values, in the unit of the column."""
+    """Grid of initial states: name of a column -> its values, in the unit of the column."""
 
     axes: tuple[tuple[str, tuple[float, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """States from a file: each column an array of that name, all samples of all traces."""
+    """Initial states from a file: each column an array of that name, all samples of all traces."""
 
     path: Path
     names: tuple[str, ...]
@@ -57,14 +57,14 @@ class FileDecl:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """A way to draw an initial state: assignments in order, then one of the branches.
+    """Component of the mixture of initial states: assignments in order, then one of the branches.
 
     Attributes:
         name: for messages and tables; "" for an unnamed branch.
         weight: share among its siblings, not normalised.
-        draws: in order; later ones read earlier ones. Names that are no columns are local.
-        branches: a sub-mixture that goes on from here.
-        points: known states of which one is taken, before anything is drawn.
+        draws: assignments in order; later ones may read earlier ones. Names that are not columns are local.
+        branches: sub-mixture of continuations.
+        points: given states, one of which is taken before the draws.
     """
 
     name: str
@@ -76,14 +76,14 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class InitDecl:
-    """The distribution of initial states: a mixture, and conditions that every state must meet.
+    """Distribution of initial states: a mixture with rejection by conditions.
 
     Attributes:
         mixture: of situations.
         where: conditions that every state must meet.
         where_text: as written.
-        params: drawn before a situation is picked; situations may draw them anew.
-        override: drawn last, over the draws of situations.
+        params: drawn before a situation is picked; situations may redraw them.
+        override: drawn last, replacing draws of situations.
         span: for messages.
     """
 
@@ -97,7 +97,7 @@ class InitDecl:
 
 @dataclass(repr=False, eq=False)
 class SituationKeys:
-    """The keys of a situation, and of each branch of one."""
+    """Keys of a situation, and of each of its branches."""
 
     name: str = key(NAME, "for messages and tables", "", label=OF)
     weight: float = key(number(), "share among its siblings, not normalised", 1.0)
@@ -133,13 +133,13 @@ class AxisKeys:
 
 @dataclass(frozen=True, slots=True)
 class _Drawn:
-    """The states and local names that have a value at some point of a situation."""
+    """States and local names that have a value so far in a situation."""
 
     states: frozenset[str] = frozenset()
     locals: tuple[tuple[str, Number | Vector], ...] = ()
 
     def drawing(self, cx: Context) -> Context:
-        """Expressions that may draw, and read what has a value."""
+        """Context for expressions that may draw, and read names with a value."""
         entries: dict[str, Name] = {name: Known(number, "local name") for name, number in self.locals}
         ready = self.states | {name for local, value in self.locals for name in _columns_of(local, value)}
         return cx.drawing(entries, ready)
@@ -150,7 +150,7 @@ def _columns_of(name: str, value: Number | Vector) -> tuple[str, ...]:
 
 
 def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
-    """The section `init`; `params` are drawn before everything else."""
+    """Read the section `init`; `params` are drawn before everything else."""
     reader = cx.reader
     if node is None:
         advice = "init: {mixture: [{draw: {x: 0}}]}"
@@ -181,7 +181,7 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
 
 
 def _mixture(items: tuple[Node, ...], drawn: _Drawn, cx: Context) -> tuple[Situation, ...]:
-    """Situations, with weights that are not all 0."""
+    """Read situations; not all weights may be 0."""
     situations = [_situation(item, drawn, cx) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
         cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
@@ -189,7 +189,7 @@ def _mixture(items: tuple[Node, ...], drawn: _Drawn, cx: Context) -> tuple[Situa
 
 
 def _situation(node: Node, drawn: _Drawn, cx: Context) -> Situation:
-    """One situation, or one branch of one."""
+    """Read one situation, or one of its branches."""
     keys = read(SituationKeys, cx, node, "a situation")
     draws = _Draws(cx, drawn)
     draws.read(keys)
@@ -201,7 +201,7 @@ def _situation(node: Node, drawn: _Drawn, cx: Context) -> Situation:
 
 
 def _all_drawn(called: str, draws: _Draws, node: Node, cx: Context) -> None:
-    """Report states that have no first value."""
+    """Report states without initial value."""
     undrawn = [column.name for column in cx.names.columns if column.name not in draws.drawn.states]
     missing = list(dict.fromkeys(map(base_name, undrawn)))
     if missing and not draws.failed:
@@ -250,7 +250,7 @@ class _Draws:
         self.drawn = replace(self.drawn, states=self.drawn.states | {column.name for column in columns})
 
     def _needed(self, node: Node) -> None:
-        """The local names that an expression mentions."""
+        """Resolve the local names that an expression mentions."""
         texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
         for name in list(self.lets):
             if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
@@ -279,11 +279,11 @@ class _Draws:
         self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))
 
 
-# ---------------------------------------------------------------------------- known points
+# ---------------------------------------------------------------------------- given states
 
 
 def _known(keys: InitKeys, node: Node, drawn: _Drawn, cx: Context) -> Situation:
-    """One situation whose states come from a grid or a file, except for those that it draws."""
+    """Situation whose states come from a grid or a file, except for those that it draws."""
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
         column.name
@@ -305,7 +305,7 @@ def _known(keys: InitKeys, node: Node, drawn: _Drawn, cx: Context) -> Situation:
 
 
 def _grid(node: Node, cx: Context) -> GridDecl:
-    """`{x: {from: -1, to: 1, count: 21}, sign: [stop, light]}`: every combination of the values."""
+    """Read `{x: {from: -1, to: 1, count: 21}, sign: [stop, light]}`: every combination of the values."""
     axes = []
     for entry in cx.reader.entries(node, "`grid`"):
         columns = states_of(entry, "`grid`", cx)
@@ -320,7 +320,7 @@ def _grid(node: Node, cx: Context) -> GridDecl:
 
 
 def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
-    """The values of one axis, in the unit of the column; one that is wrong stands for 0."""
+    """Values of one axis, in the unit of the column; an invalid one is replaced by 0."""
     where = f"the values of `{column.name}`"
     if isinstance(entry.value, Mapping):
         return _spaced(column, entry.value, where, cx)
@@ -338,7 +338,7 @@ def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
 
 
 def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[float, ...]:
-    """`{from: 0, to: 1, count: 5}`: evenly spaced, both ends among them."""
+    """Read `{from: 0, to: 1, count: 5}`: evenly spaced, including both ends."""
     keys = read(AxisKeys, cx, node, where)
     low = cx.here.constant(keys.from_, f"`from` of {where}", column.unit)
     high = cx.here.constant(keys.to, f"`to` of {where}", column.unit)
@@ -350,7 +350,7 @@ def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[flo
 
 
 def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
-    """`from: starts.npz`, relative to the system file; the states that are not drawn come from there."""
+    """Read `from: starts.npz`, relative to the system file; states that are not drawn come from there."""
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None

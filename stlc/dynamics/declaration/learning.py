@@ -1,4 +1,4 @@
-"""The sections `objective`, `policy` and `train`: the loss, the network, and the training of a policy."""
+"""Sections `objective`, `policy` and `train`: loss, network, and training of a policy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from stlc.source import Span
 from stlc.units import Unit
 
 START = "_start"
-"""Behind the name of a state: its value at the start of the plan, in performance terms."""
+"""Suffix of a state's name for its value at the start of the plan, in performance terms."""
 OUTCOME = {
     "sat": "1 where the trajectory satisfies the specification",
     "rho": "robustness of the trajectory",
@@ -72,7 +72,7 @@ class Term:
 
 @reads(items_of(json_schema(Term)), Term)
 def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
-    """A list of performance terms; they read `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
+    """Read performance terms; they may use `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
     names = cx.names
     entries = {name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()}
     entries["t"] = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the plan")
@@ -94,7 +94,7 @@ def _term_label_of(node: Node) -> str:
 
 
 def _first(state: Entry) -> Known:
-    """The value of a state at the start of the plan; a column may be converted to another unit."""
+    """Value of a state at the start of the plan; a column may be converted to another unit."""
     assert isinstance(state, Known)
     about = "its value at the start of the plan"
     match state.value:
@@ -126,17 +126,17 @@ class ObjectiveDecl:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """A linear feedback beneath the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+    """Linear feedback law: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
-    `v` is what is planned; everything is in the units of the columns.
+    `v` is the plan; all values are in the units of the columns.
 
     Attributes:
-        gain: K, a row a control with an entry a state.
-        state: x0, one a state.
-        control: u0, one a control.
+        gain: K, a row per control with an entry per state.
+        state: x0, one per state.
+        control: u0, one per control.
         low: lower ends of the actuators' ranges.
         high: upper ends.
-        authority: a, how much the feedback adds at most, one a control.
+        authority: a, the largest contribution of the feedback, one per control.
     """
 
     gain: tuple[tuple[float, ...], ...]
@@ -148,7 +148,7 @@ class Feedback:
 
 
 def _by_column(cx: Context, node: Node | None, label: str, known: Mapping[str, Unit]) -> dict[str, Node]:
-    """Values by the names of columns."""
+    """Read values by the names of columns."""
     found = {}
     for entry in cx.reader.entries(node, label):
         if entry.key.text in known:
@@ -211,7 +211,7 @@ class FeedbackDecl:
 
 @reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """The feedback asked for: `lqr`, or a mapping."""
+    """Read the requested feedback: `lqr`, or a mapping."""
     if isinstance(node, Scalar) and node.is_null:
         return {"feedback_span": node.span}
     if not isinstance(node, Scalar):
@@ -229,7 +229,7 @@ def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
-    """One item of `observe`: a number, a formula, or the components of a vector."""
+    """Read one item of `observe`: a number, a formula, or the components of a vector."""
     expr = cx.here.parse(node, "an observation")
     if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
         value = cx.here.truth(node, "an observation")
@@ -243,9 +243,9 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 @reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """The images of states and controls under a symmetry; those that are not listed stay as they are.
+    """Read the images of states and controls under a symmetry; unlisted ones are unchanged.
 
-    Dynamics and specification are compared with their images later: see `controller.problem.symmetry`.
+    The symmetry of dynamics and specification is checked later: see `controller.problem.symmetry`.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)
@@ -274,12 +274,12 @@ def _integers(cx: Context, node: Node, label: str) -> tuple[int, ...] | None:
 
 _WHOLE = {"type": "integer", "minimum": 1, "maximum": 65_536}
 INTEGERS = Kind(_integers, {"anyOf": [_WHOLE, {"type": "array", "items": _WHOLE}]})
-"""Positive whole numbers; one alone counts as a list."""
+"""Positive integers; a single one counts as a list."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecl:
-    """The network, its inputs, a symmetry of the system, and the feedback beneath its plans."""
+    """Network, its inputs, mirror symmetry of the system, and inner feedback."""
 
     type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
     hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))

@@ -1,4 +1,4 @@
-"""A system file as a declaration: every section read, every finding reported at once. No torch."""
+"""Loading of a system file as a declaration: all sections, all findings at once. No torch."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ from stlc.source import Source
 
 VERSION = 1
 MAX_FILES = 8
-"""Files that one file may extend, one through the other."""
+"""Maximum depth of a chain of extended files."""
 _EXTENDS = "extends"
 _PLUGIN = "dynamics from a plugin"
 
@@ -108,22 +108,22 @@ class SystemKeys:
 
 
 def system_schema() -> Json:
-    """JSON Schema of system files, for editors; a file that extends another one may leave anything out."""
+    """JSON Schema of system files, for editors; nothing is required in a file that extends another one."""
     found = json_schema(SystemKeys)
     required = found.pop("required")
     return {**found, "anyOf": [{"required": required}, {"required": [_EXTENDS]}]}
 
 
 def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """The declaration of a system file.
+    """Load the declaration of a system file.
 
     Args:
         path: of the file.
-        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is no
+        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is not a
             constant of this file is left to the specification.
 
     Raises:
-        UsageError: there is no such file.
+        UsageError: the file does not exist.
         SpecError: the file is not text.
         SystemFileError: with all findings.
     """
@@ -131,7 +131,7 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
 
 
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """The declaration of a system file's text; relative paths start from the folder of `path`."""
+    """Parse a system file's text; relative paths start from the folder of `path`."""
     reader = Reader(source)
     root = load_yaml(source, sink=reader.findings)
     root, bases = extended(root, reader)
@@ -151,7 +151,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
 
 
 def _with_feedback(decl: SystemDecl) -> SystemDecl:
-    """The declaration with the requested feedback beneath its plans. Raises SystemFileError (S205)."""
+    """Add the requested feedback to the declaration. Raises SystemFileError (S205)."""
     asked = decl.policy.feedback
     if asked is None:
         return decl
@@ -170,7 +170,7 @@ def _with_feedback(decl: SystemDecl) -> SystemDecl:
 def _declaration(
     found: SystemKeys, reader: Reader, source: Source, path: Path, overrides: MappingType[str, str]
 ) -> SystemDecl:
-    """All sections, in the order in which names are declared."""
+    """Read all sections, in the order in which names are declared."""
     named = _named(found, reader)
     names, clock = named.names, named.clock
     cx = Context.of(reader, names, clock)
@@ -234,14 +234,14 @@ def _report_idle(
 
 @dataclass(frozen=True, slots=True)
 class _Named:
-    """The sections that declare names.
+    """Contents of the sections that declare names.
 
     Attributes:
-        names: everything that is declared.
+        names: all declared names.
         clock: time step and horizon.
         states: keys of each state, timers among them.
         drawn: parameters and latches, drawn before the states.
-        functions: from outside.
+        functions: external functions.
     """
 
     names: Names
@@ -252,7 +252,7 @@ class _Named:
 
 
 def _named(found: SystemKeys, reader: Reader) -> _Named:
-    """The sections that declare names, in order."""
+    """Read the sections that declare names, in order."""
     names = Names()
     read_constants(found.const, reader, names)
     clock = Clockwork() if found.time is None else read_time(found.time, reader, names)
@@ -267,7 +267,7 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 
 @dataclass(frozen=True, slots=True)
 class MovingParts:
-    """The names, the time, and the sections `flow` and `jump` of a valid declaration."""
+    """Names, time, and the sections `flow` and `jump` of a valid declaration."""
 
     names: Names
     clock: Clockwork
@@ -276,7 +276,7 @@ class MovingParts:
 
 
 def moving_parts(decl: SystemDecl) -> MovingParts:
-    """The parts of a file that say how its states move."""
+    """Parts of a file that determine the motion of its states."""
     reader = Reader(decl.source)
     root, _ = extended(load_yaml(decl.source, sink=reader.findings), reader)
     root = overridden(root, decl.overrides, reader)
@@ -286,7 +286,7 @@ def moving_parts(decl: SystemDecl) -> MovingParts:
 
 
 def _empty(node: Node | None) -> bool:
-    """Whether a section says nothing."""
+    """True if a section is empty."""
     match node:
         case None:
             return True
@@ -302,12 +302,11 @@ def _empty(node: Node | None) -> bool:
 
 
 def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]]:
-    """The document merged with the files that it extends, and the texts of these.
+    """Merge a document with the files that it extends; return also their texts.
 
-    A section that is a mapping in both keeps the entries of both, and where both have an entry that of the
-    extending file; an entry that is nothing (`~`) takes that of the extended file away, and anything else is
-    replaced. Every value keeps the place where it is written. S209 is
-    reported where a file cannot be read, or leads back to itself.
+    Sections that are mappings are merged entry by entry, with precedence for the extending file; a null entry
+    (`~`) removes that of the extended file, and anything else is replaced. Every value keeps its source
+    location. S209 is reported where a file cannot be read or extends itself.
     """
     sources: list[Source] = []
     seen = {Path(reader.source.name).resolve()}
@@ -337,7 +336,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping) -> Mapping:
-    """One document merged over another, section by section and entry by entry."""
+    """Merge one document over another, section by section and entry by entry."""
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
         if _removes(entry, base):
@@ -348,7 +347,7 @@ def _merged(base: Mapping, own: Mapping) -> Mapping:
 
 
 def _removes(entry: Entry, base: Mapping) -> bool:
-    """Whether an entry removes one of the extended file: `brake: ~`."""
+    """True if an entry removes one of the extended file: `brake: ~`."""
     return isinstance(entry.value, Scalar) and entry.value.is_null and base.get(entry.key.text) is not None
 
 
@@ -366,10 +365,10 @@ def _section(base: Node | None, own: Node) -> Node:
 
 
 def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
-    """The document with the fields that `overrides` names replaced.
+    """Replace the fields of a document that `overrides` names.
 
     A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, a parameter, or
-    a field at the top that holds a single value. Other plain names are left to the specification.
+    a top-level field with a single value. Other plain names are left to the specification.
     """
     known, params = _keys(root.get("const")), _keys(root.get("param"))
     for name, text in overrides.items():
@@ -395,7 +394,7 @@ def _keys(node: Node | None) -> dict[str, Node]:
 
 
 def _value(key: str, text: str, reader: Reader) -> Node | None:
-    """The value of an override, parsed as a YAML text of its own."""
+    """Value of an override, parsed as a YAML text of its own."""
     source = Source(f"--set {key}", text)
     try:
         return load_node(source, sink=reader.findings)
@@ -405,7 +404,7 @@ def _value(key: str, text: str, reader: Reader) -> Node | None:
 
 
 def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
-    """`node` with the value at `path` replaced; keys that are not there are added."""
+    """`node` with the value at `path` replaced; missing keys are added."""
     head, rest = path[0], path[1:]
     match node:
         case Sequence(items=items) if head.isdigit() and int(head) < len(items):
@@ -421,7 +420,7 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
 
 
 def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
-    """Report a path that leads nowhere."""
+    """Report a path that does not exist."""
     keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
     near = closest(head, keys)
     guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
@@ -430,7 +429,7 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """The initial states with those that `--set` names replaced: a value (`x=3m`) or a distribution."""
+    """Initial states with those that `--set` names replaced: a value (`x=3m`) or a distribution."""
     params = {base_name(assign.name) for assign in init.params}
     found: list[Assign] = []
     for name, text in overrides.items():

@@ -1,4 +1,4 @@
-"""The sections `flow` and `jump`: derivatives, guards and resets; a timer is one of each."""
+"""Sections `flow` and `jump`: derivatives, guards and resets, including those of timers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Assign:
 
 
 def read_sets(cx: Context, node: Node | None, label: str) -> tuple[Assign, ...]:
-    """New values of states, in order."""
+    """Read new values of states, in order."""
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
         found.extend(shared_draws(state_assigns(entry, label, cx)))
@@ -62,7 +62,7 @@ SETS = Kind(read_sets, mapping_of(VECTOR))
 
 
 def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
-    """A value for a state: one for each component of a vector."""
+    """Read the value of a state: one for each component of a vector."""
     columns = states_of(entry, where, cx)
     if not columns:
         return ()
@@ -85,7 +85,7 @@ def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
 def components(
     columns: tuple[Column, ...], node: Node, where: str, unit: Unit, cx: Context
 ) -> tuple[Assign, ...]:
-    """Values for the components of a vector."""
+    """Read the values of the components of a vector."""
     values = cx.here.stored_each(node, where, unit, len(columns))
     if values is None:
         return ()
@@ -104,7 +104,7 @@ def component_texts(node: Node, size: int) -> tuple[str, ...]:
 
 
 def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
-    """A value for a column: members by name for an enum, formulas for a bool, units checked."""
+    """Value of a column: members by name for an enum, formulas for a bool, units checked."""
     where = f"`{column.name}`"
     boolean, here = column.kind == "bool", cx.here
     value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
@@ -116,7 +116,7 @@ def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
 
 
 def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
-    """The columns of the state that a key names (S202 where it names none)."""
+    """Columns of the state that a key names (S202 for other keys)."""
     name = entry.key.text
     columns = cx.names.group(name)
     if columns:
@@ -129,7 +129,7 @@ def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
 
 
 def rate_unit(unit: Unit) -> Unit:
-    """The unit of a derivative; that of an undeclared unit is undeclared."""
+    """Unit of a derivative; undeclared for an undeclared unit."""
     return unit / SECOND if unit.text else replace(unit)
 
 
@@ -137,7 +137,7 @@ def rate_unit(unit: Unit) -> Unit:
 
 
 def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
-    """The section `flow`: derivatives in the unit of the state per second, or next values."""
+    """Read the section `flow`: derivatives in the unit of the state per second, or next values."""
     found: list[Assign] = []
     for entry in cx.reader.entries(node, "`flow`"):
         columns = states_of(entry, "`flow`", cx)
@@ -178,7 +178,7 @@ class JumpDecl:
 
 
 def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
-    """The section `jump`."""
+    """Read the section `jump`."""
     found: list[JumpDecl] = []
     for index, item in enumerate(cx.reader.items(node, "`jump`")):
         values = values_of(JumpDecl, cx, item, "a jump")
@@ -196,7 +196,7 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
 
 
 def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
-    """A state for every jump with `once` that records whether it has happened; false at first."""
+    """Add a state for every jump with `once` that records whether it has happened; initially false."""
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
         once = item.get("once") if isinstance(item, Mapping) else None
@@ -215,7 +215,7 @@ def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assig
 
 
 def latch_name(jump: str) -> str:
-    """The name of the state that records whether a jump has happened."""
+    """Name of the state that records whether a jump has happened."""
     return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
 
 
@@ -223,7 +223,7 @@ def latch_name(jump: str) -> str:
 
 
 def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-    """States written as `timer: up | down` with `run`, `reset_when` and `to`."""
+    """Read states written as `timer: up | down` with `run`, `reset_when` and `to`."""
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
     for name, keys in states.items():
@@ -243,7 +243,7 @@ def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[tuple[Assign
 
 
 def _timer(column: Column, keys: StateKeys, where: str, cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
-    """The flow and the resets of one timer."""
+    """Flow and resets of one timer."""
     assert keys.timer is not None
     direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
     run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
@@ -266,7 +266,7 @@ def _timer(column: Column, keys: StateKeys, where: str, cx: Context) -> tuple[li
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """The assignments with samplers that several of them read drawn before, as local names.
+    """Move samplers shared by several assignments before them, as local names.
 
     `p: "uniform(0, 1) * [1, 2]"` names one random number; `p: "uniform(low, high)"` with vectors names one
     for each component.
@@ -309,7 +309,7 @@ class _Writer:
         self._known: dict[int, ir.Num] = {}
 
     def rewrite(self, num: ir.Num) -> ir.Num:
-        """The number with shared samplers replaced."""
+        """The number with shared samplers replaced by names."""
         if id(num) not in self._known:
             changed = map_parts(num, self.rewrite)
             if id(num) in self._shared:

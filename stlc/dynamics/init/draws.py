@@ -22,29 +22,29 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """A number of rows to draw, and a random generator; float64 on the generator's device."""
+    """Number of rows to draw, and a random generator; float64 on the generator's device."""
 
     count: int
     generator: torch.Generator
 
     def uniforms(self) -> Tensor:
-        """(count,) numbers in [0, 1)."""
+        """Uniform numbers in [0, 1), (count,)."""
         return torch.rand(
             self.count, generator=self.generator, dtype=torch.float64, device=self.generator.device
         )
 
     def normals(self) -> Tensor:
-        """(count,) standard normal numbers."""
+        """Standard normal numbers, (count,)."""
         return torch.randn(
             self.count, generator=self.generator, dtype=torch.float64, device=self.generator.device
         )
 
     def blank(self) -> Tensor:
-        """(count,) zeros, which give constants their shape."""
+        """Zeros, (count,), to broadcast constants."""
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
-        """(count,) indices, drawn with probabilities proportional to `weights`."""
+        """Random indices with probabilities proportional to `weights`, (count,)."""
         edges = torch.tensor(weights, dtype=torch.float64).cumsum(0)
         edges = (edges / edges[-1])[:-1].to(self.generator.device)
         return torch.bucketize(self.uniforms(), edges, right=True)
@@ -71,7 +71,7 @@ class Drawing:
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
-        """The value in every row, (count,) float64; `env` holds at least one (count,) column."""
+        """Value in every row, (count,) float64; `env` holds at least one (count,) column."""
         if self._calls:
             env = dict(env)
             for call in self._calls:
@@ -81,7 +81,7 @@ class Drawing:
         return value.expand(rows.count)
 
     def _extract(self, num: ir.Num) -> ir.Num:
-        """The number with every sampler replaced by a column that is drawn before."""
+        """The number with every sampler replaced by a column drawn before."""
         if id(num) in self._seen:
             return self._seen[id(num)]
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:
@@ -96,7 +96,7 @@ class Drawing:
 
 
 def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
-    """Draw from a sampler, one number a row."""
+    """Draw from a sampler, one number per row."""
     match sampler, args:
         case "uniform", [low, high]:
             return torch.lerp(low, high, rows.uniforms())

@@ -23,18 +23,18 @@ from stlc.trace.formats.npz import read_npz
 MAX_ROUNDS = 500
 MAX_BATCH = 1 << 20
 FEW = 0.01
-"""Acceptance rate below which W601 speaks up, and nothing is trained."""
+"""Acceptance rate below which W601 is reported and training is refused."""
 RATED = 10_000
 
 SHUFFLED = 1 << 20
-"""Up to so many points every one comes equally often; beyond, every axis is picked for itself."""
+"""Grids up to this size are drawn in permutations; in larger ones each axis is drawn independently."""
 
 _HARD = Hard()
 Table = dict[str, Tensor]
 
 
 class _Draws:
-    """A situation with its draws compiled."""
+    """A situation with compiled draws."""
 
     def __init__(self, situation: Situation) -> None:
         self.weight = situation.weight
@@ -52,7 +52,7 @@ class _Draws:
 
 
 class _Mixture:
-    """Situations of which one is picked for every row."""
+    """Mixture of situations; one is picked for every row."""
 
     def __init__(self, situations: tuple[Situation, ...]) -> None:
         self.parts = tuple(_Draws(situation) for situation in situations)
@@ -73,11 +73,11 @@ class _Mixture:
 
 
 class InitialStates:
-    """The distribution of a declaration's initial states.
+    """Distribution of a declaration's initial states.
 
     Attributes:
-        drawn: states that were proposed so far.
-        kept: states that met every condition.
+        drawn: number of states proposed so far.
+        kept: number of states that met every condition.
     """
 
     def __init__(self, decl: InitDecl, names: tuple[str, ...]) -> None:
@@ -94,11 +94,11 @@ class InitialStates:
 
     @property
     def acceptance(self) -> float:
-        """Share of proposed states that were kept; 1 before anything was drawn."""
+        """Share of proposed states that were accepted; 1 before the first draw."""
         return self.kept / self.drawn if self.drawn else 1.0
 
     def sample(self, n: int, generator: torch.Generator) -> Tensor:
-        """Initial states, (n, dim) float64 on the generator's device.
+        """Draw initial states, (n, dim) float64 on the generator's device.
 
         Raises SystemFileError (S301) where (nearly) every proposed state is rejected.
         """
@@ -123,7 +123,7 @@ class InitialStates:
         return torch.cat(found)
 
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
-        """States before rejection, (n, dim)."""
+        """Propose states before rejection, (n, dim)."""
         rows = Rows(n, generator)
         table = {"": rows.blank()}
         for drawing in self._params:
@@ -134,11 +134,11 @@ class InitialStates:
         return torch.stack([table[name] for name in self.names], 1)
 
     def holds(self, states: Tensor) -> Tensor:
-        """Whether (n, dim) states meet every condition of `where`, (n,) booleans."""
+        """Mask of the states (n, dim) that meet every condition of `where`, (n,)."""
         return self._each_holds(states).all(0)
 
     def _each_holds(self, states: Tensor) -> Tensor:
-        """Whether each condition of `where` holds, (conditions, n) booleans."""
+        """Mask of the states per condition of `where`, (conditions, n)."""
         if self._where is None:
             return torch.ones(0, len(states), dtype=torch.bool, device=states.device)
         env = dict(zip(self.names, states.unbind(1), strict=True))
@@ -146,7 +146,7 @@ class InitialStates:
         return torch.stack([mark.expand(len(states)) > 0.5 for mark in marks.values()])
 
     def require_many(self, n: int = 256, *, seed: int = 0) -> None:
-        """Raise SystemFileError (S301) where less than one proposed state in a hundred is kept."""
+        """Raise SystemFileError (S301) where less than 1 % of proposed states is accepted."""
         before = self.drawn, self.kept
         self.sample(n, torch.Generator().manual_seed(seed))
         drawn, kept = self.drawn - before[0], self.kept - before[1]
@@ -166,14 +166,14 @@ class InitialStates:
         )
 
     def _rates(self) -> tuple[str, ...]:
-        """The share of proposed states that meet each condition, the smallest first."""
+        """Share of proposed states that meet each condition, the smallest first."""
         proposed = self._propose(RATED, torch.Generator().manual_seed(0))
         rates = self._each_holds(proposed).double().mean(1).tolist()
         told = sorted(zip(rates, self.decl.where_text, strict=True))
         return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """W601 where few of the proposed states were kept."""
+        """W601 where few of the proposed states were accepted."""
         if self.acceptance >= FEW:
             return ()
         return (
@@ -187,23 +187,23 @@ class InitialStates:
         )
 
 
-# ------------------------------------------------------------------------- known points
+# ------------------------------------------------------------------------- given states
 
 
 class Points(Protocol):
-    """A set of known states."""
+    """A set of given states."""
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
-        """One known state for every row, (count,) float64 by name."""
+        """Draw a given state for every row, (count,) float64 by name."""
 
 
 def points_of(decl: GridDecl | FileDecl) -> Points:
-    """The known states of a declaration; a file is read when the first state is asked for."""
+    """The given states of a declaration; a file is read at the first draw."""
     return _Grid(decl) if isinstance(decl, GridDecl) else _File(decl)
 
 
 class _Grid:
-    """A grid: combinations are computed from their index (the last axis is fastest), never stored."""
+    """Grid of states: combinations are computed from their index (the last axis is fastest), never stored."""
 
     def __init__(self, decl: GridDecl) -> None:
         self._axes = [(name, torch.tensor(values, dtype=torch.float64)) for name, values in decl.axes]
@@ -224,14 +224,14 @@ class _Grid:
 
 
 class _File:
-    """The rows of a file of states."""
+    """States from the rows of a file."""
 
     def __init__(self, decl: FileDecl) -> None:
         self._decl = decl
         self._columns: dict[str, Tensor] = {}
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
-        """Raises SystemFileError (S303) where the file does not hold the states."""
+        """Draw rows. Raises SystemFileError (S303) where the file does not hold the states."""
         if not self._columns:
             self._columns = self._read()
         first = next(iter(self._columns.values()))
@@ -278,7 +278,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Indices below `count`, (rows,): all equally often, in random order."""
+    """Indices below `count`, (rows,): equally often, in random order."""
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)
     orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]

@@ -1,1 +1,1 @@
-"""The dynamics of a declared system: steps, rollouts, integrators."""
+"""Dynamics of a declared system: steps, rollouts, integrators."""

@@ -1,4 +1,4 @@
-"""Arithmetic on numbers of the IR: the columns that they read, substitution, sums and products."""
+"""Arithmetic on numbers of the IR: names that they read, substitution, sums and products."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def substitute(node: N, table: Mapping[str, ir.Num]) -> N:
 
 
 def add(left: ir.Num, right: ir.Num) -> ir.Num:
-    """Their sum."""
+    """Sum of two numbers."""
     return ir.Op("add", (left, right))
 
 
 def multiply(left: ir.Num, right: ir.Num) -> ir.Num:
-    """Their product."""
+    """Product of two numbers."""
     return ir.Op("mul", (left, right))

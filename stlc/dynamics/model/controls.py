@@ -10,19 +10,19 @@ from torch import Tensor
 from stlc.dynamics.declaration.columns import ControlDecl
 
 EPS = 1e-6
-"""Keeps the gradient of an angle finite where both components are 0."""
+"""Offset that keeps the gradient of an angle finite where both components are 0."""
 
 
 def raw_width(controls: tuple[ControlDecl, ...]) -> int:
-    """Network outputs a step: two for an angle (a planar vector), one for everything else."""
+    """Number of network outputs per step: two for an angle (a planar vector), one for other controls."""
     return sum(2 if control.squash == "angle" else 1 for control in controls)
 
 
 def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
     """Controls in physical units: (…, raw_width) -> (…, m).
 
-    `tanh` and `clip` map [-1, 1] onto the range, smoothly or with corners; `angle` turns a planar vector into
-    its direction, so that there is no seam at the ends of the range.
+    `tanh` (smooth) and `clip` (piecewise linear) map [-1, 1] onto the range; `angle` maps a planar vector to
+    its direction, without discontinuity at the ends of the range.
     """
     middle, half = _affine(controls, raw.dtype, raw.device)
     kinds = {control.squash for control in controls}
@@ -34,7 +34,7 @@ def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
 
 
 def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
-    """Every control on the scale [-1, 1]."""
+    """Controls on the scale [-1, 1]."""
     columns = iter(raw.unbind(-1))
     out: list[Tensor] = []
     for control in controls:
@@ -53,7 +53,7 @@ def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
 def _affine(
     controls: tuple[ControlDecl, ...], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Middles and half widths of the ranges, (m,) each."""
+    """Midpoints and half-widths of the ranges, (m,) each."""
     low = torch.tensor([control.low for control in controls], dtype=torch.float64)
     high = torch.tensor([control.high for control in controls], dtype=torch.float64)
     return ((low + high) / 2).to(device, dtype), ((high - low) / 2).to(device, dtype)

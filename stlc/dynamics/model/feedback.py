@@ -1,16 +1,14 @@
-"""A feedback beneath the plans: controls are planned as deviations from a linear law that stabilises.
+"""Inner feedback: controls are planned as deviations from a stabilising linear law.
 
-A plan that fixes the controls of a whole horizon in advance cannot hold an unstable plant: what differs by
-1e-7 now differs by 1e-7 exp(4 T) at the end where x' = 4 x + u. With `policy: {feedback: …}` actuators get
-at every step
+An open-loop plan over a horizon cannot hold an unstable plant: for x' = 4 x + u a deviation of 1e-7 grows to
+1e-7 exp(4 T). With `policy: {feedback: …}` actuators get at every step
 
     clip(u0 + v + clip(K (x0 - x), -a, a), low, high)
 
-where `v` is planned, so that rollouts, searches and gradients see a plant that forgets. `a` is the authority
-of the feedback, half the range of the actuator unless said otherwise; `v` may be as large as range and
-authority together need, so that every control can still be had in every state. The gain of `lqr` is that of
-the linear-quadratic regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a
-long horizon.
+where `v` is planned, so that rollouts, searches and gradients see a stabilised plant. `a` is the authority of
+the feedback, by default half the range of the actuator; the range of `v` covers range and authority together,
+so that every control remains available in every state. The gain of `lqr` is that of the linear-quadratic
+regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a long horizon.
 """
 
 from __future__ import annotations
@@ -35,16 +33,16 @@ if TYPE_CHECKING:
     from stlc.dynamics.declaration.learning import FeedbackDecl
 
 SLOPE = 1e-5
-"""Share of its range by which a column is moved to see what depends on it."""
+"""Step of the central differences, as a share of a column's range."""
 RECURSIONS = 3000
-"""Steps of the Riccati recursion; beyond some time constants the gain stands still."""
+"""Steps of the Riccati recursion; the gain converges within some time constants."""
 STILL = 1e-12
 GROWING = 10.0
-"""An open loop that grows by more over a horizon is told of."""
+"""Growth of the open loop over a horizon above which W602 is reported."""
 
 
 class NoFeedbackError(ValueError):
-    """A gain that cannot be computed, with the reason."""
+    """Raised where a gain cannot be computed, with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,7 @@ class Linear:
     Attributes:
         a: (n, n), of the moving states.
         b: (n, m).
-        rest: (n,), how far one step leads from (x0, u0).
+        rest: (n,), displacement by one step from (x0, u0).
         scale: (n,), half the range of each moving state, 1 where it has none.
         moving: their names.
     """
@@ -67,14 +65,14 @@ class Linear:
 
     @property
     def growth(self) -> float:
-        """The factor by which the fastest mode grows in one step."""
+        """Growth factor of the fastest mode per step."""
         return float(np.abs(np.linalg.eigvals(self.a)).max(initial=0.0))
 
 
 def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
-    """The declaration with a feedback beneath its plans.
+    """Add the requested inner feedback to a declaration.
 
-    Raises NoFeedbackError: an unstable mode that no control reaches, or a control that turns (`angle`).
+    Raises NoFeedbackError: an unstable mode is uncontrollable, or a control is an `angle`.
     """
     turning = [control.name for control in decl.controls if control.squash == "angle"]
     if turning:
@@ -98,14 +96,14 @@ def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
     return replace(decl, controls=deviations, feedback=feedback)
 
 
-# ------------------------------------------------------------------ the point and the slopes
+# ------------------------------------------------------------------ linearisation
 
 
 def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The point of operation, (n,) and (m,), in the units of the columns.
+    """Operating point: state (n,) and control (m,), in the units of the columns.
 
-    States that are not given are 0, or in the middle of a range that 0 is not in; controls those that hold
-    the states best, within their ranges.
+    States that are not given are 0, or the middle of a range that excludes 0; controls are those within their
+    ranges that hold the states best.
     """
     state = np.array(
         [
@@ -129,13 +127,13 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[NDArray[np.flo
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask of the moving states that a point of operation holds: those that the dynamics depend on."""
+    """Mask of the moving states to be held at the operating point: those that the dynamics depend on."""
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
 
 def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np.float64]) -> Linear:
-    """The exact step around a point, by central differences: (n,), (m,) in the units of the columns."""
+    """Linearise the exact step at a point (n,), (m,) by central differences, in the units of the columns."""
     columns, names = decl.signature.columns, decl.signature.names
     moved = {assign.name for assign in decl.flow}
     moving = [
@@ -169,7 +167,7 @@ def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np
 
 
 def _stepped(decl: SystemDecl, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One exact step from states and controls (k, n + m), without a feedback: (k, n)."""
+    """One exact step without feedback from states and controls: (k, n + m) -> (k, n)."""
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
     env = dict(zip(names, points.T, strict=True))
@@ -194,10 +192,10 @@ def _given(decl: SystemDecl, gain: Mapping[str, Mapping[str, float]]) -> NDArray
 def _lqr(
     decl: SystemDecl, weights: Mapping[str, float], state: NDArray[np.float64], control: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The gain of the linear-quadratic regulator, (m, n), in the units of the columns.
+    """Gain of the linear-quadratic regulator, (m, n), in the units of the columns.
 
-    Costs are squares of deviations by half their ranges, times `weights`; a state that nothing depends on (a
-    place in an open field) costs nothing unless it is weighed: a plan may want to be elsewhere.
+    Costs are squares of deviations divided by half the range, times `weights`; a state that nothing depends
+    on (a position in an open field) has no cost unless weighted, as plans may move it.
     """
     linear = linearised(decl, state, control)
     held, names = _held(linear), decl.signature.names
@@ -223,10 +221,10 @@ def _lqr(
 def riccati(
     a: NDArray[np.float64], b: NDArray[np.float64], q: NDArray[np.float64], r: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The gain (m, n) at which the Riccati recursion settles.
+    """Limit gain (m, n) of the Riccati recursion.
 
-    It needs no stabilising solution of the algebraic equation, which there is none of where an integrator is
-    out of reach of the controls.
+    Unlike the algebraic equation it works where an integrator is uncontrollable and no stabilising solution
+    exists.
     """
     cost: NDArray[np.float64] = q.copy()
     gain: NDArray[np.float64] = np.zeros((b.shape[1], len(a)))
@@ -241,11 +239,11 @@ def riccati(
     return gain
 
 
-# ------------------------------------------------------------------------- a hint
+# ------------------------------------------------------------------------- instability warning
 
 
 def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
-    """W602 where plans are open-loop controls of an unstable plant that grows too much over a horizon."""
+    """W602 where plans are open-loop controls of a plant that is too unstable over a horizon."""
     growth = growth_of(decl)
     if not growth > GROWING:
         return ()
@@ -265,7 +263,7 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 def growth_of(decl: SystemDecl) -> float:
     """Growth of the fastest mode over a horizon, linearised at rest; 1 where it cannot be computed.
 
-    With a feedback the loop is closed by it.
+    With an inner feedback, that of the closed loop.
     """
     try:
         if decl.feedback is None:
@@ -282,7 +280,7 @@ def growth_of(decl: SystemDecl) -> float:
 
 
 def _opened(decl: SystemDecl, feedback: Feedback) -> SystemDecl:
-    """The plant with the actuators' own ranges and no feedback."""
+    """The plant with the actuators' own ranges, without feedback."""
     ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
     own = tuple(replace(each, low=low, high=high) for each, low, high in ends)
     return replace(decl, controls=own, feedback=None)

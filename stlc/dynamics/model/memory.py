@@ -13,11 +13,11 @@ _LARGEST = 32 * 2**20  # the most that glibc accepts
 
 @cache
 def keep_freed_memory() -> bool:
-    """Tell the C library not to return freed memory to the system; True if it accepted.
+    """Tell the C library not to return freed memory to the system; True on success.
 
     A rollout allocates and frees the same few arrays of some 100 kB in every step. By default glibc returns
-    them, and each time their pages have to be mapped and cleared again, which takes as long as the rollout
-    itself. This holds for the whole process, so it is for programs to call (`stlc train`), not for imports.
+    them, and mapping and clearing their pages again takes as long as the rollout itself. The setting affects
+    the whole process, so programs (`stlc train`) call this, not imports.
     """
     if not sys.platform.startswith("linux"):
         return False

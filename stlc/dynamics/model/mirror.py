@@ -1,7 +1,7 @@
-"""Symmetries of a system under which states and controls behave as their images do.
+"""Mirror symmetries of a system: maps of states and controls under which dynamics are invariant.
 
-A ship on the left of a river is a ship on the right of it seen in a mirror. A policy that knows this learns
-one half of the states and has learnt the other.
+A ship on the left of a river mirrors one on the right. A policy that uses this learns on half of the state
+space and covers all of it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class Mirror:
     """The symmetry that `policy: {mirror: …}` declares; it is its own inverse.
 
     Attributes:
-        side: index of the state that tells a state from its image; the larger of the two is kept.
+        side: index of the state whose value distinguishes a state from its image; the larger one is kept.
     """
 
     def __init__(
         self, images: Sequence[Assign], names: Sequence[str], controls: Sequence[ControlDecl]
     ) -> None:
-        """A symmetry from the images of states and controls, the first one of a state."""
+        """Compile the images of states and controls; the first one is that of a state."""
         self._names = tuple(names)
         self._controls = tuple(controls)
         known = {control.name for control in controls}
@@ -47,7 +47,7 @@ class Mirror:
         return _applied(self._states, x, self._names)
 
     def plans(self, u: Tensor) -> Tensor:
-        """The images of controls: (…, m) -> (…, m). Angles stay within a turn of their range."""
+        """The images of controls: (…, m) -> (…, m). Angles stay within one turn of their range."""
         moved = _applied(self._inputs, u, [control.name for control in self._controls])
         for index, each in enumerate(self._controls):
             if each.squash == "angle":
@@ -55,14 +55,14 @@ class Mirror:
         return moved
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """States or their images, whichever are on the kept side, (B, n), and a mask of the images, (B,)."""
+        """States or their images, whichever are on the kept side, (B, n), and a mask (B,) of images."""
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
         return torch.where(swapped[..., None], image, x), swapped
 
 
 def _applied(program: Program, x: Tensor, names: Sequence[str]) -> Tensor:
-    """`x` with the columns that the program computes: (…, k) -> (…, k)."""
+    """`x` with the columns that the program computes replaced: (…, k) -> (…, k)."""
     columns = dict(zip(names, x.unbind(-1), strict=True))
     images = program(columns, TORCH, HARD) if program.columns else {}
     return torch.stack([images.get(name, column) for name, column in columns.items()], -1)

@@ -1,4 +1,4 @@
-"""Rollouts: columns of shape (time, batch), with as few array operations as the dynamics allow."""
+"""Rollouts: columns of shape (time, batch), computed with few array operations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Columns = dict[str, Tensor]
 class _Columns:
     """The columns of a rollout computed so far: states at all T+1 samples, and numbers at the T steps.
 
-    `now` maps every name to its values at the T steps, shape (T, B), or (B,) where it never changes.
+    `now` maps every name to its values at the T steps, shape (T, B), or (B,) if constant.
     """
 
     states: Columns
@@ -42,7 +42,7 @@ class _Columns:
         }
 
     def enter(self, name: str, column: Tensor) -> None:
-        """Add a state of which all T+1 samples are computed."""
+        """Add a state whose T+1 samples are all computed."""
         self.states[name] = column
         self.now[name] = column[:-1]
 
@@ -51,7 +51,7 @@ class _Columns:
         return values.expand(self.steps, self.batch)
 
     def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
-        """The values that are constant over the loop, and those that change from step to step."""
+        """Values that are constant over the loop, and values that change from step to step."""
         fixed: dict[str, Tensor] = {}
         timed: list[tuple[str, Sequence[Tensor]]] = []
         for name in names:
@@ -94,7 +94,7 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """A stage with its programs compiled."""
+    """A stage with compiled programs."""
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
@@ -117,7 +117,7 @@ class _StageRunner:
             self._loop(columns)
 
     def _loop(self, columns: _Columns) -> None:
-        """Run the components that depend on their own past step by step."""
+        """Step the components that depend on their own past."""
         stage = self.stage
         env, timed = columns.sliced(self.outside)
         kept = (*stage.stepped.values(), *stage.lets)
@@ -148,7 +148,7 @@ class Stepper:
         self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
-        """The columns one step later; those that do not move are the same tensors."""
+        """Columns one step later; those that do not move are the same tensors."""
         env = {**state, **controls}
         for block in self.once:
             env.update(block(env, TORCH, switch))
@@ -159,7 +159,7 @@ class Stepper:
         return {**state, **{name: value.expand_as(like) for name, value in moved.items()}}
 
     def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
-        """From (B,) columns and (T, B) controls to (T+1, B) columns; constant ones are expanded views."""
+        """Roll out (B,) columns and (T, B) controls: (T+1, B) columns; constant ones are expanded views."""
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}
         columns = _Columns(dict(start), {**steady, **controls}, steps, batch, switch)

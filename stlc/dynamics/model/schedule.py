@@ -1,9 +1,8 @@
-"""Order of evaluation of a step's components over a rollout.
+"""Evaluation order of a step's components over a rollout.
 
-A rollout need not take all components through one loop. Components are ordered by what they read: one that
-depends only on earlier ones is computed for all steps at once, one that adds a known increment is a
-cumulative sum, and only components that feed back into themselves are stepped, with everything that
-does not change inside their loop computed before it.
+Not all components need a loop over time. They are ordered by dependencies: one that depends only on earlier
+ones is computed for all steps at once, one that adds a known increment is a cumulative sum, and only
+components with feedback are stepped, after the loop invariants have been computed.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 @dataclass(frozen=True, slots=True)
 class RolloutStage:
-    """Components that can be run together once all that they read is computed.
+    """Components that can be computed together once their inputs are available.
 
     Attributes:
-        early: numbers of all steps, computed together, before anything else here.
+        early: numbers computed for all steps at once, before the rest of the stage.
         follows: state -> name of its next value, an early number of this stage or of one before.
-        sums: state -> name of the early number that it adds every step.
-        blocks: computed in every step, one after the other.
+        sums: state -> name of the early number that is its increment.
+        blocks: computed in every step, in order.
         stepped: state -> name of its next value in `blocks`.
         lets: names in `blocks` that later stages read.
     """
@@ -41,7 +40,7 @@ class RolloutStage:
 
 
 def schedule(step: Step) -> tuple[RolloutStage, ...]:
-    """The stages of a step, in an order in which each reads only states and numbers of earlier ones."""
+    """Stages of a step, ordered so that each reads only states and numbers of earlier ones."""
     numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((_next(name),)) for name in step.next}
@@ -63,7 +62,7 @@ def schedule(step: Step) -> tuple[RolloutStage, ...]:
 
 
 class _StageWriter:
-    """Gathers the groups of one level."""
+    """Builder of the stage of one dependency level."""
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
         self.numbers = numbers
@@ -110,7 +109,7 @@ class _StageWriter:
 
 
 def blocks(numbers: Lets) -> tuple[Lets, ...]:
-    """Numbers in blocks of which each reads only earlier blocks."""
+    """Numbers in blocks, each of which reads only earlier blocks."""
     level: dict[str, int] = {}
     for name, num in numbers.items():
         level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
@@ -119,12 +118,12 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _next(name: str) -> str:
-    """The name of the next value of a state."""
+    """Name of the next value of a state."""
     return f"{name}'"
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """The increment of a state that is a running sum; None for other states."""
+    """Increment of a state that is a running sum; None for other states."""
     if len(states) != 1 or len(body) != 1:
         return None
     (state,) = states
@@ -171,7 +170,7 @@ def _enter(
     low: dict[str, int],
     stack: list[str],
 ) -> tuple[str, Iterator[str]]:
-    """Number a name that is seen for the first time."""
+    """Number a name at its first visit."""
     order[name] = low[name] = len(order)
     stack.append(name)
     return name, iter(sorted(reads[name]))
@@ -182,12 +181,12 @@ def _enter(
 
 @dataclass
 class Hoist:
-    """Hoisting of loop invariants: parts of numbers that can be computed before the loop.
+    """Hoisting of loop invariants out of numbers.
 
     Attributes:
         moving: names that change within the loop.
-        early: name -> number that does not depend on them; fills up as numbers are split.
-        prefix: of the names that are made.
+        early: name -> invariant number; extended as numbers are split.
+        prefix: of the generated names.
     """
 
     moving: frozenset[str]
@@ -209,7 +208,7 @@ class Hoist:
                 return map_parts(num, self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
-        """A loop invariant, named; constants and columns stay."""
+        """Name for a loop invariant; constants and columns are unchanged."""
         if isinstance(num, ir.Const | ir.Signal):
             return num
         for name, known in self.early.items():
@@ -220,7 +219,7 @@ class Hoist:
         return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """A choice whose condition is invariant: the condition becomes a mask."""
+        """Choice with invariant condition: the condition becomes a mask."""
         if yes == ir.Const(0.0):
             keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))
@@ -228,7 +227,7 @@ class Hoist:
         return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
-        """The terms of a sum, invariant ones gathered into one."""
+        """Sum with its invariant terms combined."""
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
         steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
@@ -240,7 +239,7 @@ class Hoist:
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
     def _product(self, num: ir.Num) -> ir.Num:
-        """The factors of a product, invariant ones gathered into one."""
+        """Product with its invariant factors combined."""
         factors = _factors(num)
         moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
         steady = [factor for factor in factors if not names_in(factor) & self.moving]

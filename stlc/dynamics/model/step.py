@@ -19,7 +19,7 @@ class Step:
 
     Attributes:
         lets: (name, number), in order.
-        next: name of a state that moves -> what it is one step later.
+        next: name of a moving state -> its value one step later.
     """
 
     lets: tuple[tuple[str, ir.Num], ...]
@@ -28,7 +28,7 @@ class Step:
 
 @dataclass
 class _Writer:
-    """Gathers assignments, so that no number is written out twice."""
+    """Writer of assignments that names intermediate results, so that none is duplicated."""
 
     lets: list[tuple[str, ir.Num]] = field(default_factory=list)
 
@@ -41,16 +41,16 @@ class _Writer:
         return ir.Signal(name)
 
     def named(self, state: State) -> dict[str, ir.Num]:
-        """Every component held by a column."""
+        """All components as named columns."""
         return {name: self.name(name, num) for name, num in state.items()}
 
 
 def build_step(decl: SystemDecl, *, soft: bool) -> Step:
-    """The step of a declaration.
+    """Build the step of a declaration.
 
-    `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice.
-    Guards and resets read the state at the start of the step, clamps act after each substep,
-    and of two jumps on one component the later one wins.
+    `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice. Guards and resets
+    read the state at the start of the step, clamps act after each substep, and of two jumps on one component
+    the later one wins.
     """
     writer = _Writer()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
@@ -67,9 +67,9 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
 
 
 def commands(decl: SystemDecl) -> dict[str, ir.Num]:
-    """The commands of actuators, from the state and the plan: name of a control -> number.
+    """Actuator commands from the state and the plan: name of a control -> number.
 
-    {} where actuators get what is planned. It is computed once a step, as a sampled controller does.
+    {} without inner feedback. Computed once per step, as in a sampled-data controller.
     """
     feedback = decl.feedback
     if feedback is None:
@@ -88,7 +88,7 @@ def commands(decl: SystemDecl) -> dict[str, ir.Num]:
 
 
 def _given(jump: JumpDecl, given: State) -> JumpDecl:
-    """The jump with controls replaced by the commands of actuators."""
+    """The jump with controls replaced by actuator commands."""
     if not given:
         return jump
     resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
@@ -96,7 +96,7 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
 
 
 def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
-    """All substeps of the continuous part; `given` are the commands of actuators."""
+    """All substeps of the continuous part; `given` are the actuator commands."""
 
     def rate(at: State) -> State:
         table = {**writer.named(at), **given}
@@ -132,7 +132,7 @@ def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
-    """A component clamped to its range, where one is declared."""
+    """Component clamped to its range, where one is declared."""
     if name not in decl.clamps:
         return num
     low, high = decl.clamps[name]

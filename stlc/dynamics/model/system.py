@@ -1,4 +1,4 @@
-"""A system made from its declaration: steps, rollouts, initial states and objective as tensors."""
+"""System built from its declaration: steps, rollouts, initial states and objective as tensors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from stlc.files import find_system
 
 HARD = Hard()
 PROBED = 1000
-"""Steps that a probe drives at most: what explodes does so soon, and a horizon may be long."""
+"""Maximum number of steps of a probe: divergence shows early, and a horizon may be long."""
 
 
 class System:
@@ -70,24 +70,24 @@ class System:
     def load(
         cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
     ) -> System:
-        """Load a system file, by path or by name (`stlc.files.find_system`), under a scenario.
+        """Load a system file, by path or by name (`stlc.files.find_system`), with a scenario applied.
 
-        Raises UsageError where there is none, SystemFileError where it is invalid.
+        Raises UsageError where it does not exist, SystemFileError where it is invalid.
         """
         decl = load_system_decl(find_system(str(path)), overrides or {})
         return cls(decl if scenario is None else under(decl, scenario))
 
     @cached_property
     def truth(self) -> System:
-        """The true system where the scenario has a model mismatch; without parameters."""
+        """True system where the scenario has a model mismatch; without parameters."""
         real = truth(self.decl)
         return self if real is self.decl else System(real)
 
     def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
         """The same system with parameters, and with timers as its last columns.
 
-        Parameters are drawn for every trajectory, and nothing moves them. Timers follow from the states
-        before; no gradient goes through them. Initial states are the starts of missions.
+        Parameters are drawn per trajectory and constant. Timers follow from the previous states, without
+        gradient. Initial states are mission starts.
         """
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
@@ -99,12 +99,12 @@ class System:
 
     @property
     def name(self) -> str:
-        """As written in the file."""
+        """Name of the system."""
         return self.decl.name
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the file's text and of what was overridden."""
+        """SHA-256 of the file's text and its overrides."""
         return self.decl.hash
 
     @cached_property
@@ -114,17 +114,17 @@ class System:
 
     @cached_property
     def dt(self) -> float:
-        """Length of a step in seconds."""
+        """Time step in seconds."""
         return float(self.decl.dt)
 
     @property
     def horizon(self) -> int:
-        """Steps of a plan."""
+        """Horizon of a plan in steps."""
         return self.decl.horizon
 
     @property
     def controls(self) -> tuple[ControlDecl, ...]:
-        """The inputs."""
+        """Declarations of the inputs."""
         return self.decl.controls
 
     @cached_property
@@ -144,7 +144,7 @@ class System:
 
     @property
     def actuators(self) -> tuple[tuple[float, float], ...]:
-        """Ranges of the actuators; those of plans are wider where a feedback lies beneath."""
+        """Ranges of the actuators; with inner feedback the ranges of plans are wider."""
         if self.decl.feedback is None:
             return tuple((control.low, control.high) for control in self.controls)
         return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
@@ -168,10 +168,7 @@ class System:
         return torch.stack([moved[name] for name in self.names], 1)
 
     def begun(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """Initial states with parameters drawn and timers at the start of a mission.
-
-        (B, n - added) -> (B, n).
-        """
+        """Append parameters, drawn, and timers at mission start to states: (B, n - added) -> (B, n)."""
         if not self.added:
             return states
         table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
@@ -187,20 +184,20 @@ class System:
         return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
 
     def added_later(self, x: Tensor) -> Tensor:
-        """Parameters and timers one step later, by any cause of motion: (B, n) -> (B, added)."""
+        """Parameters and timers one step later, whatever moved the state: (B, n) -> (B, added)."""
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
 
     def commanded(self, x: Tensor, u: Tensor) -> Tensor:
-        """Commands of actuators in states (B, n) for plans `u` (B, m); `u` itself without a feedback."""
+        """Actuator commands in states (B, n) for plans `u` (B, m); `u` itself without inner feedback."""
         if self._commands is None:
             return u
         found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
         return torch.stack([found[name] for name in self.control_names], 1)
 
     def planned(self, x: Tensor, command: Tensor) -> Tensor:
-        """Plans in states (B, n) for which actuators get `command` (B, m), where they can."""
+        """Plans in states (B, n) for which actuators get `command` (B, m), where possible."""
         if self._commands is None:
             return command
         feedback = self.decl.feedback
@@ -216,12 +213,12 @@ class System:
         return Program(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
+        """Roll out: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
         columns = self.rollout_columns(x0, u, switch)
         return torch.stack([columns[name].t() for name in self.names], 2)
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
-        """The same as (T+1, B) columns by name; columns that never change are expanded views."""
+        """Rollout as (T+1, B) columns by name; constant columns are expanded views."""
         if (
             x0.shape[1:] != (len(self.names),)
             or u.shape[2:] != (len(self.controls),)
@@ -243,7 +240,7 @@ class System:
         return {timer.name: after[timer.name] for timer in self.timers}
 
     def _kept(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """The timers over time, which follow from the states over time."""
+        """Timers over time, computed from the states over time."""
         if not self.timers:
             return {}
         with torch.no_grad():
@@ -254,7 +251,7 @@ class System:
 
     @cached_property
     def _keeper(self) -> Stepper:
-        """The dynamics of the timers."""
+        """Compiled dynamics of the timers."""
         return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
 
     @cached_property
@@ -286,7 +283,7 @@ class System:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Initial states, (n, dim), parameters drawn, timers as at the start of a mission.
+        """Draw initial states, (n, dim), with parameters, and timers at mission start.
 
         The same seed gives the same states, whatever the dtype.
 
@@ -334,10 +331,10 @@ class System:
 
         Args:
             columns: states over time, (T+1, B) each.
-            sat: 1 where the trajectory satisfies the specification, (B,); its gradient is not followed.
-            rho: robustness, (B,), for terms that name it; 0 if left out.
-            u: controls, (B, T, m), for terms that name one; such a term is the mean over the T steps.
-            switch: how `ind(…)` in a term becomes a number.
+            sat: 1 where the trajectory satisfies the specification, (B,); without gradient.
+            rho: robustness, (B,), for terms that name it; 0 by default.
+            u: controls, (B, T, m), for terms that name one; these are averaged over the T steps.
+            switch: numeric form of `ind(…)` in a term.
         """
         like = next(iter(columns.values()))
         sat = sat.detach().to(like.dtype)
@@ -367,19 +364,19 @@ class System:
 
     @cached_property
     def _named_first(self) -> tuple[str, ...]:
-        """The states whose value at the start of the plan a term reads."""
+        """States whose value at the start of the plan a term reads."""
         read = {name for term in self.decl.objective.terms for name in names_in(term.value)}
         return tuple(name for name in self.names if name + START in read)
 
     @cached_property
     def _terms(self) -> tuple[Program | None, Program | None]:
-        """The objective's terms as programs."""
+        """Terms of the objective as programs."""
         states, controlled = (None if total is None else Program({"cost": total}) for total in self.objective)
         return states, controlled
 
     @cached_property
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
-        """The weighed sum of the performance terms over states, and of those that read a control."""
+        """Weighted sums of the performance terms on states, and of those that read a control."""
         sums: list[ir.Num | None] = [None, None]
         given = commands(self.decl)
         for term in self.decl.objective.terms:
@@ -411,7 +408,7 @@ class System:
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
-        """Test the system: initial states and random plans of at most `PROBED` steps; returns warnings.
+        """Test the system on initial states and random plans of at most `PROBED` steps; return warnings.
 
         Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
         """

@@ -1,1 +1,1 @@
-"""Robots: descriptions, kinematics, functions from outside."""
+"""Robots: URDF descriptions, kinematics, external functions."""

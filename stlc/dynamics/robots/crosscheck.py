@@ -1,4 +1,4 @@
-"""Comparison of the compiled forward kinematics with another library's, on a robot description.
+"""Check of the compiled forward kinematics against pytorch-kinematics.
 
 `stlc.dynamics.robots.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
 multiplies batches of transforms. Where that package is installed, `stlc system check` compares the two.
@@ -31,12 +31,12 @@ _NEAR = 1e-5
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The result of comparing one function.
+    """Result of comparing one function.
 
     Attributes:
         name: of the function.
-        distance: the largest, m; None where the two were not compared.
-        why: why not.
+        distance: the largest difference, m; None where not compared.
+        why: reason for not comparing.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Comparison:
 
 
 def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
-    """Compare forward kinematics with pytorch-kinematics in random positions of the joints.
+    """Compare forward kinematics with pytorch-kinematics at random joint positions.
 
     Args:
         function: of the kind `urdf`.
@@ -61,7 +61,7 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
     try:
         with _silent():
             theirs = _by_library(function, q)
-    except Exception as error:  # whatever it raises about a description that it does not take
+    except Exception as error:  # any error about a description that it does not support
         return Comparison(function.name, None, f"{LIBRARY} does not take it: {type(error).__name__}")
     ours = _by_body(function.body, q)
     far = float(np.abs(ours - theirs).max())
@@ -89,7 +89,7 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 
 
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
-    """The function's numbers, (n, joints) -> (n, 3) m."""
+    """Values of the function, (n, joints) -> (n, 3) m."""
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
     program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)

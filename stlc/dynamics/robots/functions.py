@@ -1,4 +1,4 @@
-"""Functions from outside, loaded on demand, on arrays of NumPy or torch."""
+"""External functions, loaded on demand, on arrays of NumPy or torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from stlc.registry import closest
 
 
 def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
-    """The functions of a system, by name: their modules are imported, which runs them.
+    """Load the functions of a system, by name; their modules are imported, which runs their code.
 
     Raises:
         SystemFileError: S208, a module or a function cannot be loaded.
@@ -34,9 +34,9 @@ def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """The files that a system file names: by their paths below its folder, else by their last names.
+    """Files that a system file refers to, by path below its folder, else by file name.
 
-    These are the files that it extends, those of its functions, and those of its initial states.
+    These are the extended files, those of functions, and those of initial states.
     """
     home = decl.path.parent.resolve()
     named = [Path(base.name) for base in decl.bases]
@@ -86,7 +86,7 @@ def _refused(
 @final
 @dataclass(frozen=True, slots=True)
 class PythonFunction:
-    """A loaded function: vectors are arrays (…, size), numbers arrays (…), and so is the result."""
+    """Loaded function: vectors are arrays (…, size), numbers arrays (…), and so is the result."""
 
     decl: FunctionDecl
     call: Callable[..., Array]
@@ -99,7 +99,7 @@ class PythonFunction:
 @final
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A function with the sizes that a specification gives it."""
+    """Function with the sizes that a specification declares."""
 
     decl: FunctionDecl
     call: Callable[..., Array]
@@ -123,7 +123,7 @@ class Bound:
         return [found] if self.result is None else [found[..., i] for i in range(self.result)]
 
     def _checked(self, values: Sequence[Array], batch: tuple[int, ...]) -> Array:
-        """The result, of the shape that was declared."""
+        """The result, checked for the declared shape."""
         try:
             found = self.call(*values)
             shape = tuple(found.shape)
@@ -147,7 +147,7 @@ def _shape(parts: Sequence[Array]) -> tuple[int, ...]:
 
 
 def _joined(parts: Sequence[Array], sizes: tuple[int | None, ...]) -> list[Array]:
-    """Arguments made from their components, broadcast to one shape but for the last axis."""
+    """Arguments joined from their components, broadcast to one shape except for the last axis."""
     if all(isinstance(part, (float, np.ndarray, np.generic)) for part in parts):
         library: Any = np
         spread = np.broadcast_arrays(*parts)

@@ -1,7 +1,7 @@
 """Forward kinematics: a chain of joints, unrolled into numbers of the IR.
 
-Everything that is known now is folded, so what stays of a seven-joint arm are the sines and cosines of its
-joints and some thirty products and sums: the torch graph and the C kernel compute the same few operations.
+Constants are folded, so a seven-joint arm needs the sines and cosines of its joints and some thirty products
+and sums: the torch graph and the C kernel compute the same few operations.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Point: TypeAlias = tuple[ir.Num, ir.Num, ir.Num]
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
-    """The position of the tip in the frame of the base, (3,) m, from the positions of the moving joints."""
+    """Position of the tip in the frame of the base, (3,) m, from the positions of the moving joints."""
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
     writer = _Lines()
@@ -33,7 +33,7 @@ def position(joints: Sequence[Joint]) -> ir.Body:
 
 
 class _Lines:
-    """Named intermediate results, so that none is written out twice."""
+    """Writer of named intermediate results, so that none is duplicated."""
 
     def __init__(self) -> None:
         self.lets: list[tuple[str, ir.Num]] = []

@@ -16,7 +16,7 @@ Doubles: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["revolute", "prismatic", "fixed"]
 MAX_BYTES = 10_000_000
 _SNAP = 1e-9
-"""Entries of a rotation this close to a whole number are that number: files round pi / 2."""
+"""Tolerance within which an entry of a rotation is rounded to an integer: files round pi / 2."""
 _KINDS: Mapping[str, Kind] = {
     "revolute": "revolute",
     "continuous": "revolute",
@@ -31,8 +31,8 @@ class Joint:
 
     Attributes:
         name: as written.
-        kind: how it moves.
-        parent: link that it hangs on.
+        kind: type of the joint.
+        parent: link that it is attached to.
         child: link that it moves.
         offset: origin of the child, (3,) m.
         rotation: of the child at rest, (3, 3).
@@ -52,7 +52,7 @@ def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
     """The joints from `base` (the root of the robot, if left out) to the link `tip`.
 
     Raises:
-        ValueError: the text is no URDF, has no such link, or holds a joint that has no closed form here.
+        ValueError: the text is not URDF, lacks the link, or has an unsupported joint.
     """
     joints = {joint.get("name", ""): joint for joint in robot_of(text).findall("joint")}
     above = {_link(joint, "child"): joint for joint in joints.values()}
@@ -80,7 +80,7 @@ def read_urdf(path: Path) -> str:
 
 
 def robot_of(text: str) -> ElementTree.Element:
-    """The root of a description. Raises ValueError where it is none, or not plain XML."""
+    """Root element of a description. Raises ValueError where it is not URDF, or not plain XML."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a robot description has no document type and no entities")
     try:
@@ -136,7 +136,7 @@ def _triple(element: ElementTree.Element | None, key: str, default: tuple[float,
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Doubles:
-    """Rz(yaw) Ry(pitch) Rx(roll), as URDF has it; entries next to a whole number are that number."""
+    """Rz(yaw) Ry(pitch) Rx(roll), as in URDF; entries close to an integer are rounded."""
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll, pitch, yaw))
     found = np.array(
         [

@@ -1,1 +1,1 @@
-"""Scenarios, and systems that differ from their model."""
+"""Scenarios, and systems that deviate from their model."""

@@ -1,9 +1,9 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
-These are, unless `test: {uncertain: […]}` names them, the constants that `flow` and the resets of jumps
-compute with, and the numbers that `flow` and resets have written in them. What a condition reads (where a
-station is, when a light changes) is a place or an instant and no property of what moves; exponents, indices
-and numbers that a function is called with are mathematics. Constants that a condition reads too stay.
+Unless `test: {uncertain: […]}` names them, uncertain numbers are the constants and literals that `flow` and
+the resets of jumps compute with. Conditions read positions and instants (where a station is, when a light
+changes), which are not properties of the plant; exponents, indices and function arguments are mathematics. So
+these numbers, and constants that a condition also reads, are exact.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Uncertain:
     """An uncertain number.
 
     Attributes:
-        factor: the column that multiplies it; 1 is what the model says.
-        text: as it is written: `vy`, `0.01 m/rad`.
-        states: whose equations or resets have it.
+        factor: the column that multiplies it; 1 for the model's value.
+        text: as written: `vy`, `0.01 m/rad`.
+        states: those whose equations or resets read it.
     """
 
     factor: str
@@ -54,20 +54,20 @@ class Uncertain:
 
 @dataclass(frozen=True, slots=True)
 class Perturbable:
-    """A declaration whose `flow` and `jumps` read a factor for each of its uncertain numbers."""
+    """Declaration whose `flow` and `jumps` read a factor for each of its uncertain numbers."""
 
     decl: SystemDecl
     numbers: tuple[Uncertain, ...]
 
 
 def perturbable(decl: SystemDecl) -> Perturbable:
-    """The dynamics of a declaration with a factor at every uncertain number."""
+    """Dynamics of a declaration with a factor at every uncertain number."""
     parts = moving_parts(decl)
     names = parts.names
     used, listed = _UsedNumbers(names), decl.test.uncertain
 
     def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-        cx = Context.of(Reader(decl.source), rewriting, parts.clock)  # findings are dropped
+        cx = Context.of(Reader(decl.source), rewriting, parts.clock)  # its findings are dropped
         return read_flow(parts.flow, cx), read_jumps(parts.jump, cx)
 
     read(_RewritingNames.of(names, used.look))
@@ -86,7 +86,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """The declaration with other numbers for its real states and its guards."""
+    """The declaration with replaced equations of real states and replaced guards."""
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
     rates = {assign.name: assign for assign in flow if assign.name in real}
     again = {jump.name: jump for jump in jumps}
@@ -104,7 +104,7 @@ def _jump(jump: JumpDecl, again: JumpDecl, real: set[str]) -> JumpDecl:
 
 
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
-    """The states whose equations or jumps read a factor."""
+    """States whose equations or jumps read a factor."""
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
         guarded = factor in names_in(jump.guard)
@@ -126,7 +126,7 @@ def _place(node: ast.Quantity) -> str:
 
 
 def _times(entry: Entry, factor: ir.Num) -> Entry:
-    """A constant with a factor, all components of a vector with the same one."""
+    """Constant times a factor, the same for all components of a vector."""
     assert isinstance(entry, Known)
     match entry.value:
         case Number() as number:
@@ -138,13 +138,13 @@ def _times(entry: Entry, factor: ir.Num) -> Entry:
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:
-    """A number with a factor; a point of a scale has no share that it could be wrong by."""
+    """Number times a factor; a point of a scale has no relative error and is unchanged."""
     if number.unit.offset:
         return number
     return replace(number, num=multiply(number.num, factor), exact=None)
 
 
-# -------------------------------------------------------------------- reading expressions again
+# -------------------------------------------------------------------- rewriting of expressions
 
 Rewrite = Callable[[ast.Expr], ast.Expr]
 
@@ -179,7 +179,7 @@ class _RewritingExpressions(Expressions):
 
 
 class _UsedNumbers:
-    """Constants and numbers that expressions compute with, and constants that conditions read."""
+    """Numbers that expressions compute with, and constants that conditions read."""
 
     def __init__(self, names: Names) -> None:
         self.names = names
@@ -189,12 +189,12 @@ class _UsedNumbers:
         self.literals: dict[str, ast.Quantity] = {}
 
     def look(self, expr: ast.Expr) -> ast.Expr:
-        """Record an expression, unchanged."""
+        """Record an expression and return it unchanged."""
         self.rewritten(expr)
         return expr
 
     def rewritten(self, expr: ast.Expr, *, called: bool = False) -> ast.Expr:
-        """An expression with a factor at each number that it computes with; definitions are put in."""
+        """Add a factor to each number that an expression computes with; definitions are expanded."""
         match expr:
             case ast.Quantity(span=span, value=value):
                 if called or not value or _is_point(expr):
@@ -225,7 +225,7 @@ class _UsedNumbers:
 
 
 def _parts(expr: ast.Expr) -> Iterator[tuple[Any, bool]]:
-    """The parts of an expression, and whether it computes with them."""
+    """Parts of an expression, and whether it computes with them."""
     match expr:
         case ast.Neg(operand=operand):
             yield operand, True
@@ -244,7 +244,7 @@ def _parts(expr: ast.Expr) -> Iterator[tuple[Any, bool]]:
 
 
 def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
-    """An expression with some of its parts replaced."""
+    """Expression with some of its parts replaced."""
 
     def put(value: Any) -> Any:
         match value:
@@ -258,15 +258,15 @@ def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
     return replace(expr, **{each.name: put(getattr(expr, each.name)) for each in fields(expr)})
 
 
-# -------------------------------------------------------------------------- the perturbed truth
+# -------------------------------------------------------------------------- the perturbed system
 
 
 class PerturbedSystem(System):
-    """The true dynamics of some agents, each with its own factors; all are stepped at once.
+    """True dynamics of some agents, each with its own factors; all are stepped in one batch.
 
     Args:
         loose: the dynamics, with a factor at every uncertain number.
-        factors: (agents, numbers), 1 where a number is right.
+        factors: (agents, numbers), 1 where a number is exact.
     """
 
     def __init__(self, loose: Perturbable, factors: Tensor) -> None:

@@ -1,7 +1,6 @@
 """Scenarios: overlays of a system for deployment.
 
-Some are there for every system: `mismatch`, `disturb` and `noise`, with a number of per cent behind a hyphen
-or without.
+Every system has `mismatch`, `disturb` and `noise`, optionally with a percentage after a hyphen.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.registry import closest
 
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
-"""Scenarios of every system that the documentation measures."""
+"""Standard scenarios that the documentation measures."""
 _STANDARD = re.compile(r"(mismatch|disturb|noise)(?:-(\d{1,3}(?:\.\d{1,3})?))?")
 _USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
 
 
 def standard(name: str) -> ScenarioDecl | None:
-    """A scenario that every system has, such as `mismatch-20`; None for other names."""
+    """A standard scenario such as `mismatch-20`; None for other names."""
     found = _STANDARD.fullmatch(name)
     percent = float(found[2] or _USUAL[found[1]]) if found else 0.0
     if found is None or not 0.0 < percent <= 100.0:
@@ -43,7 +42,7 @@ def standard(name: str) -> ScenarioDecl | None:
 
 
 def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
-    """The overlay of that name, one of the file or one of every system's. Raises UsageError (U101)."""
+    """Scenario of that name, from the file or a standard one. Raises UsageError (U101)."""
     for scenario in decl.scenarios:
         if scenario.name == name:
             return scenario
@@ -58,14 +57,14 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """The constants that a scenario changes, for specification and model alike."""
+    """Constants that a scenario changes, for specification and model alike."""
     return find_scenario(load_system_decl(path, overrides), name).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:
-    """The system under a scenario; its model keeps all but the constants that the scenario changes.
+    """Apply a scenario to a system; of its model only the scenario's constants change.
 
-    Raises UsageError (U101) where there is no such scenario.
+    Raises UsageError (U101) where the scenario does not exist.
     """
     scenario = find_scenario(decl, name)
     return _laid_over(_with_constants(decl, scenario.constants) if scenario.constants else decl, name)

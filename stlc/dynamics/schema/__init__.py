@@ -1,1 +1,1 @@
-"""YAML with places, records of keys, names and expressions: what sections are read with."""
+"""YAML nodes with source locations, records of keys, names and expressions: tools to read sections."""

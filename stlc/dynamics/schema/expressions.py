@@ -46,9 +46,9 @@ class Expressions:
 
     Attributes:
         reader: where findings go.
-        scope: what names mean.
-        ready: columns that have a value here; None where all of them do.
-        amounts: numbers are added to what columns hold: differences, where those are points of a scale.
+        scope: meaning of names.
+        ready: columns that have a value here; None for all.
+        amounts: whether numbers are increments of columns: differences, where those are points of a scale.
     """
 
     reader: Reader
@@ -59,14 +59,14 @@ class Expressions:
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
-        """The same compiler with more names."""
+        """The compiler with additional names."""
         scope = self.scope.extended(entries, samplers=samplers)
         return Expressions(self.reader, scope, ready, self.amounts)
 
     # ------------------------------------------------------------------ parsing
 
     def parse(self, node: Node | None, where: str) -> ast.Expr | None:
-        """The syntax tree of a field."""
+        """Parse a field."""
         if not isinstance(node, Scalar) or node.is_null:
             if node is not None:
                 self.reader.wrong(node, where, "an expression")
@@ -102,7 +102,7 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """The number that a field holds, in SI units from the zero of its unit."""
+        """Number of a field, in SI units from the zero of its unit."""
         expr = self.parse(node, where)
         if expr is None:
             return None
@@ -112,7 +112,7 @@ class Expressions:
         return number
 
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
-        """The components that a field holds, as `number` gives them: one expression, or a list of them."""
+        """Components of a field, as from `number`: one expression, or a list of them."""
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
             found = tuple(number for number in each if number is not None)
@@ -125,19 +125,19 @@ class Expressions:
         return numbers if self._known(read, expr.span) else None
 
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
-        """The state formula that a field holds."""
+        """State formula of a field."""
         expr = self.parse(node, where)
         return None if expr is None else self.formula_of(expr)
 
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
-        """The state formula that an expression is."""
+        """State formula of an expression."""
         formula = self._typed(resolve_state_formula, expr)
         if formula is not None and not self._known(names_in(formula), expr.span):
             return None
         return formula
 
     def check(self, expr: ast.Expr) -> None:
-        """Report what is wrong with an expression of any sort."""
+        """Report errors in an expression of any sort."""
         rejected: list[list[Diagnostic]] = []
         resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (
             resolve_numbers,
@@ -158,7 +158,7 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """The result of a resolver of the compiler, or None with its findings reported."""
+        """Result of a resolver of the compiler; None with its findings reported."""
         sink: list[Diagnostic] = []
         try:
             return resolve(expr, replace(self.scope, sink=sink))
@@ -169,7 +169,7 @@ class Expressions:
             self._report(sink)
 
     def _report(self, findings: Sequence[Diagnostic]) -> None:
-        """Remember findings of the compiler under the codes of system files."""
+        """Report findings of the compiler under the codes of system files."""
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     def _known(self, names: frozenset[str], span: Span) -> bool:
@@ -183,14 +183,14 @@ class Expressions:
     # --------------------------------------------------------------------- values
 
     def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
-        """A number as it is stored in a column of `unit`."""
+        """Number as stored in a column of `unit`."""
         number = self.number(node, where)
         if number is None or node is None:
             return None
         return self._in_unit(number, node, where, unit)
 
     def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
-        """The components of a vector of `size` as they are stored in columns of `unit`.
+        """Components of a vector of `size` as stored in columns of `unit`.
 
         One number stands for all components; a random one is drawn for each.
         """
@@ -209,7 +209,7 @@ class Expressions:
         return kept if len(kept) == size else None
 
     def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
-        """A number as it is stored in a column of `unit`, or None with E203 reported."""
+        """Number as stored in a column of `unit`; None with E203 reported."""
         if self._fits(number, unit):
             place = first_line(node.span)
             if self.amounts and number.unit.offset:
@@ -225,7 +225,7 @@ class Expressions:
         return None
 
     def truth(self, node: Node | None, where: str) -> ir.Num | None:
-        """A number or a formula as the 0 or 1 of a bool column."""
+        """A number or a formula as 0 or 1 of a bool column."""
         expr = self.parse(node, where)
         match expr:
             case None:
@@ -239,7 +239,7 @@ class Expressions:
                 return self.stored(node, where, Unit())
 
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
-        """A compile-time constant, as it is stored in a column of `unit`."""
+        """Compile-time constant, as stored in a column of `unit`."""
         value = self.stored(node, where, unit)
         if value is None or node is None:
             return None
@@ -249,7 +249,7 @@ class Expressions:
         return value.value
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
-        """Compile-time constants, as they are stored in columns of `unit`."""
+        """Compile-time constants, as stored in columns of `unit`."""
         values = self.stored_each(node, where, unit, size)
         if values is None:
             return None
@@ -260,7 +260,7 @@ class Expressions:
         return found
 
     def duration(self, node: Node | None, where: str) -> Fraction | None:
-        """Seconds, exactly; a bare number counts as seconds."""
+        """Exact duration in seconds; a bare number is in seconds."""
         number = self.number(node, where)
         if number is None or node is None:
             return None
@@ -270,7 +270,7 @@ class Expressions:
         return number.exact
 
     def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
-        """A whole number of steps, given as `25 steps`, `25` or a time."""
+        """Number of steps, given as `25 steps`, `25` or a time."""
         if node is None:
             return None
         expr = self.parse(node, where)
@@ -299,12 +299,12 @@ class Expressions:
 
     @staticmethod
     def _fits(number: Number, unit: Unit) -> bool:
-        """Whether a number may be stored in a column of `unit`; an undeclared unit takes anything."""
+        """True if a number may be stored in a column of `unit`; an undeclared unit accepts anything."""
         return number.flexible or number.bare or not unit.text or same_dims(number.unit, unit)
 
 
 def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
-    """A number converted from SI to the unit of a column; a bare number is in that unit already."""
+    """Number converted from SI to the unit of a column; a bare number is in that unit already."""
     return number.num if number.bare else stored(number, unit)
 
 

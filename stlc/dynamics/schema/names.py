@@ -1,4 +1,4 @@
-"""The names of a system file: time, constants, states, controls and definitions."""
+"""Names of a system file: time, constants, states, controls and definitions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
-    """The section `time`; a horizon of 0 is not known."""
+    """The section `time`; a horizon of 0 means unknown."""
 
     dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
     horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
@@ -39,12 +39,12 @@ class Clockwork:
 
 
 def base_name(column: str) -> str:
-    """The name of the vector whose component a column is; its own name where it is none."""
+    """Name of the vector that a column is a component of; else its own name."""
     return column.partition("[")[0]
 
 
 def component_names(name: str, size: int | None) -> tuple[str, ...]:
-    """The columns of a state or control: its name, or one for each component of a vector."""
+    """Columns of a state or control: its name, or one for each component of a vector."""
     return (name,) if size is None else tuple(f"{name}[{index}]" for index in range(size))
 
 
@@ -56,7 +56,7 @@ class Names:
         constants: name -> (value in SI units, unit).
         columns: the states, in order.
         controls: the inputs, in order.
-        entries: everything that expressions may name.
+        entries: all names for expressions.
         places: name -> where it is declared.
     """
 
@@ -72,32 +72,32 @@ class Names:
         return Signature(tuple(self.columns))
 
     def expressions(self, reader: Reader) -> Expressions:
-        """A compiler of expressions that knows all declared names."""
+        """Compiler of expressions that knows all declared names."""
         return Expressions(
             reader, Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
         )
 
     def group(self, name: str) -> tuple[Column, ...]:
-        """The state of that name: one column, or the components of a vector; none where there is none."""
+        """Columns of a state: one, or the components of a vector; empty for other names."""
         exact = tuple(column for column in self.columns if column.name == name)
         return exact or tuple(column for column in self.columns if base_name(column.name) == name)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states; a vector has one."""
+        """Names of the states; one per vector."""
         return tuple(dict.fromkeys(base_name(column.name) for column in self.columns))
 
     def vector(self, name: str) -> bool:
-        """Whether a state of that name is a vector."""
+        """True if the state is a vector."""
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """Record the place of a vector for its components."""
+        """Record the source location of a vector for its components."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
-        """Declare a name; False, with a finding, where it is taken or is no identifier."""
+        """Declare a name; False, with a finding, if it is taken or not an identifier."""
         first = self.places.get(key.text)
         if first is not None:
             reader.report(
@@ -120,13 +120,13 @@ class Names:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The context in which the values of a section are read.
+    """Context in which the values of a section are read.
 
     Attributes:
-        reader: takes the findings.
-        names: everything that is declared.
+        reader: collects findings.
+        names: all declared names.
         clock: the time step and horizon.
-        here: expressions of this section.
+        here: compiler of this section's expressions.
     """
 
     reader: Reader
@@ -136,31 +136,31 @@ class Context:
 
     @staticmethod
     def of(reader: Reader, names: Names, clock: Clockwork | None = None) -> Context:
-        """The context of a section whose expressions read all names and draw nothing."""
+        """Context of a section whose expressions read all names and draw nothing."""
         return Context(reader, names, clock or Clockwork(), names.expressions(reader))
 
     @property
     def plain(self) -> Context:
-        """The same without what `here` adds to the names."""
+        """The context without the names that `here` adds."""
         return replace(self, here=self.names.expressions(self.reader))
 
     @property
     def timed(self) -> Context:
-        """The same with samplers, and `t` as the time of a deployment."""
+        """The context with samplers, and `t` as the time of a deployment."""
         clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
         return self.drawing({} if "t" in self.names.places else {"t": clock})
 
     def drawing(self, entries: MappingType[str, Entry], ready: frozenset[str] | None = None) -> Context:
-        """The same with samplers and more names; `ready` are the columns that have a value, if not all."""
+        """The context with samplers and more names; `ready`: columns with a value, None for all."""
         return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
 
     def amounts(self) -> Context:
-        """The same where numbers are added to what columns hold."""
+        """The context where numbers are increments of columns."""
         return replace(self, here=replace(self.here, amounts=True))
 
 
 def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
-    """The section `time`; `dt` becomes a name."""
+    """Read the section `time`; `dt` becomes a name."""
     first = node.get("dt") if isinstance(node, Mapping) else None
     scratch = Expressions(Reader(reader.source), names.expressions(reader).scope)
     dt = scratch.duration(first, "`dt`") or Clockwork().dt
@@ -170,7 +170,7 @@ def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
 
 
 def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `const`: numbers and vectors with units; later ones may use earlier ones."""
+    """Read the section `const`: numbers and vectors with units; later ones may use earlier ones."""
     for entry in reader.entries(node, "`const`"):
         name = entry.key.text
         if not names.declare(entry.key, "constant", reader):
@@ -195,7 +195,7 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
 
 @reads({"type": "string"})
 def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
-    """A unit."""
+    """Read a unit."""
     text = cx.reader.text(node, "`unit`")
     try:
         return None if text is None else parse_unit(text)
@@ -208,7 +208,7 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
 
 
 def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `def`: named sub-expressions, numbers or formulas; checked even where nothing uses them."""
+    """Read the section `def`: named sub-expressions, numbers or formulas; unused ones are checked too."""
     written: list[ast.Expr] = []
     for entry in reader.entries(node, "`def`"):
         if not names.declare(entry.key, "definition", reader):

@@ -1,4 +1,4 @@
-"""Checked access to YAML nodes: known keys, kinds of values, and findings with their places."""
+"""Checked access to YAML nodes: known keys, kinds of values, findings with source locations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stlc.registry import closest
 from stlc.source import Source, Span
 
 MAX_NAME = 200
-"""Characters of a name that is free text: of a system, an event, a scenario, the word of an enum."""
+"""Maximum length of a free-text name: of a system, an event, a scenario, a word of an enum."""
 _OPENING, _CLOSING = "([{", ")]}"
 
 
@@ -20,7 +20,7 @@ _OPENING, _CLOSING = "([{", ")]}"
 class Reader:
     """Checked access to the values of a system file, and the findings about them.
 
-    Every method returns None (or leaves a key out) where it has reported something.
+    Every method returns None (or omits a key) where it has reported a finding.
     """
 
     source: Source
@@ -39,12 +39,12 @@ class Reader:
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
-        """Record findings, one for each place: an anchor that is used twice is wrong once."""
+        """Record findings, one per source location: an error in a reused anchor is reported once."""
         for finding in findings:
             tell(self.findings, finding)
 
     def close(self) -> None:
-        """Raise SystemFileError with all errors, in the order of the file, if there is any."""
+        """Raise SystemFileError with all errors, in file order, if there are any."""
         errors = [finding for finding in self.findings if finding.severity == "error"]
         if errors:
             raise SystemFileError(*sorted(errors, key=lambda error: error.span.start if error.span else 0))
@@ -63,7 +63,7 @@ class Reader:
     def fields(
         self, node: Node | None, where: str, known: Collection[str], required: Iterable[str] = ()
     ) -> dict[str, Node]:
-        """Values by key of a mapping whose keys are fixed."""
+        """Values by key of a mapping with fixed keys."""
         found: dict[str, Node] = {}
         for entry in self.entries(node, where):
             if entry.key.text in known:
@@ -90,7 +90,7 @@ class Reader:
 
     @staticmethod
     def near(name: str, candidates: Iterable[str]) -> str | None:
-        """The candidate that `name` is probably a misspelling of."""
+        """Candidate that `name` is probably a misspelling of."""
         return closest(name, candidates)
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
@@ -107,7 +107,7 @@ class Reader:
         return node.items
 
     def _whole(self, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """The entries without the fragments of expressions that a comma inside `{…}` has cut."""
+        """Entries without the fragments of expressions that a comma inside `{…}` has split off."""
         kept: list[Entry] = []
         open_value = False
         for entry in entries:
@@ -146,12 +146,12 @@ class Reader:
         return node.text
 
     def name(self, node: Node | None, where: str) -> str | None:
-        """A text that can be a name: printable, and not too long."""
+        """A text that can be a name: printable and not too long."""
         text = self.text(node, where)
         return text if text is None or self.nameable(node, where) else None
 
     def nameable(self, node: Node | None, where: str) -> bool:
-        """Whether a text can be a name: printable, and not too long; reports why not."""
+        """True if a text can be a name: printable and not too long; otherwise reports the reason."""
         assert isinstance(node, Scalar)
         hidden = unseen(node.text)
         if not hidden and len(node.text) <= MAX_NAME:
@@ -162,7 +162,7 @@ class Reader:
         return False
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
-        """A whole number between `low` and `high`."""
+        """An integer between `low` and `high`."""
         if node is None:
             return None
         value = as_int(node) if isinstance(node, Scalar) else None
@@ -207,7 +207,7 @@ class Reader:
 
 
 def _kind(node: Node) -> str:
-    """The description of a value in messages."""
+    """Description of a value in messages."""
     match node:
         case Sequence():
             return "a list"
@@ -220,7 +220,7 @@ def _kind(node: Node) -> str:
 
 
 def first_line(span: Span) -> Span:
-    """The part of a span on its first line, which carets underline."""
+    """First line of a span, which carets underline."""
     length = span.text.find("\n")
     return span if length < 0 else Span(span.source, span.start, span.start + max(length, 1))
 

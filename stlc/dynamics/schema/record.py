@@ -1,6 +1,6 @@
-"""Records of a system file: a key's description gives its reader, its JSON Schema and its documentation.
+"""Records of a system file: one description per key for reader, JSON Schema and documentation.
 
-A record is a frozen dataclass some of whose fields are made by `key`:
+A record is a frozen dataclass with fields made by `key`:
 
     @dataclass(frozen=True, slots=True)
     class TrainDecl:
@@ -31,7 +31,7 @@ _Read: TypeAlias = "Callable[[Context, Node, str], Any]"
 Json = dict[str, Any]
 _KEY = "key"
 OF = "`{name}` of {of}"
-"""The label of a value that also names its mapping."""
+"""Label of a value that also names its mapping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class Kind:
     """A kind of value.
 
     Attributes:
-        read: (context, node, label for messages) -> the value; None where a finding was reported.
-        schema: JSON Schema of what may be written.
+        read: (context, node, label for messages) -> value; None where a finding was reported.
+        schema: JSON Schema of accepted values.
         record: the record that the value, or each of its items, is read into.
     """
 
@@ -59,8 +59,8 @@ class Key:
         kind: of the value.
         about: meaning, for the documentation.
         label: name of the value in messages; `{of}` is that of the record.
-        required: the key must be there.
-        spread: the kind gives several fields, by name.
+        required: whether the key is mandatory.
+        spread: whether the kind gives several fields, by name.
     """
 
     attribute: str
@@ -107,7 +107,7 @@ def keys_of(record: type) -> Mapping[str, Key]:
 def values_of(
     record: type, cx: Context, node: Node | None, of: str, label: str = "`{name}`"
 ) -> dict[str, Any]:
-    """The fields that a mapping gives, read and checked.
+    """Read and check the fields of a mapping.
 
     `of` names the mapping in messages, and `label` its values that have no label of their own.
     """
@@ -126,7 +126,7 @@ def values_of(
 
 
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
-    """A record from a mapping, with defaults for what is missing or wrong."""
+    """Read a record from a mapping, with defaults for missing or invalid values."""
     return record(**values_of(record, cx, node, of, label))
 
 
@@ -146,17 +146,17 @@ FLAG = Kind(lambda cx, node, label: cx.reader.flag(node, label), {"type": "boole
 SECONDS = Kind(lambda cx, node, label: cx.here.duration(node, label), EXPRESSION)
 """A positive time, as a fraction of seconds."""
 STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.clock.dt), EXPRESSION)
-"""A positive number of steps, given as such or as a time."""
+"""A positive number of steps, given as a number or as a time."""
 FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 
 
 def reads(schema: Mapping[str, Any], record: type | None = None) -> Callable[[_Read], Kind]:
-    """A decorator that makes a kind of a reader."""
+    """Decorator that makes a kind from a reader."""
     return lambda read: Kind(read, schema, record)
 
 
 def integer(low: int = 1, high: int = 10**9) -> Kind:
-    """A whole number between `low` and `high`."""
+    """An integer between `low` and `high`."""
     return Kind(
         lambda cx, node, label: cx.reader.integer(node, label, low=low, high=high),
         {"type": "integer", "minimum": low, "maximum": high},
@@ -171,7 +171,7 @@ def number(low: float = 0.0) -> Kind:
 
 
 def word(options: Iterable[str]) -> Kind:
-    """One of a few words, or of the names of a registry, which are looked up whenever one is read."""
+    """One of a few words, or of the names of a registry, looked up at each reading."""
     return Kind(
         lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
     )
@@ -187,12 +187,12 @@ def fraction(cx: Context, node: Node, label: str) -> float | None:
 
 
 def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
-    """The node itself, for values that are read when more names are known."""
+    """The node itself, for values that are read later, when more names are known."""
     return Kind(lambda _cx, node, _label: node, schema, record)
 
 
 def mapping_of(schema: Mapping[str, Any]) -> Json:
-    """JSON Schema of a mapping with free keys; `~` takes an entry of an extended file away."""
+    """JSON Schema of a mapping with free keys; `~` removes an entry of an extended file."""
     return {
         "type": ["object", "null"],
         "additionalProperties": {"anyOf": [dict(schema), {"type": "null"}]},
@@ -200,12 +200,12 @@ def mapping_of(schema: Mapping[str, Any]) -> Json:
 
 
 def items_of(schema: Mapping[str, Any]) -> Json:
-    """JSON Schema of a list; nothing is an empty one."""
+    """JSON Schema of a list; null is an empty one."""
     return {"type": ["array", "null"], "items": dict(schema)}
 
 
 def list_of(kind: Kind, label: str) -> Kind:
-    """A list, as a tuple of the items that can be read; `label` names an item in messages."""
+    """A list, as a tuple of the valid items; `label` names an item in messages."""
 
     def items(cx: Context, node: Node, where: str) -> tuple[Any, ...]:
         each = [kind.read(cx, item, label) for item in cx.reader.items(node, where)]
@@ -215,7 +215,7 @@ def list_of(kind: Kind, label: str) -> Kind:
 
 
 def part(record: type) -> Kind:
-    """A mapping that is a record of its own."""
+    """A mapping read as a record."""
     return Kind(lambda cx, node, label: read(record, cx, node, label), json_schema(record), record)
 
 
@@ -225,7 +225,7 @@ def section(record: type, *, free: bool = False) -> Kind:
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
 
 
-# ------------------------------------------------------------------- what is derived from them
+# ------------------------------------------------------------------- schema and documentation
 
 
 def json_schema(record: type) -> Json:
@@ -255,7 +255,7 @@ def reference(record: type, title: str) -> Iterator[str]:
 
 
 def _shown(default: Any) -> str:
-    """A default of a record in a table."""
+    """Default of a record, as shown in a table."""
     if isinstance(default, (bool, int, float, str)) and default != "":
         return f"`{str(default).lower() if isinstance(default, bool) else default}`"
     if isinstance(default, tuple) and default and all(isinstance(each, int) for each in default):

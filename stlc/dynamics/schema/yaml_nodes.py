@@ -1,9 +1,9 @@
-"""YAML nodes with their places in the file, read strictly and safely.
+"""YAML nodes with source locations, read strictly and safely.
 
-Built on the event stream of PyYAML, so no object is ever constructed from a tag, aliases share one
-node instead of being copied, and depth and size are bounded while reading. Scalars stay text: what a
-text means is decided by whoever reads the field, with the rules of YAML 1.2 (`1e-3` is a number, `on`
-and `yes` are words, `012` is twelve, `12:30` is a word).
+Built on the event stream of PyYAML, so no object is ever constructed from a tag, aliases share one node
+instead of being copied, and depth and size are bounded while reading. Scalars stay text: the reader of a
+field interprets it, by the rules of YAML 1.2 (`1e-3` is a number, `on` and `yes` are words, `012` is twelve,
+`12:30` is a word).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_NODES = 20_000
 MERGE_KEY = "<<"
 _FAST = getattr(yaml, "CSafeLoader", None)
 _LAX = re.compile("[\t?\ufeff]")
-"""Text that the parser in C reads differently: tabs and `?` within words, a mark of the order of bytes."""
+"""Text that the C parser reads differently: tabs and `?` within words, byte order marks."""
 _PLAIN_WORDS = (("character '\\t'", "a tab"), ("'<stream end>'", "the end of the file"), ("'", "`"))
 
 Style: TypeAlias = Literal["plain", "single", "double", "block"]
@@ -41,12 +41,12 @@ _STYLES: dict[str | None, Style] = {
 
 @dataclass(frozen=True, slots=True)
 class Scalar:
-    """A scalar, as text.
+    """Scalar, as text.
 
     Attributes:
-        span: of the text as it stands in the file, quotes included.
-        text: the value, quotes and escapes undone.
-        style: how it was written.
+        span: of the text in the file, quotes included.
+        text: the value, unquoted and unescaped.
+        style: quoting or block style.
     """
 
     span: Span
@@ -68,13 +68,13 @@ class Scalar:
 
     @property
     def escaped(self) -> bool:
-        """Whether the value differs from the characters between the quotes."""
+        """True if the value differs from the characters between the quotes."""
         inside = self.inside.text
         return "\\" in inside if self.style == "double" else self.style == "single" and "''" in inside
 
     @property
     def is_null(self) -> bool:
-        """Whether the value is null: empty, `~` or `null`."""
+        """True if the value is null: empty, `~` or `null`."""
         return self.style == "plain" and self.text in {"", "~", "null", "Null", "NULL"}
 
 
@@ -95,7 +95,7 @@ class Entry:
     value: Node
 
     def place(self, key: str) -> Span:
-        """The place of the value of `key` within this one, else that of all of it."""
+        """Source location of the value of `key` within this one, else that of the whole."""
         node = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.value.span if node is None else node.span
 
@@ -145,7 +145,7 @@ def as_bool(node: Scalar) -> bool | None:
 
 
 def as_int(node: Scalar) -> int | None:
-    """A decimal whole number, else None."""
+    """A decimal integer, else None."""
     return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
 
 
@@ -161,8 +161,8 @@ def as_float(node: Scalar) -> float | None:
 def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
     """The one document of `source`, which must be a mapping.
 
-    Keys that are given twice are appended to `sink` as S102; the first one counts.
-    Raises SystemFileError (S100) where there is no such document, or one that is not safe to read.
+    Duplicate keys are appended to `sink` as S102; the first one counts. Raises SystemFileError (S100) where
+    there is no such document, or it is not safe to read.
     """
     node = load_node(source, sink=sink)
     if node is None or (isinstance(node, Scalar) and node.is_null):
@@ -191,8 +191,8 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
     """The one node of `source`, of any kind; None when there is no document.
 
-    The parser in C reads it ten times faster where PyYAML has one. What is wrong is told by that in Python,
-    whose messages and places are the better ones.
+    PyYAML's C parser, if available, is ten times faster. Errors are reported by the Python parser, whose
+    messages and locations are better.
     """
     found: list[Diagnostic] = []
     if _FAST is not None and not _LAX.search(source.text):
@@ -235,7 +235,7 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
 
 
 class _Builder:
-    """Builder of the nodes of one document from parser events, within bounds."""
+    """Builder of the nodes of one document from parser events, with bounded size."""
 
     def __init__(self, source: Source, sink: list[Diagnostic], loader: Any) -> None:
         self.source = source
@@ -257,7 +257,7 @@ class _Builder:
         return root
 
     def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
-        """An S100 error at the place of an event."""
+        """S100 error at the location of an event."""
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, event: Any) -> Span:
@@ -321,7 +321,7 @@ class _Builder:
         return node
 
     def sequence(self, start: Any, depth: int) -> Sequence:
-        """Items up to the end of the sequence."""
+        """Read items up to the end of the sequence."""
         items: list[Node] = []
         while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
             items.append(self.node(event, depth + 1))
@@ -329,7 +329,7 @@ class _Builder:
         return Sequence(span, tuple(items), 1 + sum(item.size for item in items))
 
     def mapping(self, start: Any, depth: int) -> Mapping:
-        """A mapping up to its end event; merged entries come after its own."""
+        """Read a mapping up to its end event; merged entries come after its own."""
         written: dict[str, Entry] = {}
         merged: dict[str, Entry] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
@@ -350,7 +350,7 @@ class _Builder:
         return Mapping(self.whole(start, event), entries, size)
 
     def merge(self, key: Scalar, value: Node) -> tuple[Entry, ...]:
-        """The entries that `<<` brings in."""
+        """Entries merged by `<<`."""
         if isinstance(value, Mapping):
             return value.entries
         if isinstance(value, Sequence) and all(isinstance(item, Mapping) for item in value.items):
@@ -373,7 +373,7 @@ class _Builder:
         )
 
     def whole(self, start: Any, end: Any) -> Span:
-        """The span from the start event to the end event, without trailing blanks."""
+        """Span from the start event to the end event, without trailing blanks."""
         first, last = start.start_mark.index, end.end_mark.index
         last = first + len(self.source.text[first:last].rstrip())
         return self.source.span(first, max(last, first + 1))

@@ -1,4 +1,4 @@
-"""Integrators: every module of this package is one, and holds a `TABLEAU`."""
+"""Integrators, one per module, each with a `TABLEAU`."""
 
 from stlc.dynamics.model.integrators._tableau import Tableau
 from stlc.registry import PackageRegistry

@@ -1,6 +1,7 @@
 """Explicit Runge-Kutta methods as tableaux, applied to numbers of the IR.
 
-The result of a step is a formula, so one tableau serves rollouts in torch, NumPy programs and emitted C.
+The result of a step is an expression, so one tableau serves rollouts in torch, NumPy programs and generated
+C.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ Rate: TypeAlias = Callable[[State], State]
 
 @dataclass(frozen=True, slots=True)
 class Tableau:
-    """The coefficients of an explicit Runge-Kutta method (Butcher).
+    """Butcher tableau of an explicit Runge-Kutta method.
 
-    Weights are whole numbers over a common divisor, so that equal ones share a product.
+    Weights are integers over a common divisor, so that equal ones share a product.
 
     Attributes:
-        stages: row i holds the coefficients of the derivatives before stage i, of which the first has none.
+        stages: row i holds the coefficients of the earlier derivatives in stage i; the first row is empty.
         weights: of the derivatives in the result, times `divisor`.
         divisor: of the weights.
     """
@@ -33,7 +34,7 @@ class Tableau:
     divisor: float = 1.0
 
     def __call__(self, rate: Rate, state: State, length: float) -> State:
-        """The state one step of `length` later; `rate` gives the derivatives of the components that move."""
+        """State after one step of `length`; `rate` gives the derivatives of the moving components."""
         slopes: list[State] = []
         for row in self.stages:
             slopes.append(rate(_moved(state, slopes, row, length)))
@@ -41,7 +42,7 @@ class Tableau:
 
 
 def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], length: float) -> State:
-    """`state + length * sum(weight * slope)`; components that do not move stay."""
+    """`state + length * sum(weight * slope)`; components that do not move are unchanged."""
     groups: dict[float, list[State]] = {}
     for weight, slope in zip(weights, slopes, strict=True):
         if weight:
@@ -56,7 +57,7 @@ def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], leng
 
 
 def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
-    """The weighted sum of one component's derivatives, those of equal weights added first."""
+    """Weighted sum of one component's derivatives; those with equal weights are added first."""
     total: ir.Num | None = None
     for weight, slopes in groups.items():
         part = slopes[0][name]
