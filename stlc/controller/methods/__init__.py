@@ -1,6 +1,6 @@
 """Training methods and planners, one per file, named as in `--method` and `train: {method: …}`.
 
-A file holds an object `METHOD` with the attributes of `Method`; `stlc.registry.METHODS` finds it by file name.
+A file holds an object `METHOD` with the attributes of `Method`; `stlc.registry.METHODS` finds it.
 Schema, command line and tables read the names from there, without torch. Code shared by several methods lies
 in files whose names begin with `_`.
 """
