@@ -1,4 +1,4 @@
-"""Probability that the backup policy's grid contains a working plan: the paper's Theorem 1 and exact.
+"""Probability that the backup policy's grid contains a working plan: the paper's Theorem 1, and exactly.
 
 Assume a prefix u* of T0 actions, uniformly distributed over the control ranges, such that every prefix within
 `radius` of it, in every control at every step, leads to satisfaction. The backup policy finds it if a grid

@@ -1,4 +1,4 @@
-"""Robustness of the prefixes of a plan over all continuations."""
+"""Upper bounds on the robustness of plan prefixes over all continuations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def anchored(formula: ir.Formula) -> ir.Formula:
 def robustness_until(
     formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
 ) -> Tensor:
-    """Minimum robustness of formulas on the samples 0 to `last`, over all continuations: (batch,).
+    """Minimum over formulas of the robustness upper bound given the samples 0 to `last`: (batch,).
 
     `columns`: name -> (time, batch), as long as the formulas' horizon. `last`: one number, or (batch,).
     """
@@ -57,7 +57,7 @@ def robustness_until(
 
 
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """Minimum robustness of the anchored formulas on every prefix, over all continuations; exact.
+    """Minimum over the anchored formulas of the exact robustness upper bound given each prefix.
 
     Args:
         formulas: the safety requirements.
