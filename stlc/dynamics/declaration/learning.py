@@ -245,7 +245,7 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """Read the images of states and controls under a symmetry; unlisted ones are unchanged.
 
-    The symmetry of dynamics and specification is checked later: see `controller.problem.symmetry`.
+    `stlc.controller.training.diagnose.check_mirror` checks the symmetry before a training.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)
