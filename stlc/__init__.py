@@ -1,4 +1,4 @@
-"""Signal Temporal Logic in, a trained, checked and guarded controller out.
+"""Synthesis, monitoring and guarding of controllers from Signal Temporal Logic specifications.
 
 The names of the library are imported when they are first used:
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from stlc.trace import Trace
 
     def compile(spec: ast.Spec, system: System) -> Task:
-        """Call of the package `stlc.compile` as a function."""
+        """Compile a specification for a system: the package `stlc.compile` called as a function."""
 
 else:
     import stlc.compile as compile
@@ -76,11 +76,11 @@ def __dir__() -> list[str]:
 
 
 def load(path: Path | str) -> ast.Spec:
-    """Read and parse a specification; it remembers its path, so that the system it names is found.
+    """Read and parse a specification; it keeps its path, from which the system it names is found.
 
     Raises:
         UsageError: there is no such file.
-        SpecError: the text is no specification; the error carries all diagnostics.
+        SpecError: the text is not a specification; the error carries all diagnostics.
     """
     from stlc.files import find_spec, read_source
     from stlc.grammar.parse.parser import parse as parse_source
@@ -99,8 +99,8 @@ def parse(text: str, name: str = "<text>") -> ast.Spec:
 class _CallablePackage(ModuleType):
     """The package `stlc.compile`, which is also the function of that name.
 
-    The name is taken twice on purpose: the package compiles, and so does the call that a notebook makes.
-    Python looks up what it calls in the class, so the package gets a class that can be called.
+    The name is used twice on purpose, as a package and as a function for notebooks. Python looks up
+    `__call__` in the class, so the package object gets a callable class.
     """
 
     def __call__(self, spec: ast.Spec, system: System) -> Task:

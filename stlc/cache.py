@@ -1,4 +1,4 @@
-"""The cache folder: what can be made anew is kept between processes, where nobody else can have changed it.
+"""The cache folder: reproducible artefacts kept between processes, protected from other users.
 
 Code is loaded from here, so the folder is used only if it belongs to the user, is no link, and nobody else
 may write to it; every file in it that is read is held to the same. Otherwise, and where there is no place for
@@ -21,11 +21,11 @@ from stlc.diagnostics import Diagnostic, notice
 from stlc.stopping import undoing
 
 MOST_BYTES = 256_000_000
-"""What the cache may hold; the files that were not used for the longest time go first."""
+"""Size limit of the cache in bytes; the least recently used files are removed first."""
 MOST_DAYS = 60
-"""Files that were not used for so long go."""
+"""Days without use after which a file is removed."""
 KINDS = ("kernel-", "grammar-", "trouble-")
-"""How names of files in the cache begin; nothing else in the folder is ever removed."""
+"""Prefixes of file names in the cache; other files in the folder are never removed."""
 
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _DAY = 86_400.0
@@ -34,11 +34,11 @@ _OPEN_FOLDERS = Path("/proc/self/fd")
 
 
 class Unusable(Exception):  # noqa: N818 - an answer, caught by who asks
-    """Reason for which a folder is not used.
+    """Error: a folder cannot be used as the cache.
 
     Attributes:
-        why: said after the name of the folder.
-        distrusted: somebody else could have changed what is in it.
+        why: reason, printed after the name of the folder.
+        distrusted: another user could have changed its content.
     """
 
     def __init__(self, why: str, *, distrusted: bool = False) -> None:
@@ -49,19 +49,19 @@ class Unusable(Exception):  # noqa: N818 - an answer, caught by who asks
 
 @dataclass(frozen=True, slots=True)
 class Cache:
-    """A folder of the user's alone.
+    """A cache folder that only the user can write to.
 
     Attributes:
-        shown: where it is.
-        folder: the same, through the open folder where the system has names for such: what stands above it
-            may be renamed or replaced, and this stays the folder that was looked at.
+        shown: its path.
+        folder: the same through an open file descriptor, where the system supports that: it stays the checked
+            folder even if a parent folder is renamed or replaced.
     """
 
     shown: Path
     folder: Path
 
     def read(self, name: str) -> bytes | None:
-        """The content of a file; None where there is none, or where somebody else may have written it."""
+        """Return the content of a file; None if it is missing or another user may have written it."""
         flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         path = self.folder / name
         try:
@@ -82,13 +82,13 @@ class Cache:
         return data
 
     def refuse(self, name: str, why: str) -> None:
-        """Remove a file that cannot be trusted, and say so."""
+        """Remove an untrusted file and warn about it."""
         with suppress(OSError):
             (self.folder / name).unlink()
         _tell(f"`{self.shown / name}` {why}", "it is made anew")
 
     def keep(self, name: str, data: bytes) -> bool:
-        """Write a file beside and rename it; gives whether that could be done."""
+        """Write a file atomically (temporary file, then rename); return whether that succeeded."""
         beside = self.folder / f"{_UNFINISHED}{os.urandom(8).hex()}"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
         try:
@@ -103,7 +103,7 @@ class Cache:
         return True
 
     def names(self, start: str) -> list[str]:
-        """The files whose names begin so."""
+        """Names of the files with a prefix."""
         try:
             return sorted(entry.name for entry in os.scandir(self.folder) if entry.name.startswith(start))
         except OSError:
@@ -116,7 +116,7 @@ class Cache:
 
 
 def _require_own(found: os.stat_result, right_kind: bool, otherwise: str) -> None:
-    """Raises Unusable where a file or folder could have been changed by others than the user."""
+    """Raise Unusable if another user could have changed a file or folder."""
     if not right_kind:
         raise Unusable(otherwise, distrusted=True)
     if os.name != "posix":
@@ -131,7 +131,7 @@ def _tell(what: str, instead: str) -> None:
     notice(Diagnostic("W701", f"{what}; {instead}"))
 
 
-# ---------------------------------------------------------------------- the lasting one
+# ---------------------------------------------------------------------- persistent cache
 
 
 def place() -> Path:
@@ -149,9 +149,9 @@ def place() -> Path:
 
 
 def lasting() -> Cache | None:
-    """The user's cache folder, made if it is not there; None where it cannot be used.
+    """The user's cache folder, created if missing; None if it cannot be used.
 
-    A folder that somebody else could have changed is told about, once a command.
+    A folder that another user could have changed causes a warning, once per command.
     """
     try:
         return opened()
@@ -164,7 +164,7 @@ def lasting() -> Cache | None:
 
 
 def why_not() -> str:
-    """Reason for which there is no lasting cache; "" where there is one."""
+    """Reason for which there is no persistent cache; "" if there is one."""
     try:
         opened()
     except Unusable as refused:
@@ -180,14 +180,14 @@ def opened() -> Cache:
 
 
 _held: dict[Path, int] = {}
-"""Open folders: their names below `_OPEN_FOLDERS` are good for as long as the process lives."""
+"""Open folders; their paths below `_OPEN_FOLDERS` are valid as long as the process lives."""
 
 
 def private(path: Path) -> Cache:
-    """A folder that belongs to the user alone, made if it is not there.
+    """A folder that only the user can write to, created if missing.
 
     Raises:
-        Unusable: it cannot be made, or somebody else could have changed what is in it.
+        Unusable: it cannot be created, or another user could have changed its content.
     """
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -205,7 +205,7 @@ def private(path: Path) -> Cache:
 
 
 def _looked_at(path: Path) -> Path:
-    """The folder as it is named from now on, after its owner and mode were looked at."""
+    """The path of a folder through an open descriptor, after a check of its owner and mode."""
     held = _held.get(path)
     fresh = held is None or not os.path.samestat(os.fstat(held), path.lstat())
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else held
@@ -230,11 +230,11 @@ def _looked_at(path: Path) -> Path:
     return _OPEN_FOLDERS / str(folder)
 
 
-# ---------------------------------------------------------------------- the one of this process
+# ---------------------------------------------------------------------- cache of this process
 
 
 def temporary() -> Cache | None:
-    """A folder of this process, removed when it ends; None where there is no room for one."""
+    """A temporary folder of this process, removed at its end; None if the disk is full."""
     return _temporary(os.getpid())
 
 
@@ -263,7 +263,7 @@ def _temporary(process: int) -> Cache | None:
 
 @cache
 def _pruned(kept: Cache) -> None:
-    """Remove what is old or too much, once a process."""
+    """Prune the cache, once per process."""
     prune(kept)
 
 

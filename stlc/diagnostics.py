@@ -14,7 +14,7 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A secondary place, with what is to be said about it."""
+    """A secondary source location and its message."""
 
     span: Span
     text: str = ""
@@ -36,7 +36,7 @@ class Diagnostic:
         code: an entry of `CODES`; codes that start with W are warnings.
         message: one terse headline, in the user's terms.
         span: the place; None when there is no text to point at.
-        label: said beside the carets.
+        label: text beside the carets.
         labels: secondary places.
         help: what to do, one entry a line.
         note: why, one entry a line.
@@ -63,7 +63,7 @@ class Diagnostic:
 
 
 class Findings(list[Diagnostic]):
-    """Findings that can be asked quickly whether they hold one already, however many there are."""
+    """A list of findings without duplicates, with constant-time membership tests."""
 
     def __init__(self, items: Iterable[Diagnostic] = ()) -> None:
         super().__init__(items)
@@ -71,7 +71,7 @@ class Findings(list[Diagnostic]):
         self._indexed = 0
 
     def tell(self, finding: Diagnostic) -> None:
-        """Append a finding unless its code, place and headline are there."""
+        """Append a finding unless one with its code, place and headline is present."""
         for known in self[self._indexed :]:
             self._known.add((known.code, known.span, known.message))
         key = (finding.code, finding.span, finding.message)
@@ -82,7 +82,7 @@ class Findings(list[Diagnostic]):
 
 
 def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
-    """Append a finding to a list unless it holds one of that code, place and headline."""
+    """Append a finding to a list unless one with its code, place and headline is present."""
     if isinstance(sink, Findings):
         sink.tell(finding)
         return
@@ -92,7 +92,7 @@ def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
 
 
 class StlcError(Exception):
-    """Base of errors in what the user gave; `exit_code` is that of the command line."""
+    """Base of errors in user input; `exit_code` is the exit code of the command line."""
 
     exit_code = 3
 
@@ -118,11 +118,11 @@ class TraceError(StlcError):
 
 
 class RunError(StlcError):
-    """A run folder or checkpoint does not fit what was asked of it."""
+    """A run folder or checkpoint does not fit the request."""
 
 
 class UsageError(StlcError):
-    """The command line is off, or a named file does not exist."""
+    """The command line is wrong, or a named file does not exist."""
 
     exit_code = 2
 
@@ -134,7 +134,7 @@ class MissingError(StlcError):
 
 
 class Notice(UserWarning):
-    """Warning about the machine that changes no result; the command line shows its finding once."""
+    """A warning about the machine that does not affect results; the command line shows it once."""
 
     def __init__(self, finding: Diagnostic) -> None:
         super().__init__(": ".join((finding.code, "; ".join((finding.message, *finding.help)))))
@@ -142,7 +142,7 @@ class Notice(UserWarning):
 
 
 def notice(finding: Diagnostic) -> None:
-    """Warn of something about the machine."""
+    """Warn about a property of the machine, such as a missing compiler."""
     warnings.warn(Notice(finding), stacklevel=3)
 
 

@@ -1,4 +1,4 @@
-"""Text from elsewhere, made to stand in C, markup, tables, terminals, shells and paths as mere text.
+"""Escaping of untrusted text for C, markup, tables, terminals, shells and paths.
 
 Names, comments, units and file names come from files that anybody may have written. Each target has one
 function here; what is written for that target goes through it, whoever wrote the text. Where the target has
@@ -20,7 +20,7 @@ _UNSEEN = (
     r"\u2060-\u2064\u2066-\u206f\ud800-\udfff\ufeff\ufff9-\ufffb\U000110bd\U000110cd\U00013430-\U0001343f"
     r"\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0001\U000e0020-\U000e007f"
 )
-"""Controls, formats, halves of pairs, separators of lines: what steers a terminal, turns text or hides it."""
+"""Control and format characters, surrogates, line separators, which control a terminal or hide text."""
 
 _INVISIBLE = re.compile(f"[{_UNSEEN}]")
 _ON_SCREEN = re.compile(f"(?![\n\t])[{_UNSEEN}]")
@@ -31,22 +31,22 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def visible(text: str) -> str:
-    """A name on one line of a terminal: no control character, no line break, nothing that turns text."""
+    """A name for one line of a terminal: without control characters, line breaks or bidi overrides."""
     return text if text.isascii() and text.isprintable() else _INVISIBLE.sub(_sign, text)
 
 
 def unseen(text: str) -> str:
-    """The first character of a text that is not `visible` as it is; "" where all are."""
+    """The first character of a text that `visible` would replace; "" if there is none."""
     found = _INVISIBLE.search(text)
     return "" if found is None else found[0]
 
 
 def screen(text: str, *, styled: bool = False) -> str:
-    """A whole text for a terminal, of which only line breaks and tabs steer it.
+    """A multi-line text for a terminal, without control characters except line breaks and tabs.
 
     Args:
         text: lines.
-        styled: whether it holds colours of its own; then every name in it has to be `visible` already.
+        styled: whether it contains colour codes; then every name in it must have been made `visible`.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -59,7 +59,7 @@ def screen(text: str, *, styled: bool = False) -> str:
 
 
 def _sign(match: re.Match[str]) -> str:
-    """The picture of a control character, `\N{REPLACEMENT CHARACTER}` for what has none."""
+    """The Unicode symbol of a control character; `\N{REPLACEMENT CHARACTER}` if it has none."""
     code = ord(match[0])
     if code < 0x20:
         return chr(0x2400 + code)
@@ -67,12 +67,12 @@ def _sign(match: re.Match[str]) -> str:
 
 
 def shell(words: Iterable[str]) -> str:
-    """A command line to copy: each word is one argument, whatever it holds, and steers no terminal."""
+    """A command line to copy: each word is quoted as one argument, without control characters."""
     return " ".join(_word(word) for word in words)
 
 
 def operand(path: str) -> str:
-    """A path as a word of a command: none that begins with a dash is taken for an option."""
+    """A path as an argument: a leading dash is not taken for an option."""
     return f"./{path}" if path.startswith("-") else path
 
 
@@ -84,7 +84,7 @@ def _word(text: str) -> str:
 
 
 def _ansi(char: str) -> str:
-    """A character between `$'` and `'`, by its bytes where it cannot be seen."""
+    """A character within `$'…'`; an invisible one is written as its bytes."""
     if not _INVISIBLE.match(char):
         return char
     return "".join(
@@ -114,7 +114,7 @@ _C_BYTES = {code: chr(code) for code in range(0x20, 0x7F)} | {0x22: r"\"", 0x5C:
 
 
 def c_comment(text: str) -> str:
-    """Words within a comment of either kind: they do not end it, continue it, or open another."""
+    """Text within a `//` or `/* */` comment: it cannot end, continue or nest the comment."""
     words = visible(text).replace("\\", "\N{SET MINUS}")
     return re.sub(r"\*(?=/)|/(?=[*/])|\?(?=\?)", r"\g<0> ", words)
 
@@ -123,7 +123,7 @@ def c_comment(text: str) -> str:
 
 
 def lawful(text: str) -> str:
-    """The characters that HTML and XML 1.0 may hold, and signs for the others; nothing is escaped."""
+    """Text with the characters that HTML and XML 1.0 forbid replaced by symbols; nothing is escaped."""
     return _KEPT_IN_MARKUP.sub(_sign, text)
 
 
@@ -133,7 +133,7 @@ def html(text: str) -> str:
 
 
 def script_json(text: str) -> str:
-    """A JSON text to stand within `<script>`: it neither ends the element nor opens a comment in it."""
+    """A JSON text for a `<script>` element: it cannot end the element or open a comment."""
     return text.translate(_IN_SCRIPT)
 
 
@@ -141,7 +141,7 @@ _IN_SCRIPT = str.maketrans({char: f"\\u{ord(char):04x}" for char in "<>&\u2028\u
 _KEPT_IN_MARKUP = re.compile(
     "[^\t\n\\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufdcf\ufdf0-\ufffd\U00010000-\U0010ffff]"
 )
-"""What no XML 1.0 may hold, what HTML replaces or refuses, and what turns text round."""
+"""Characters that XML 1.0 forbids, that HTML replaces or rejects, or that change the text direction."""
 
 
 def xml(text: str) -> str:
@@ -150,13 +150,13 @@ def xml(text: str) -> str:
 
 
 def markdown(text: str) -> str:
-    """Words in a line or a cell of a table of Markdown: no mark-up, no link, no HTML, no next cell."""
+    """Text in a line or table cell of Markdown: mark-up, links, HTML and `|` are escaped."""
     words = re.sub(r"[\\`*_{}\[\]()#+\-.!|<>~&$:@=]", r"\\\g<0>", visible(text))
     return re.sub(r"^ +| +\Z", lambda match: "\N{NO-BREAK SPACE}" * len(match[0]), words)
 
 
 def markdown_code(text: str) -> str:
-    """A name in code letters in a line of Markdown, whatever back quotes it holds."""
+    """A name as inline code in Markdown; it may contain back quotes."""
     words = visible(text)
     longest = max(map(len, re.findall("`+", words)), default=0)
     fence = "`" * (longest + 1)
@@ -175,12 +175,12 @@ def workflow_property(text: str) -> str:
 
 
 def sarif_message(text: str) -> str:
-    """A plain message of SARIF 2.1.0: no link and no place for an argument (sections 3.11.5 and 3.11.6)."""
+    """A plain message of SARIF 2.1.0: links and placeholders are escaped (sections 3.11.5 and 3.11.6)."""
     return re.sub(r"\](?=\()", r"\\]", re.sub(r"\{(\d+)\}", r"{{\1}}", text))
 
 
 def uri(path: str) -> str:
-    """A path as a relative reference: what is no letter of an address is written in hexadecimal."""
+    """A path as a relative URI reference, percent-encoded."""
     return quote(path.replace("\\", "/"), safe="/-._~+@=,()", errors="surrogateescape")
 
 
@@ -193,17 +193,17 @@ def dot(text: str) -> str:
 
 
 LABEL = 60
-"""Letters of a label in a picture."""
+"""Maximum number of characters of a label in a picture."""
 
 
 def picture(text: str) -> str:
-    """A label in a picture, cut where it is endless; a legend leaves out what begins with an underline."""
+    """A label in a picture, truncated; legends omit a leading underscore, so it gets a thin space."""
     words = visible(text if len(text) <= LABEL else f"{text[: LABEL - 1]}…")
     return f"\N{THIN SPACE}{words}" if words.startswith("_") else words
 
 
 def tag(name: str) -> str:
-    """A name as one part of a tag of TensorBoard: no group of its own, and no other name gives the same."""
+    """A name as one part of a TensorBoard tag: injective, without group separators."""
     return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)
 
 
@@ -213,7 +213,7 @@ def topic(name: str, *, empty: str) -> str:
 
 
 def json_text(text: str) -> str:
-    """A text of JSON as it may stand in a file or on a terminal: what cannot be seen is in escapes."""
+    """A JSON text for a file or terminal: invisible characters are escaped."""
     if text.isascii() and "\x7f" not in text:
         return text
     return _ON_SCREEN.sub(lambda match: _unit(match[0]), text)
@@ -230,27 +230,27 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def spreadsheet(text: str) -> str:
-    """A word in a cell of a table of text that no spreadsheet takes for a formula."""
+    """A table cell that no spreadsheet takes for a formula."""
     return f"'{text}" if _FORMULA.match(text) else text
 
 
 def from_spreadsheet(text: str) -> str:
-    """The word that `spreadsheet` wrote."""
+    """The inverse of `spreadsheet`."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
 LONGEST = 80
-"""Bytes of a part of a path that a name gives; file systems have room for 255."""
+"""Maximum bytes of a path component made from a name; file systems allow 255."""
 
 _RESERVED = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.I)
 
 
 def file_part(name: str, *, empty: str) -> str:
-    """A name as one part of a path: letters, digits, `_`, `-`, `.`; in its folder, and never too long.
+    """A name as one path component: letters, digits, `_`, `-`, `.`; at most `LONGEST` bytes.
 
     Args:
         name: of anything.
-        empty: what stands for a name of which nothing is left.
+        empty: replacement for a name without any allowed character.
     """
     part = re.sub(r"[^\w.-]+", "-", visible(name).replace("\ufffd", "-")).strip("-.") or empty
     if len(part.encode()) <= LONGEST and not _RESERVED.fullmatch(part):

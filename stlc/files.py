@@ -1,4 +1,4 @@
-"""Files: read with care, written beside and then renamed, found by name."""
+"""Files: checked reading, atomic writing, and search by name."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stlc.stopping import leaving
 MAX_BYTES = 10_000_000
 _INSTALLED = Path(__file__).parent / "library"
 LIBRARY = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
-"""What is installed beside the code, laid out as in the source tree; of an editable install that tree."""
+"""Folder of the installed data files, laid out as the source tree (in an editable install, that tree)."""
 SYSTEMS, SPECS = LIBRARY / "examples", LIBRARY / "specs"
-"""The installed systems, and what they are to do. They name each other by `../`."""
+"""Folders of the installed systems and specifications, which refer to each other by `../`."""
 
 _SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
 _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
@@ -117,7 +117,7 @@ def _not_utf8(name: str, data: bytes, error: UnicodeDecodeError) -> Diagnostic:
 
 
 def write_atomic(path: Path | str, data: bytes | str) -> None:
-    """Write a whole file so that a reader sees the old one or the new one, never a part.
+    """Write a file atomically: a reader sees the old or the new content, never a part.
 
     Raises:
         MissingError: R201, no room or no permission; the old file is untouched.
@@ -128,9 +128,9 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A path beside `path`, with the same suffix, that replaces it when the block ends well.
+    """Yield a temporary path with the same suffix that replaces `path` if the block succeeds.
 
-    Missing folders are made. What is no regular file (a pipe, `/dev/null`) is written in place.
+    Missing folders are created. A path that is not a regular file (a pipe, `/dev/null`) is written in place.
 
     Raises:
         MissingError: R201, no room or no permission; the old file is untouched, the new one removed.
@@ -189,7 +189,7 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
 def find_spec(name: Path | str) -> Path:
     """The specification called `name`: as given, else among the installed ones, with or without `specs/`.
 
-    What is nowhere comes back as it is: who reads it says so.
+    A name that is not found is returned unchanged, so that reading it raises the error.
     """
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():

@@ -1,7 +1,7 @@
-"""Any specification and system as a `gymnasium` environment, for whoever trains policies by other means.
+"""A specification and a system as a `gymnasium` environment, for training by other libraries.
 
-The reward is the robustness of what has been driven, so that a policy that maximises it satisfies the
-specification. Needs the extra `stlc[gym]`.
+The reward is the robustness of the closed-loop run; a policy that maximises it satisfies the specification.
+Needs the extra `stlc[gym]`.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ Reward: TypeAlias = Literal["dense", "sparse"]
 Observation: TypeAlias = NDArray[np.float32]
 
 MOST = 10.0
-"""Robustness beyond this, either way, is no better or worse: it may be infinite."""
+"""Bound to which the robustness, which may be infinite, is clipped on both sides."""
 
 
 class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """Environment of one agent in the world of a system, rewarded by the robustness of a specification.
 
-    An observation is what the system's policy observes, (k,) float32, then the share of the episode that is
-    over where it is terminated at its end: what is left to earn depends on it. Its bounds are finite, what
-    is beyond them is clipped: those of the states' nominal ranges and of random plans, half as wide again.
-    An action is what actuators get, (m,) float32, in physical units, clipped to their range. `info` holds
-    `state` (n,) float64, `robustness` by requirement, `rho` of the whole, and `satisfied`. Robustness is that
-    of the last horizon, of as much of it as there is (`end = "truncate"`).
+    An observation is the policy's observation, (k,) float32, followed by the elapsed share of the episode if
+    the episode terminates at its end (the remaining return depends on it). Observations are clipped to finite
+    bounds: those of the states' nominal ranges and of random plans, widened by half. An action is the control
+    input, (m,) float32, in physical units, clipped to their range. `info` holds `state` (n,) float64,
+    `robustness` by requirement, `rho` of the whole, and `satisfied`. Robustness is that of the last horizon,
+    of as much of it as there is (`end = "truncate"`).
 
     Args:
         task: specification and system.
         steps: of an episode; by default the horizon of a plan, after which the episode is *terminated*.
             A longer one goes on in the world of the system and is *truncated*.
-        reward: "dense" gives what each step adds to the robustness, which sums to that of the episode less
-            that of its start; "sparse" gives all of it with the last step.
+        reward: "dense" is the increase of the robustness in each step, which sums to that of the episode less
+            that of its start; "sparse" is the robustness of the episode, at its last step.
         normalised: observations and actions are from -1 to 1, which most learners expect.
-        time: whether the share of the episode that is over is observed; None: where it is terminated.
+        time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -95,11 +95,11 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """A fresh world. The same seed gives the same episode.
+        """Reset the world. The same seed gives the same episode.
 
         Args:
-            seed: of everything random from here on.
-            options: `state`, (n,), begins there instead of where the world would.
+            seed: of all random numbers from here on.
+            options: `state`, (n,), an initial state in place of the world's own.
         """
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**62))
@@ -135,7 +135,7 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observed.told(seen, unit=self.normalised)
 
     def _judged(self) -> dict[str, Any]:
-        """Robustness of the last horizon of the episode, or of as much of it as there is."""
+        """Robustness of the last horizon of the episode, truncated if the episode is shorter."""
         driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
         columns = {name: driven[:, i, None] for i, name in enumerate(self.task.names)}
         margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")
@@ -153,7 +153,7 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 @dataclass(frozen=True, slots=True)
 class _Box:
-    """Ends of a space, (k,) float32, as they are or as -1 and 1."""
+    """Bounds of a space, (k,) float32, with normalisation to [-1, 1]."""
 
     low: Observation
     high: Observation
@@ -169,13 +169,13 @@ class _Box:
         return gymnasium.spaces.Box(self.low, self.high, dtype=np.float32)
 
     def clipped(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
-        """The number that a value of the space stands for, within the ends."""
+        """The physical value of a (normalised) value of the space, clipped to the bounds."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         value = np.asarray(given, dtype=np.float64)
         return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)
 
     def told(self, value: NDArray[np.float64], *, unit: bool) -> Observation:
-        """A number as a value of the space."""
+        """The (normalised) value of the space for a physical value."""
         if unit:
             wide = (self.high - self.low).astype(np.float64)
             value = 2.0 * (value - self.low) / wide - 1.0
@@ -188,7 +188,7 @@ PROBED = 256
 
 
 def _observed(task: Task, *, time: bool) -> _Box:
-    """Bounds of what the policy observes: of nominal ranges where they say, and of random plans; wider."""
+    """Bounds of the policy's observation: nominal ranges, or those of random plans, widened."""
     system = task.system
     generator = torch.Generator().manual_seed(0)
     x0 = task.sample(PROBED, seed=0, dtype=torch.float64)
@@ -224,7 +224,7 @@ def make(
     normalised: bool = False,
     time: bool | None = None,
 ) -> SpecEnv:
-    """The environment of a specification's file and of a system's, which the specification may name itself.
+    """Make the environment of a specification file and a system file (default: the one the former names).
 
     The other arguments are those of `SpecEnv`.
 

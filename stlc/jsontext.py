@@ -24,7 +24,7 @@ def plain(value: object) -> Json:
     sequences, sets, arrays and array scalars are taken apart; paths become text.
 
     Raises:
-        TypeError: `value` holds something that is no data.
+        TypeError: `value` contains an object that is not data.
     """
     match value:
         case None | bool() | str():
@@ -45,7 +45,7 @@ def plain(value: object) -> Json:
 
 
 def _foreign(value: object) -> Json:
-    """Dataclasses, and whatever turns itself into plain numbers (`tolist`: NumPy, torch)."""
+    """Convert dataclasses, and arrays with `tolist` (NumPy, torch)."""
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
     to_list = getattr(value, "tolist", None)
@@ -63,7 +63,7 @@ def _number(value: float) -> float | str:
 def dumps(value: object, *, indent: int | None = None) -> str:
     """`value` as a JSON text, by the rules of `plain`; on one line unless `indent` is given.
 
-    What cannot be seen, and halves of pairs, which no file in UTF-8 holds, are written in escapes.
+    Invisible characters, and lone surrogates, which UTF-8 cannot encode, are escaped.
     """
     return json_text(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
@@ -72,10 +72,10 @@ _ESCAPES = re.compile(r"(\\\\|\\u[dD][89abAB]..\\u[dD][c-fC-F]..)|\\u[dD][89a-fA
 
 
 def loads(text: str) -> Any:
-    """Data of a JSON text from elsewhere; half of a character, which no file can hold, becomes U+FFFD.
+    """Parse untrusted JSON text; lone surrogates, which UTF-8 cannot encode, become U+FFFD.
 
     Raises:
-        ValueError: it is no JSON.
+        ValueError: it is not JSON.
         RecursionError: it is nested too deeply.
     """
     return json.loads(_ESCAPES.sub(lambda match: match[1] or "\ufffd", text))

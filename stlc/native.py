@@ -1,8 +1,8 @@
-"""C text -> a loaded library: built by the system's compiler on first use, kept in the cache folder.
+"""Native kernels: C text compiled by the system's compiler on first use, cached and loaded.
 
-Where there is no compiler, or it fails or hangs, there is no kernel and the caller goes on without. A kept
-library is named after what it was built from and by (text, compiler, its version, flags, processor) and after
-its own content; one that is not what its name says is not loaded.
+Without a working compiler there is no kernel, and the caller uses its fallback. The name of a cached library
+holds a hash of its inputs (text, compiler, its version, flags, processor) and of its content; a library whose
+hash does not match is not loaded.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ if TYPE_CHECKING:
 
 FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
 VECTOR_FLAGS = ("-DVECTOR_MATH", *(f"-fno-builtin-{name}" for name in ("sin", "cos", "exp", "log")))
-"""For the vector functions of the GNU C library: a sine is not merged with the cosine beside it."""
+"""Flags for the vector functions of the GNU C library: sine and cosine are not merged into one call."""
 LONG = 80_000
-"""Characters of a C text from which on the third level of optimisation takes too long for what it gains."""
+"""Characters of a C text from which on `-O3` takes too long for its gain."""
 GRAIN = 16
-"""Rows that a kernel judges side by side."""
+"""Rows that a kernel evaluates together (SIMD lanes)."""
 SMALL = 512
 """Rows below which a second thread costs more than it saves."""
 PART = 0.05
-"""Seconds that a kernel works without a look at whether it is to stop."""
+"""Seconds between checks of the stop flag within a kernel."""
 
 Stop: TypeAlias = Callable[[], bool]
 
 
 def never() -> bool:
-    """The stop of work that is done to its end."""
+    """A stop condition that never holds."""
     return False
 
 
@@ -70,13 +70,13 @@ class Climb:
     """Parameters of a local search; all arrays contiguous float64.
 
     Attributes:
-        bounds: lowest and highest value of each control, and 1 where it is an angle that turns round, (3, m).
-        factors: of each requirement's robustness in the whole, (R,).
-        bank: plans that solved other states, (k, T, m).
+        bounds: lowest and highest value of each control, and 1 for a periodic angle, (3, m).
+        factors: scale of each requirement's robustness in the total, (R,).
+        bank: plan library of other states, (k, T, m).
         generations: of `LANES` changed plans each.
-        enough: a row is left alone once its robustness reaches this.
+        enough: target robustness at which the search of a row ends.
         seed: of the random changes.
-        stop: ends the climb before all rows are done.
+        stop: ends the search before all rows are done.
     """
 
     bounds: NDArray[np.float64]
@@ -103,13 +103,13 @@ class Kernel:
     def judge(
         self, x0: NDArray[np.float64], u: NDArray[np.float64], *, threads: int = 1, columns: bool = False
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Roll plans out exactly and judge them.
+        """Roll out plans with the exact dynamics and compute their robustness.
 
         Args:
             x0: (B, n), contiguous float64.
             u: (B, T, m), contiguous float64.
             threads: to share the rows among.
-            columns: whether the states are wanted too.
+            columns: whether the states are returned too.
 
         Returns:
             Robustness per requirement (B, R), and the states (n, T+1, B) or None.

@@ -32,7 +32,7 @@ def versions() -> dict[str, str]:
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:
-    """Commit and dirty flag of the source tree around `folder` (the current one by default), if any."""
+    """Commit and dirty flag of the git repository of `folder` (default: current folder), if any."""
     commit = _git(folder, "rev-parse", "HEAD")
     if commit is None:
         return None

@@ -1,4 +1,4 @@
-"""Names to plugins, with "did you mean"."""
+"""Registries of plugins by name, with suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ U = TypeVar("U")
 
 _SIMILAR = 0.6
 _LONGEST = 100
-"""Letters of a name that somebody may have mistyped; the work grows with their square."""
+"""Longest name, in characters, for which suggestions are computed (quadratic work)."""
 
 
 def closest(name: str, candidates: Iterable[str]) -> str | None:
-    """The candidate that `name` is most probably a slip of, or None if none is near.
+    """Return the candidate nearest to a misspelt `name`, or None if none is near.
 
-    One that differs in case alone comes first; then up to a third of the letters (at least one) may be
-    inserted, dropped, replaced or swapped with their neighbour; then what difflib calls similar.
+    First a candidate that differs only in case; then one within an edit distance (with transpositions) of a
+    third of the letters, at least one; then difflib's closest match.
     """
     pool = sorted({word for word in candidates if 0 < len(word) <= _LONGEST and word != name})
     if len(name) > _LONGEST:
@@ -42,7 +42,7 @@ def _ratio(left: str, right: str) -> float:
 
 
 def _distance(left: str, right: str) -> int:
-    """Edits between two words; a swap of neighbours counts once (optimal string alignment)."""
+    """Optimal string alignment distance of two words: a transposition counts as one edit."""
     before: list[int] = []
     above = list(range(len(right) + 1))
     for i, a in enumerate(left, start=1):
@@ -143,9 +143,9 @@ class PackageRegistry(Registry[T]):
 METHODS: PackageRegistry[Any] = PackageRegistry(
     "method", "stlc.controller.methods", "METHOD", default="guided"
 )
-"""Ways to a policy, `stlc.controller.methods.Method` each: what `--method` and `train: {method: …}` name."""
+"""Methods, `stlc.controller.methods.Method` each, named by `--method` and `train: {method: …}`."""
 
 SEMANTICS: PackageRegistry[Any] = PackageRegistry(
     "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"
 )
-"""Semantics of robustness, `stlc.compile.semantics.protocol.Semantics` each."""
+"""Robustness semantics, `stlc.compile.semantics.protocol.Semantics` each."""

@@ -1,8 +1,8 @@
 """Folder of a run, self-describing: `runs/<spec>/<number>-<words>`.
 
 A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
-to the newest. Whole files are written beside and renamed; rows are appended so that a kill costs at most
-the last one.
+to the newest. Whole files are written atomically; rows are appended so that a kill loses at most the last
+one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _KINDS: Mapping[str, type] = {
     **dict.fromkeys(("seed", "threads"), int),
     "overrides": dict,
 }
-"""What a record must hold under a name, if it holds anything."""
+"""Expected type of each entry of a record, if present."""
 
 _NUMBERED = re.compile(r"(\d{4,})-(.+)")
 
@@ -135,7 +135,7 @@ class RunDir:
 
     @property
     def shown(self) -> str:
-        """The path as it is printed: relative to the current folder where it lies below it."""
+        """The path as printed: relative to the current folder if it lies below it."""
         with suppress(ValueError):
             return self.path.resolve().relative_to(Path.cwd()).as_posix()
         return self.path.as_posix()
@@ -167,7 +167,7 @@ class RunDir:
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
-        """Enter `facts` into `run.json`, which is made if it is not there, and return all of it."""
+        """Update `run.json` (created if missing) with `facts`, and return its whole content."""
         before = self.record() if (self.path / RECORD).exists() else {}
         after = {**before, **facts}
         self.write_json(RECORD, after)
@@ -180,7 +180,7 @@ class RunDir:
         return status
 
     def finish(self, status: Status, result: object = None) -> None:
-        """Close the record: how the run ended, when, and with what result."""
+        """Record the status, the end time and the result of the run."""
         ended = {"status": status, "finished": now()}
         self.update(ended if result is None else {**ended, "result": result})
 
@@ -195,7 +195,7 @@ class RunDir:
     def append_row(self, row: Mapping[str, object], name: str = ROWS) -> None:
         """Append one object to a file of JSON lines, in a single write.
 
-        A last line that a kill has cut short is removed first.
+        An incomplete last line, left by a kill, is removed first.
         """
         data = (dumps(row) + "\n").encode()
         try:
@@ -207,7 +207,7 @@ class RunDir:
             raise MissingError(Diagnostic("R201", f"cannot write `{self.shown}/{name}`: {reason}")) from error
 
     def rows(self, name: str = ROWS) -> list[dict[str, Any]]:
-        """The rows of a file of JSON lines, without a last one that was cut short; [] if there is no file.
+        """The rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
 
         Raises:
             RunError: R101, a whole line is not JSON.
@@ -226,7 +226,7 @@ class RunDir:
         return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
-        """Drop the rows that are not `wanted`, as a resumed run does with those past its checkpoint."""
+        """Keep only the `wanted` rows; a resumed run drops those past its checkpoint."""
         kept = [row for row in self.rows(name) if wanted(row)]
         write_atomic(self.path / name, "".join(dumps(row) + "\n" for row in kept))
 
@@ -238,7 +238,7 @@ def every_run(root: Path = RUNS) -> list[RunDir]:
 
 
 def remove_run(run: RunDir) -> None:
-    """Delete the folder of a run. A link that pointed to it points to the newest run that is left.
+    """Delete the folder of a run. A link to it is redirected to the newest remaining run.
 
     Raises:
         MissingError: R201, it cannot be deleted.
@@ -288,7 +288,7 @@ def _by_name(where: str, root: Path) -> RunDir:
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
-    """The newest run that was trained for a specification file, or for one of its name."""
+    """The newest run trained for a specification file, or for one with the same name."""
     runs = every_run(root)
     trained = [run for run in runs if _spec_path(run) == path.resolve()]
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
@@ -299,7 +299,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
 
 
 def _spec_path(run: RunDir) -> Path | None:
-    """The specification file of a run, as far as its record can be read."""
+    """The specification file of a run; None if its record cannot be read."""
     try:
         return Path(str(run.record().get("spec_path"))).resolve()
     except RunError:
@@ -313,7 +313,7 @@ def _names(run: RunDir) -> tuple[str, str, str, str]:
 
 
 def _folder_of(path: Path) -> Path:
-    """The run that a path lies in: itself, or the nearest folder above it that has a record."""
+    """The run folder of a path: the path itself, or its nearest parent with a record."""
     candidates = (path, *path.parents)
     return next((folder for folder in candidates if (folder / RECORD).is_file()), path)
 
@@ -336,10 +336,10 @@ def _checked(words: str) -> str:
 
 
 def _reserve(home: Path, words: str) -> Path:
-    """Make the folder with the next free number. Of two processes no two get the same one.
+    """Create the folder with the next free number, unique among concurrent processes.
 
-    Folders of one number may have different words, so making the folder cannot be the test. Whoever makes
-    the marker of a number owns it, and looks again whether the number was used before the marker was free.
+    Folders of one number may have different words, so creating the folder does not reserve the number. The
+    process that creates the marker file of a number owns it, and then checks again that the number is unused.
     """
     number = max(_numbers(home), default=0)
     while True:
@@ -370,7 +370,7 @@ def _marker(path: Path) -> Iterator[bool]:
 
 
 def _point(link: Path, target: str) -> None:
-    """Make `link` point to `target`, replacing it in one step. Where links are not allowed there is none."""
+    """Make `link` point to `target`, atomically; without effect where links are not allowed."""
     temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}")
     try:
         temporary.symlink_to(target, target_is_directory=True)

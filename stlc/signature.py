@@ -19,7 +19,7 @@ class Column:
         name: as written in specifications and system files.
         unit: physical unit of the numbers that are stored.
         kind: what the numbers mean; bool is 0/1, enum one of `labels`.
-        role: who moves it; `timer` columns are appended by the compiler.
+        role: of the column; `timer` columns are appended by the compiler.
         low: nominal lower end of its range, in its unit (None: unknown).
         high: nominal upper end.
         labels: (label, value) pairs of an enum.

@@ -1,9 +1,9 @@
-"""The last resort of an interrupted command: it ends in time, whatever it is doing.
+"""Forced exit of an interrupted command that does not unwind in time.
 
-Ctrl-C and SIGTERM raise an exception in the main thread, which unwinds what was begun. That waits while a
-library computes. So a thread is told of the signal too, by the system and not by the interpreter: where the
-command has not ended `PATIENCE` seconds later it ends the process, after it has undone what must not stay
-(`leaving`): programs that were started, temporary files, the status of a run.
+Ctrl-C and SIGTERM raise an exception in the main thread, but only after a running library call returns. So a
+watchdog thread receives the signal too, through a file descriptor. If the command is still running `PATIENCE`
+seconds later it runs the registered clean-up (`leaving`: child processes, temporary files, the status of a
+run) and ends the process.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 PATIENCE = 0.9
-"""Seconds that an interrupted command has to unwind."""
+"""Seconds for an interrupted command to unwind."""
 LAST = 0.3
-"""Seconds that are left then for what must not stay."""
+"""Seconds for the clean-up afterwards."""
 CHILD = "STLC_PATIENCE"
-"""Environment variable by which a command gives those that it starts less patience than it has itself."""
+"""Environment variable that gives child processes a shorter `PATIENCE` than their parent's."""
 
 _undone: dict[int, Callable[[int], object]] = {}
 _armed: list[float] = []
@@ -32,7 +32,7 @@ _numbers = iter(range(1 << 62))
 
 @contextmanager
 def leaving(undo: Callable[[int], object]) -> Iterator[None]:
-    """While the block runs, a forced end calls `undo` with the exit code, in another thread."""
+    """Register `undo` for the block: a forced exit calls it with the exit code, in another thread."""
     key = undoing(undo)
     try:
         yield
@@ -41,14 +41,14 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 
 
 def undoing(undo: Callable[[int], object]) -> int:
-    """Register `undo` for a forced end, as in `leaving`; returns its number."""
+    """Register `undo` for a forced exit, as `leaving` does; return its number."""
     key = next(_numbers)
     _undone[key] = undo
     return key
 
 
 def arm() -> None:
-    """Let this process end in time once it is interrupted; for the main thread of a command."""
+    """Start the watchdog of this process; call it in the main thread of a command."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     try:
@@ -57,22 +57,22 @@ def arm() -> None:
         os.close(read)
         os.close(write)
         return
-    # a process that is forked from this one has its own end; it must not tell of it here
+    # a forked process must not write to the file descriptor of its parent
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
     threading.Thread(target=_wait, args=(read,), name="last resort", daemon=True).start()
     _armed.append(time.perf_counter())
 
 
 def age() -> float:
-    """Seconds since the command began; 0 where stlc is not a process of its own."""
+    """Seconds since the command began; 0 if stlc is used as a library."""
     return time.perf_counter() - _armed[0] if _armed else 0.0
 
 
 def finish(code: int) -> int:
-    """End an interrupted process at once with its code, the buffers written: libraries take long to unload.
+    """End an interrupted process at once, with flushed buffers: libraries take long to unload.
 
-    Gives the code back where nobody has interrupted it: what was asked for is done then, and a signal while
-    libraries are unloaded does not take its exit code away.
+    Returns the code if the process was not interrupted; a signal while libraries are unloaded then does not
+    change the exit code.
     """
     if not _asked and code not in (128 + signal.SIGINT, 128 + signal.SIGTERM):
         with suppress(ValueError):  # not the main thread

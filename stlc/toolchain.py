@@ -1,7 +1,7 @@
-"""The system's C compiler: found, asked for its version, and never waited for without end.
+"""The system's C compiler: search, version, and runs under resource limits.
 
-A compiler that hangs, or takes too much time or memory, is ended with all that it started. One that hangs is
-not asked again: by this process, and for a while not by others of the same user either (`REMEMBERED`).
+A compiler that hangs, or takes too much time or memory, is killed with its child processes. One that hangs is
+not started again by this process, nor for `REMEMBERED` seconds by other processes of the user.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from stlc.cache import Cache
 from stlc.stopping import leaving
 
 IDLE = 10.0
-"""Seconds in which a program that was started must use the processor, or it hangs."""
+"""Seconds without processor use after which a program counts as hung."""
 BUSY = 40.0
-"""Seconds of the processor after which a program is given up; of the clock where that is not known."""
+"""Limit of processor time of a program, seconds; of wall time where that is unknown."""
 MEMORY = 2_000_000_000
-"""Bytes of memory beyond which a program is given up, where that is known."""
+"""Memory limit of a program in bytes, where its use is known."""
 REMEMBERED = 600.0
-"""Seconds for which other processes do not ask a compiler again that hangs."""
+"""Seconds for which other processes do not start a hung compiler again."""
 LONG_REMEMBERED = 86_400.0
-"""Seconds for which other processes do not try again a text that was too much."""
+"""Seconds for which other processes do not compile again a text that exceeded the limits."""
 _GRACE = 0.5
-"""Seconds from being asked to end until being ended."""
+"""Seconds from SIGTERM to SIGKILL."""
 _PROBE = "#include <math.h>\nint works(void) { return 1; }\n"
 
 
 class CompilerError(Exception):
-    """The compiler cannot be used; `why` is said after its name."""
+    """The compiler cannot be used; `why` is printed after its name."""
 
     def __init__(self, why: str) -> None:
         super().__init__(why)
@@ -48,15 +48,15 @@ class CompilerError(Exception):
 
 
 class TooMuchError(CompilerError):
-    """A compiler works, and takes more time or memory for a text than it gets."""
+    """The compiler exceeds the time or memory limit for a text."""
 
 
 class HangsError(Exception):
-    """A program did not end within the limits, and was ended.
+    """A program exceeded its limits and was killed.
 
     Attributes:
-        why: said after its name.
-        worked: it was at work, and took too much time or memory.
+        why: reason, printed after its name.
+        worked: it used the processor, but exceeded the time or memory limit.
     """
 
     def __init__(self, why: str, *, worked: bool = False) -> None:
@@ -84,7 +84,7 @@ def compiled(using: str, arguments: Sequence[str]) -> Done:
     """Run a compiler.
 
     Raises:
-        TooMuchError: it was given up while it worked.
+        TooMuchError: it exceeded the time or memory limit.
         CompilerError: it hangs, did so a short while ago, or cannot be started.
     """
     key = _identity(using)
@@ -117,7 +117,7 @@ def version(using: str) -> str:
 
 
 def _identity(using: str) -> str:
-    """A compiler's name among what is remembered: changes as its file does."""
+    """Key of a compiler among remembered failures; it changes with the compiler's file."""
     try:
         found = Path(using).stat()
         facts = f"{using} {found.st_size} {found.st_mtime_ns} {found.st_ino}"
@@ -127,7 +127,7 @@ def _identity(using: str) -> str:
 
 
 def works(using: str) -> str:
-    """Reason for which a compiler cannot build a library, "" where it can; earlier failures are forgotten."""
+    """Reason for which a compiler cannot build a library, "" if it can; clears remembered failures."""
     forget()
     try:
         version(using)
@@ -172,7 +172,7 @@ def _recorded(kept: Cache, name: str) -> str:
 
 
 def remember(key: str, why: str, *, seconds: float | None = None) -> None:
-    """Keep in mind that something failed, for so long; for `REMEMBERED` seconds where that is not said."""
+    """Remember a failure for `seconds` (default: `REMEMBERED`)."""
     _known[key] = why
     kept = cache.lasting()
     if kept is not None:
@@ -181,14 +181,14 @@ def remember(key: str, why: str, *, seconds: float | None = None) -> None:
 
 
 def remembered() -> list[str]:
-    """Reason for which commands do without the compiler at present."""
+    """Remembered reasons for which commands do not use the compiler."""
     kept = cache.lasting()
     found = [] if kept is None else [_recorded(kept, name) for name in kept.names(_TROUBLE)]
     return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
 
 
 def forget() -> None:
-    """Let everything be tried again."""
+    """Forget all failures."""
     _known.clear()
     _versions.clear()
     kept = cache.lasting()
@@ -206,9 +206,9 @@ def _file(key: str) -> str:
 
 
 def run(command: Sequence[str], *, given: str = "") -> Done:
-    """Run a program in a session of its own, and end it with all that it started if it hangs.
+    """Run a program in its own session; kill it with its child processes if it exceeds the limits.
 
-    Whatever interrupts the wait, no process is left.
+    No process is left when the wait is interrupted.
 
     Args:
         command: the program and its arguments.
@@ -218,7 +218,7 @@ def run(command: Sequence[str], *, given: str = "") -> Done:
         HangsError: it used no processor time for `IDLE` seconds, or more than `BUSY`, or more than `MEMORY`.
         OSError: it cannot be started.
     """
-    # files, not pipes: whoever holds the other end of a pipe could keep us waiting
+    # files, not pipes: a surviving child process could keep a pipe open
     with tempfile.TemporaryFile() as into, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as said:
         into.write(given.encode())
         into.seek(0)
@@ -245,7 +245,7 @@ def run(command: Sequence[str], *, given: str = "") -> Done:
 
 @contextmanager
 def _whole() -> Iterator[None]:
-    """Signals to stop come after what is done here: what is half begun could not be ended."""
+    """Defer stop signals: a half-started process could not be killed."""
     if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
         yield
         return
@@ -265,7 +265,7 @@ def _whole() -> Iterator[None]:
 
 
 def _bound(process: subprocess.Popen[bytes]) -> None:
-    """Let a program and what it starts end by themselves, should nobody be left to end them."""
+    """Limit the processor time of a program and its children, in case this process dies."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         import resource
 
@@ -296,7 +296,7 @@ def _await(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """Resources used by the processes of a session: seconds of the processor, bytes of memory."""
+    """Resources used by the processes of a session: processor seconds, bytes of memory."""
 
     seconds: float
     memory: int
@@ -316,7 +316,7 @@ def _use(session: int) -> _Use | None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ask all processes of a session to end, then end them."""
+    """Terminate, then kill all processes of a session."""
     if os.name != "posix":
         process.kill()
         process.wait()
@@ -333,6 +333,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End all processes of a session at once."""
+    """Kill all processes of a session."""
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)

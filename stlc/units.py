@@ -1,9 +1,8 @@
 """Physical units: dimensions as exponent vectors, scales to SI as exact fractions.
 
-`degC` counts from a zero of its own, 273.15 K. A number in it is a point of that scale; the difference of two
-is in kelvin (`Unit.interval`), and no product has it as a factor.
-Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`. `steps` is no physical unit;
-whoever reads an interval handles it.
+`degC` is an affine unit with its zero at 273.15 K: differences are in kelvin (`Unit.interval`), and it is not
+a factor of products. Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`. `steps`
+is not a physical unit; the reader of an interval handles it.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Unit:
     Attributes:
         dims: exponents of m, kg, s, A and K.
         ratio: how many SI units one of it is, exactly (pi to double precision).
-        text: as written; "" where nothing was written, which is how undeclared units are told from `1`.
+        text: as written; "" for an undeclared unit, in contrast to `1`.
         offset: its zero in SI units, exactly; 0 for all but scales like `degC`.
     """
 
