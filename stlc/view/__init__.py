@@ -1,7 +1,7 @@
 """Pictures of training and deployment: curves, signals, failures, animation, one report.
 
-Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). Nothing here imports them before a picture
-is asked for, so that training and deployment work without; `available` says whether they are there.
+Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). They are imported only when a picture is
+drawn, so that training and deployment work without them; `available` checks for them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def available() -> bool:
 
 
 def require_drawing() -> None:
-    """Raise MissingError R301 where pictures cannot be drawn."""
+    """Raise MissingError (R301) if pictures cannot be drawn."""
     missing = _missing()
     if missing:
         verb = "is" if len(missing) == 1 else "are"

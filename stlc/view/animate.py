@@ -1,4 +1,4 @@
-"""A deployment in motion: drawn by its world, over the places of the specification, else its signals."""
+"""Animation of a deployment: its world's scene, else a map of the specification's regions, else signals."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ STILL = "scene.png"
 UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
 """Trace and scene of the same seed without the guard."""
 PANEL = 5.8
-"""Inches across one drive of a page."""
+"""Width of one run on a page, in inches."""
 
 
 @dataclass(frozen=True, slots=True)
 class Animation:
-    """The files of an animation; no video where there is no ffmpeg."""
+    """The files of an animation; without ffmpeg there is no video."""
 
     gif: Path
     mp4: Path | None
@@ -48,11 +48,10 @@ class Animation:
 def film_of(run: RunDir, *, title: str | None = None) -> Film | None:
     """Film of the run's deployment; None where nothing was recorded.
 
-    Its title names specification, scenario and run where no other is given.
+    The default title names specification, scenario and run.
 
-    A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded or
-    fails to draw, the paths of the trace are shown over the places that its specification names, else its
-    signals.
+    The scene is drawn by its world, loaded from the folder. Without a world, or if it fails, the film shows
+    the paths of the trace over the regions of its specification, else the signals.
     """
     title = _title(run) if title is None else title
     return _scene_film(run, title) or _signal_film(run, title)
@@ -67,7 +66,7 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
     """Animate the deployment of `run` into its folder, with a still beside it.
 
     Args:
-        run: a run that was simulated.
+        run: a simulated run.
         max_frames: of the animation; instants are left out evenly beyond that.
         max_bytes: of the GIF; the picture gets smaller where it would be larger.
 
@@ -90,7 +89,7 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
 
 
 def current(run: RunDir) -> bool:
-    """True if the animation in the folder is that of the newest deployment."""
+    """True if the animation in the folder shows the newest deployment."""
     gif = run.path / f"{film_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
     return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
@@ -101,11 +100,11 @@ class Seen:
     """A recorded scene with its world.
 
     Attributes:
-        scene: snapshots stacked to (frames, …), and `violated` (frames, agents) where that could be judged.
-        world: what draws them.
+        scene: snapshots stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
+        world: draws them.
         dt: seconds between them.
-        judged: what was driven; None where it cannot be judged.
-        events: its violations, those of all requirements.
+        judged: verdict on the agents; None if they cannot be judged.
+        events: violations of all requirements.
     """
 
     scene: Scene
@@ -116,12 +115,12 @@ class Seen:
 
     @property
     def stage(self) -> Stage | None:
-        """The robots in space; None where the world has none."""
+        """The 3D stage of the robots; None if the world has none."""
         return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
 
     @property
     def own_keys(self) -> Mapping[str, str]:
-        """Entries of the legend that the world adds."""
+        """Legend entries of the world."""
         return getattr(self.world, "KEYS", {})
 
     @property
@@ -131,7 +130,7 @@ class Seen:
 
     @property
     def strip(self) -> Strip | None:
-        """Strip charts; None where margins or decisions are not known."""
+        """Strip charts; None if margins or decisions are unknown."""
         decisions = self.scene.get("decision")
         if self.judged is None or decisions is None:
             return None
@@ -139,9 +138,9 @@ class Seen:
 
 
 def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
-    """The scene of the run's deployment; None without one, or where its world cannot be loaded.
+    """The scene of the run's deployment; None without one, or if its world cannot be loaded.
 
-    With `guarded` false that of the same seed without the guard, where it was driven to compare.
+    With `guarded` false: the same seed simulated without the guard, if recorded.
     """
     from stlc.controller.world import world_type
     from stlc.dynamics.declaration.load import load_system_decl
@@ -169,7 +168,7 @@ def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
 
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> Judged | None:
-    """Judged drives of a scene's agents; None for another deployment's trace, or one without a verdict."""
+    """Verdict on a scene's agents; None if the trace is of another deployment or cannot be judged."""
     decisions = scene.get("decision")
     if decisions is None:
         return None
@@ -199,20 +198,20 @@ def _scene_film(run: RunDir, title: str) -> Film | None:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A drive as a page shows it.
+    """One closed-loop run as shown on a page.
 
     Attributes:
-        title: under which guard; nothing where there is only one drive.
-        alt: what is seen, in words.
-        frames: how many instants there are.
+        title: name of the guard; empty for a single run.
+        alt: description in words.
+        frames: number of instants.
         dt: seconds between them.
         t0: of the first one.
-        keys: of the legend.
-        strip: what is shown over time.
+        keys: legend entries.
+        strip: strip charts.
         events: violations.
         names: of the agents.
-        requirements: names of those that were judged.
-        taped: records some frames.
+        requirements: names of the judged ones.
+        taped: records the drawing of given frames.
     """
 
     title: str
@@ -236,10 +235,9 @@ WITHOUT, WITH = "without the guard", "with the guard"
 
 
 def shots_of(run: RunDir) -> list[Shot]:
-    """Drives of the newest deployment for a page: the first seed without and with the guard.
+    """Shots of the newest deployment for a page: the first seed without and with the guard.
 
-    One shot where there is nothing to compare; the signals of a trace where no world draws; none where
-    nothing was recorded.
+    One shot without a comparison; signals of the trace if there is no world; empty without a recording.
     """
     shots = []
     for guarded, title in ((False, WITHOUT), (True, WITH)):
@@ -266,7 +264,7 @@ def _scene_shot(seen: Seen, title: str) -> Shot:
 
         return taped(lambda axes, index: seen.world.draw(axes, seen.scene, index), shown, size)
 
-    record(range(1))  # what a world cannot draw shows here, and not while the page is written
+    record(range(1))  # errors of a world's drawing code are raised here, not while the page is written
     return Shot(
         title=title,
         alt=f"{agents} agents drive {title}".strip(),
@@ -283,7 +281,7 @@ def _scene_shot(seen: Seen, title: str) -> Shot:
 
 
 def _trace_shots(run: RunDir) -> list[Shot]:
-    """The signals of the trace, or its paths over places, as one shot."""
+    """One shot of the trace: its paths over regions, or its signals."""
     film = _signal_film(run, "")
     if film is None:
         return []
@@ -316,7 +314,7 @@ def _trace_shots(run: RunDir) -> list[Shot]:
 
 
 def _decisions_shown(trace: Trace) -> NDArray[np.int64] | None:
-    """Source of the decision at every sample, (samples, traces); None where it was not recorded."""
+    """Source of the decision at every sample, (samples, traces); None if not recorded."""
     decided = decisions_of(trace)
     if decided is None or decided.shape[1] != trace.samples - 1:
         return None
@@ -324,7 +322,7 @@ def _decisions_shown(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def _scenario(run: RunDir) -> str | None:
-    """The scenario of the newest deployment, if there was one."""
+    """The scenario of the newest deployment, if any."""
     try:
         name = run.read_json(RESULT).get("scenario")
     except (StlcError, AttributeError):
@@ -342,7 +340,7 @@ def _signal_film(run: RunDir, title: str) -> Film | None:
 
 
 def _chart(trace: Trace) -> Chart | None:
-    """The map of a trace; None where it carries no specification that names places."""
+    """The map of a trace; None if its specification names no regions."""
     try:
         monitor = monitor_of(trace)
         return chart_of(monitor.spec, monitor.check(trace), trace)

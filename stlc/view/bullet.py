@@ -31,10 +31,10 @@ ADVICE = "pip install 'stlc[panda]'"
 SIZE = 1216
 """Pixels across a picture."""
 PITCH = 1.32
-"""From one base to the next, in reaches."""
+"""Distance between bases, in reaches of the arm."""
 CLEAR = 0.6
-"""How much of a ball is seen where something is behind it."""
-_AWAY, _TILT, _FIELD = 9.0, -16.0, 0.86  # reaches to the camera, its degrees, what it sees above the middle
+"""Opacity of a ball in front of something."""
+_AWAY, _TILT, _FIELD = 9.0, -16.0, 0.86  # camera: distance (reaches), tilt (degrees), half height (reaches)
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 
 
@@ -122,7 +122,7 @@ class Theatre:
                 self.client.disconnect()
 
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
-        """Show frame `index`, robots by who decided, (robots,)."""
+        """Show frame `index`, robots coloured by decision source `who`, (robots,)."""
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
             angles = self.stage.joints[index, robot, :, None].tolist()
@@ -136,7 +136,7 @@ class Theatre:
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
 
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Frame `index` as (height, width, 3); balls are seen through, which the renderer cannot do."""
+        """Frame `index` as (height, width, 3); transparent balls are blended here, as the renderer cannot."""
         self.turn(index, who)
         whole = self._rendered()
         for body in (body for bodies in self.balls for body in bodies):
@@ -173,7 +173,7 @@ class Theatre:
         return int(self.client.createMultiBody(0, -1, shape))
 
     def _colour(self, robot: int, source: int) -> None:
-        """Its disc says who decided; the robot itself changes colour where the policy did not."""
+        """Colour the disc by the source of the decision, and the robot too if the guard intervened."""
         self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
         body = _WHITE if source == 0 else _rgba(DECIDED[source])
         for link in self.links:
@@ -188,7 +188,7 @@ class Theatre:
         return [float(self.places[:, 0].mean()), 0.0, 0.5 * self.stage.reach]
 
     def _look(self) -> None:
-        """The window without its panels, and still while robots come in."""
+        """Hide the window's panels, and suspend rendering while robots are loaded."""
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)
         away = 0.5 * PITCH * self.stage.reach * max(self.count, 2)
@@ -226,7 +226,7 @@ def _rgba(color: str, strength: float = 1.0) -> Rgba:
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """PyBullet talks to the standard output past Python, where results belong."""
+    """Silence PyBullet, whose C code prints to the standard output."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(number) for number in (1, 2)]
@@ -249,7 +249,7 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 
 
 def dressed(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
-    """`urdf` as it is where it has anything to see, else a copy in `folder` that has.
+    """`urdf` itself if it has visual geometry, else a copy in `folder` with added geometry.
 
     Args:
         urdf: of the robot; kinematics are enough.
@@ -288,7 +288,7 @@ def _mesh(name: str | None) -> Path | None:
 
 
 def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, float]]]:
-    """Link -> where its joints are, in metres from its own origin."""
+    """Link -> positions of its joints, in metres from the link's origin."""
     found: dict[str, list[tuple[float, float, float]]] = {}
     for joint in robot.findall("joint"):
         parent, origin = joint.find("parent"), joint.find("origin")
@@ -300,7 +300,7 @@ def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, floa
 
 
 def _weigh(link: ElementTree.Element) -> None:
-    """Without a mass PyBullet complains of every link."""
+    """Give a link a mass; PyBullet warns of links without one."""
     if link.find("inertial") is None:
         inertial = ElementTree.SubElement(link, "inertial")
         ElementTree.SubElement(inertial, "mass", value="1")

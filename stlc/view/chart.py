@@ -1,4 +1,4 @@
-"""The map: places of the specification, paths through them, and who is in which place when."""
+"""The map: regions of the specification, paths through them, and occupancy of each region over time."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ if TYPE_CHECKING:
 
 
 MOST_PATHS = 200
-"""Paths that are drawn; the violating ones come first."""
+"""Maximum number of drawn paths; violating ones come first."""
 CROWDED = 1000
-"""Points of paths from which on they are drawn finer."""
+"""Number of path points above which thinner lines are drawn."""
 TAIL = 2.5
-"""Seconds of path behind a point of the film."""
+"""Length of the trail behind an agent in the film, in seconds."""
 STRONG, FEEBLE = 0.4, 0.1
-"""How much of a place's colour is seen while it matters, and while it does not."""
+"""Opacity of a region while it is active, and while it is not."""
 _TINTS = (GREEN, BLUE, PINK, SKY, ORANGE)
 
 Mask = NDArray[np.bool_]
@@ -62,9 +62,9 @@ class Chart:
     """Data of a map.
 
     Attributes:
-        trace: what was recorded.
-        plane: the two signals and their places.
-        violated: which traces violate a requirement, (traces,).
+        trace: the recording.
+        plane: the two signals and their regions.
+        violated: mask of the traces that violate a requirement, (traces,).
     """
 
     trace: Trace
@@ -78,23 +78,23 @@ class Chart:
         return self.trace.data[across], self.trace.data[up]
 
     def color(self, place: Place) -> str:
-        """Colour of a place: red where it must not be entered, else its own."""
+        """Colour of a region: red if it must be avoided, else its own."""
         if place.role == "avoid":
             return RED
         others = [other for other in self.plane.places if other.role != "avoid"]
         return _TINTS[others.index(place) % len(_TINTS)]
 
     def inside(self, place: Place) -> Mask:
-        """Mask of the traces in a place over time, (traces, samples)."""
+        """Mask of the traces in a region over time, (traces, samples)."""
         return place.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
-        """At most so many traces, those that violate something first."""
+        """Indices of at most `most` traces, violating ones first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
 def chart_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> Chart | None:
-    """The map of a judged trace; None where its specification names no places in a plane."""
+    """The map of a judged trace; None if its specification names no planar regions."""
     plane = plane_of(spec, [judgement.rule for judgement in verdict], trace)
     if plane is None:
         return None
@@ -103,7 +103,7 @@ def chart_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> Chart | None:
 
 
 def draw_chart(chart: Chart) -> Picture:
-    """Map of all paths over the places; beside it, for every place, the share of traces in it over time."""
+    """Draw all paths over the regions; beside them, for each region, the share of traces in it over time."""
     with look():
         figure = new_figure(9, 4.4)
         plot, rows = _layout(figure, chart)
@@ -115,7 +115,7 @@ def draw_chart(chart: Chart) -> Picture:
 
 
 def chart_film(chart: Chart, *, title: str = "") -> Film:
-    """Film of the map: places fill while they matter, paths fade behind the agents."""
+    """Film of the map: active regions are filled, trails fade behind the agents."""
 
     def begin(figure: Figure) -> Callable[[int], None]:
         plot, rows = _layout(figure, chart)
@@ -158,7 +158,7 @@ def _summary(chart: Chart) -> str:
 
 
 def _layout(figure: Figure, chart: Chart) -> tuple[Axes, list[Axes]]:
-    """The map, and a row for each place beside it."""
+    """Axes of the map, and of a row for each region beside it."""
     (left, right), (low, high) = chart.plane.window(chart.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
     grid = figure.add_gridspec(len(chart.plane.places), 2, width_ratios=[1.55 * ratio**0.5, 1])
@@ -176,7 +176,7 @@ def _layout(figure: Figure, chart: Chart) -> tuple[Axes, list[Axes]]:
 
 
 def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
-    """Draw every place; returns the filled area of each, empty where it cannot be seen."""
+    """Draw every region; return the filled patch of each, empty for an invisible one."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -207,7 +207,7 @@ def _tint(color: str, strength: float) -> tuple[float, float, float, float]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Position of a label: deep in its place and, if possible, outside the others; (row, column)."""
+    """Position of a label: deep in its region and, if possible, outside the others; (row, column)."""
     free = np.minimum.reduce([depth, *(-other for other in others)])
     best = int(np.argmax(free if (free >= 0).any() else depth))
     return best // depth.shape[1], best % depth.shape[1]
@@ -219,7 +219,7 @@ def _write(axes: Axes, name: str, at: tuple[float, float]) -> None:
 
 
 def _draw_paths(axes: Axes, chart: Chart) -> None:
-    """Paths that satisfy everything in ink, others in red above them; where they begin and end."""
+    """Draw satisfying paths in ink, violating ones in red above them; mark start and end."""
     across, up = chart.paths
     chosen = chart.first(MOST_PATHS)
     for violated, color, order in ((False, INK, 3), (True, RED, 4)):
@@ -238,12 +238,12 @@ def _draw_paths(axes: Axes, chart: Chart) -> None:
 
 
 def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows one after the other with gaps between: one line, which draws fast."""
+    """Concatenate rows, separated by NaN, into one line, which draws fast."""
     return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
 
 
 def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
-    """The share of traces in a place over time, over the time in which it matters."""
+    """Draw the share of traces in a region over time, with its active time shaded."""
     color, times = chart.color(place), chart.trace.times
     for low, high in place.windows:
         axes.axvspan(chart.trace.t0 + low, chart.trace.t0 + high, color=FAINT, alpha=0.8, lw=0, zorder=0)
@@ -272,12 +272,12 @@ def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
 
 
 def _matters(place: Place, trace: Trace) -> Mask:
-    """Mask of the samples at which a place matters, (samples,)."""
+    """Mask of the samples at which a region is active, (samples,)."""
     return np.array([place.active(float(seconds) - trace.t0) for seconds in trace.times])
 
 
 class _Moving:
-    """The agents of the film: a point each, and a tail of path behind it."""
+    """The agents of the film: a point and a trail each."""
 
     def __init__(self, axes: Axes, chart: Chart) -> None:
         chosen = chart.first(MOST_AGENTS)
@@ -305,22 +305,22 @@ Role = Literal["reach", "avoid", "mixed"]
 Window: TypeAlias = tuple[float, float]
 
 GRID = 240
-"""Points along each axis at which a place is evaluated."""
+"""Grid points along each axis at which a region is evaluated."""
 ROOM = 0.06
-"""Of the plane's size, left free around what there is to see."""
+"""Margin around the visible area, as a share of its size."""
 TITLE = 26
-"""Letters of a place's name in a picture."""
+"""Maximum number of characters of a region's name in a picture."""
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """An occurrence of a place in a requirement.
+    """An occurrence of a region in a requirement.
 
     Attributes:
         requirement: its name.
         negative: under an odd number of negations.
-        visit: being there at some time is enough.
-        window: seconds from the start of the trace in which it matters; None where it always does.
+        visit: under an `eventually`: one visit is enough.
+        window: active time, in seconds from the start of the trace; None if always active.
     """
 
     requirement: str
@@ -335,8 +335,8 @@ class Place:
 
     Attributes:
         name: as declared, or its text.
-        uses: where the specification speaks of it.
-        monitor: judges whether a point is in it.
+        uses: its occurrences in the specification.
+        monitor: evaluates membership of a point.
     """
 
     name: str
@@ -345,28 +345,28 @@ class Place:
 
     @property
     def title(self) -> str:
-        """The name, cut where it is a text that would cover the picture."""
+        """The name, truncated if it is a long expression."""
         return self.name if len(self.name) <= TITLE else self.name[: TITLE - 1] + "…"
 
     @property
     def role(self) -> Role:
-        """Requirement on the place: reach, avoid, or both."""
+        """Role of the region: reach, avoid, or both."""
         kinds = {use.negative for use in self.uses}
         return "mixed" if len(kinds) != 1 else "avoid" if kinds.pop() else "reach"
 
     @property
     def visited(self) -> bool:
-        """True if having been there once is enough."""
+        """True if one visit is enough."""
         return self.role == "reach" and all(use.visit for use in self.uses)
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Times at which it matters; empty for always."""
+        """Times at which it is active; empty for always."""
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
     def active(self, seconds: float) -> bool:
-        """True if it matters at this time."""
+        """True if it is active at this time."""
         return not self.windows or any(low <= seconds <= high for low, high in self.windows)
 
     def depth(self, points: Trace) -> NDArray[np.float64]:
@@ -377,7 +377,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Two signals and the places that are regions of them.
+    """Two signals and the regions of their plane.
 
     Attributes:
         axes: names of the two columns.
@@ -388,7 +388,7 @@ class Plane:
     places: tuple[Place, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
-        """Part of the plane to show: all paths, and places as far as they lie near them."""
+        """Part of the plane to show: all paths, and the regions near them."""
         ends = []
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
@@ -414,7 +414,7 @@ class Plane:
         *,
         count: int = GRID,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """The place's depth over a grid: the coordinates along both axes, and (y, x) values."""
+        """Signed distance of a region over a grid: the coordinates along both axes, and (y, x) values."""
         (left, right), (low, high) = window
         xs, ys = np.linspace(left, right, count), np.linspace(low, high, count)
         across, up = np.meshgrid(xs, ys)
@@ -425,14 +425,14 @@ class Plane:
 
 
 def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
-    """The plane with most places, each region once; None where the requirements name none.
+    """The plane with most regions, each once; None if the requirements name none.
 
     Regions that move with other signals and those of more than two dimensions are left out.
 
     Args:
-        spec: what was written.
+        spec: syntax tree.
         rules: its requirements, compiled for recorded traces.
-        trace: on which they are judged.
+        trace: the trace to judge.
     """
     members = {_key(node.span): node for node in descendants(spec) if isinstance(node, ast.Member)}
     uses: dict[tuple[str, str], list[Use]] = {}
@@ -458,7 +458,7 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
 
 
 def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
-    """A monitor of one membership alone; None where it cannot stand alone (it names a formal, say)."""
+    """A monitor of one membership predicate; None if it does not compile alone (it uses an argument, say)."""
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
     alone = ast.Require(
         name="inside",
@@ -479,7 +479,7 @@ def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
 
 
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Every predicate of a requirement, with its polarity and the time in which it matters."""
+    """Every predicate of a requirement, with its polarity and active time."""
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()
@@ -505,7 +505,7 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """The use as seen by an operand, its time in seconds of the trace; unchanged where it slides."""
+    """The use within a temporal operand, window in seconds of the trace; unchanged if the window slides."""
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)
     if low is None or high is None or (interval.clock == "now" and slides):
@@ -526,7 +526,7 @@ def _key(span: Span) -> tuple[str, int, int]:
 
 
 def _point(node: ast.Member) -> ast.Expr:
-    """The point that is asked about: that of `sweep(p)` is `p`."""
+    """The point of a membership predicate; that of `sweep(p)` is `p`."""
     match node.item:
         case ast.Call(func=ast.Name(name="sweep"), args=(arg,)):
             return arg.value
@@ -535,7 +535,7 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """Key of a place: text of its point and of its region."""
+    """Key of a region: texts of the point and of the region."""
     return _text(_point(node)), _text(node.region)
 
 
@@ -544,7 +544,7 @@ def _text(node: ast.Node) -> str:
 
 
 def uses_text(uses: Sequence[Use]) -> str:
-    """Requirements on a place, in a few words."""
+    """Requirements on a region, in a few words."""
     parts = []
     for use in uses:
         when = "" if use.window is None else f" {use.window[0]:g} to {use.window[1]:g} s"

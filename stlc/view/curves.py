@@ -18,7 +18,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def draw_curves(rows: Rows) -> Picture | None:
-    """The curves of the rows of `train.jsonl`; None where nothing was measured yet."""
+    """Draw the curves of the rows of `train.jsonl`; None before the first measurement."""
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None
@@ -47,7 +47,7 @@ def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Running mean of `values`, over a shorter window at the ends."""
+    """Moving average of `values`, with a shorter window at the ends."""
     reach, count = len(values) // 60, len(values)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(count) - reach, 0)
@@ -56,7 +56,7 @@ def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
-    """Set limits from the bulk of the lowest curve to the highest; first measurements may be cut off."""
+    """Set limits that show most of the lowest and all of the highest curve; first points may be cut off."""
     low = min((float(np.quantile(curve, 0.08)) for curve in values if len(curve)), default=0.0)
     high = max((float(curve.max()) for curve in values if len(curve)), default=1.0)
     low = max(0.0, np.floor(20 * (low - 0.02)) / 20)
@@ -65,13 +65,13 @@ def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
-    """Draw measurements faintly, and their running mean above them."""
+    """Draw measurements faintly, and their moving average above them."""
     axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
     axes.plot(seconds, _even(shares), **style)
 
 
 def _legend(axes: Axes, rows: int) -> None:
-    """The names of the curves beneath them, where no curve can be."""
+    """Draw the legend below the axes."""
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(-0.02, -0.17),

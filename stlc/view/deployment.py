@@ -1,4 +1,4 @@
-"""The report's sections on a deployment: drives, metrics and decisions with and without a guard."""
+"""Report sections on a deployment: runs, metrics and decisions with and without a guard."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from stlc.view.words import cause_words, count, drives_of, guard_words, seconds,
 Record = Mapping[str, Any]
 
 MOST_BROKEN = 12
-"""Drives that broke rules and are listed."""
+"""Maximum number of listed runs that violated rules."""
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
 def deployment_tiles(material: Material) -> list[tuple[str, str]]:
-    """The numbers of the deployment for the first screen."""
+    """Key figures of the deployment for the first screen."""
     guards = _guards(material)
     if not guards:
         return []
@@ -37,7 +37,7 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
 
 
 def deployment_section(material: Material) -> Section | None:
-    """The table of metrics, one column per guard; who decided; how fast."""
+    """Tables of metrics (a column per guard), sources of decisions, and decision times."""
     guards = _guards(material)
     if not guards:
         return None
@@ -55,7 +55,7 @@ def deployment_section(material: Material) -> Section | None:
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
-    """A table with a column per guard; nothing where there are no rows."""
+    """A table with a column per guard; None without rows."""
     if not rows:
         return None
     header = ["", *(guard_words(name).title for name in guards)]
@@ -76,7 +76,7 @@ def _setting(simulation: Record) -> str:
 
 
 def _unforeseen(guards: Mapping[str, Record]) -> Html | None:
-    """Explanation of a gap between plans and drives."""
+    """Explanation of a gap between the satisfaction of plans and of closed-loop runs."""
     foreseen = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if foreseen is None or foreseen >= 1.0:
         return None
@@ -94,7 +94,7 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Drives that obeyed every rule, those of them that could, and rule by rule."""
+    """Rows: runs that satisfy all rules, the share among viable ones, and each rule."""
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
     if not known:
@@ -120,7 +120,7 @@ def _of(some: int, all_: int) -> str:
 
 
 def _broken(simulation: Record | None) -> Html | None:
-    """Table of the drives that broke a rule with the guard."""
+    """Table of the guarded runs that violated a rule."""
     each = list(drives_of(simulation).values())
     broken = each[-1]["broken"] if each else []
     if not broken:
@@ -155,7 +155,7 @@ def _ever(guards: Mapping[str, Record], name: str) -> bool:
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Share of the starts from which what was driven satisfies one requirement."""
+    """Share of the starts from which the executed trajectory satisfies each requirement."""
     names = [name for name in _names(guards) if name.startswith(HOLDS)]
     return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
 
@@ -202,7 +202,7 @@ def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     for name in names:
         shares = [(guard.get("decisions") or {}).get(name) for guard in guards.values()]
         if not any(shares):
-            continue  # a rule that never decided
+            continue  # a rule that was inconclusive in all runs
         rows.append((_decided(name), *(share(value, 2) for value in shares)))
     latencies = [guard.get("latency") or {} for guard in guards.values()]
     for key, label in (("median", "time for one decision, median"), ("p99", "99th percentile")):

@@ -1,4 +1,4 @@
-"""The report's sections on the recorded trace: verdicts, signals with robustness, causes, map."""
+"""Report sections on the recorded trace: verdicts, signals with robustness, causes, map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MAP_CAPTION = (
 
 
 def driven_section(material: Material) -> Section | None:
-    """The recorded traces under the monitor; None where there is no trace that can be judged."""
+    """Verdicts on the recorded traces; None without a trace that can be judged."""
     trace = material.trace
     if trace is None:
         return None
@@ -58,7 +58,7 @@ def driven_section(material: Material) -> Section | None:
 
 
 def _rules_part(material: Material, trace: Trace, names: list[str]) -> Html | None:
-    """The drives judged by the rules that the trace carries; None where it carries none."""
+    """Verdicts by the rules for runs stored in the trace; None if there are none."""
     if not trace.meta.judge_text:
         return None
     try:
@@ -83,7 +83,7 @@ def _monitor(material: Material, trace: Trace) -> Monitor:
 
 
 def map_section(material: Material) -> Section | None:
-    """The paths over the places of the specification; None where it names none in a plane."""
+    """The map of paths over regions; None if the specification names no planar region."""
     trace = material.trace
     if trace is None:
         return None
@@ -135,7 +135,7 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
 
 
 def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
-    """The instant of the worst violation; without one the start of the window with least to spare."""
+    """The instant of the worst violation; without one, the start of the window with the least robustness."""
     moment, cause = verdict.subject.moment, causes.get(judgement.name)
     if cause is None:
         return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
@@ -209,7 +209,7 @@ def _code(text: str) -> Html:
 
 
 def _marked(text: str, marks: list[tuple[int, int]]) -> Html:
-    """`text` with the stretches `marks` (start, end) set apart; overlapping ones are joined."""
+    """`text` with the ranges `marks` (start, end) highlighted; overlapping ones are merged."""
     parts: list[Html | str] = []
     last = 0
     for start, end in marks:

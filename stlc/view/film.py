@@ -1,4 +1,4 @@
-"""Films: something drawn frame by frame, and how it becomes a GIF, a video or a still."""
+"""Films: frame-by-frame drawings and their encoding as GIF, video or still."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 240
 MAX_BYTES = 4_000_000
 LONGEST = 16.0
-"""Seconds that a film lasts; what took longer is shown faster."""
+"""Maximum duration of a film in seconds; longer recordings are sped up."""
 DPI, FINE = 100, 2
 """Dots per inch of a GIF, and how many times as many a video and a still have."""
 QUALITY = 86
@@ -42,13 +42,13 @@ class Film:
     """A drawing for each of a number of instants.
 
     Attributes:
-        frames: how many instants there are.
+        frames: number of instants.
         dt: seconds between them.
         size: of the picture in inches.
-        begin: prepares an empty figure and returns what draws an instant on its canvas.
-        alt: what is seen, in words.
-        moment: the instant that tells most, for a still.
-        draws: whether what `begin` returns draws by itself; otherwise it only changes what is to be drawn.
+        begin: sets up an empty figure; returns the function that draws an instant on its canvas.
+        alt: description in words.
+        moment: index of the most informative instant, for a still.
+        draws: whether that function renders the canvas itself; otherwise it only updates artists.
     """
 
     frames: int
@@ -70,12 +70,12 @@ Command: TypeAlias = tuple[Any, ...]
 
 @dataclass(frozen=True, slots=True)
 class Taped:
-    """A film as commands.
+    """A film as drawing commands.
 
     Attributes:
         width, height: of the picture, in dots.
-        commands: what is drawn, each once: `["p", path, fill, stroke, width, dash, clip]`,
-            `["t", x, y, text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
+        commands: the distinct drawing commands: `["p", path, fill, stroke, width, dash, clip]`, `["t", x, y,
+            text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
         frames: numbers of the commands of every frame, in the order of drawing.
     """
 
@@ -106,13 +106,13 @@ class Taped:
 
 
 def in_the_dark(tapes: Sequence[Taped], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """The colours on dark paper; none where a tape has pictures, or colours that nobody has chosen."""
+    """Colour -> colour in the dark scheme; empty if a tape has images, or colours outside the palette."""
     known = all(tape.colors <= dark.keys() and not tape.pictured for tape in tapes)
     return dark if known else {}
 
 
 def wipe(axes: Axes) -> None:
-    """Take everything away that was drawn; far quicker than to begin axes anew."""
+    """Remove all artists; much faster than clearing the axes."""
     for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.images):
         artist.remove()
     axes.dataLim.set_points(np.array([[np.inf, np.inf], [-np.inf, -np.inf]]))
@@ -120,7 +120,7 @@ def wipe(axes: Axes) -> None:
 
 
 def speed_of(frames: int, dt: float) -> int:
-    """The whole number of times as fast at which so many frames take `LONGEST` at most."""
+    """Smallest integer speed-up at which the film lasts at most `LONGEST`."""
     return max(1, int(np.ceil(frames * dt / LONGEST)))
 
 
@@ -132,13 +132,13 @@ def save_film(
     max_frames: int = MAX_FRAMES,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write `film` as a GIF, and as a video, too, drawing every instant once.
+    """Write `film` as a GIF and as a video; every instant is drawn once.
 
     Args:
-        film: what is shown.
+        film: to write.
         gif: path of the GIF, smaller in width where it would exceed `max_bytes`.
         mp4: path of the video.
-        max_frames: instants are left out evenly beyond that.
+        max_frames: more instants are subsampled evenly.
         max_bytes: of the GIF.
 
     Raises:
@@ -159,7 +159,7 @@ def save_film(
 
 
 def save_still(film: Film, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
-    """Write the instant number `at` of `film`, by default the one that tells most, as PNG or WebP."""
+    """Write instant `at` of `film` (default: its `moment`) as PNG or WebP."""
     write_atomic(path, still_bytes(film, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
     return path
 
@@ -167,7 +167,7 @@ def save_still(film: Film, path: Path, *, at: int | None = None, dpi: int = FINE
 def still_bytes(
     film: Film, kind: Literal["png", "webp"] = "webp", *, at: int | None = None, dpi: int = DPI
 ) -> bytes:
-    """File content of one instant of `film`, by default of its most telling one."""
+    """File content of one instant of `film` (default: its `moment`)."""
     index = min(film.frames - 1, film.moment if at is None else at)
     (picture,) = frames_in(film, range(index, index + 1), dpi)
     buffer = io.BytesIO()
@@ -200,7 +200,7 @@ def frames_in(film: Film, indices: range, dpi: int) -> Iterator[Image]:
 
 COLOURS = 96
 SAMPLED = 8
-"""Pictures that the palette is taken from, the first and the last among them."""
+"""Number of frames from which the palette is computed, the first and last included."""
 NARROWEST = 160  # pixels
 
 
@@ -240,10 +240,10 @@ def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
 
 
 def _palette(sheet: Image) -> Image:
-    """The colours that cover most, exactly (white paper stays white), then those that lack most.
+    """Palette: the most frequent colours, exactly (white stays white), then the least represented ones.
 
-    A colour lacks the more, the farther it is from those that are there and the more often it occurs: a dot
-    of a legend, or a line that was violated, keeps its own however small it is.
+    A colour is added by its distance to the palette times its frequency, so that small details such as a
+    legend's dot or a violating line keep their colour.
     """
     from PIL import Image
 
@@ -281,18 +281,18 @@ def encoder() -> str | None:
 
     try:
         return str(get_ffmpeg_exe())
-    except RuntimeError:  # a platform for which the package brings none
+    except RuntimeError:  # a platform without a bundled program
         return None
 
 
 @contextmanager
 def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Callable[[Image], None]]:
-    """Write H.264 for every browser and player: what is yielded takes the next RGB picture.
+    """Write an H.264 video that every browser plays; yields the function that appends an RGB picture.
 
     Args:
         path: of the file, replaced when the block ends well.
         size: width and height of all pictures; an odd last row or column is cut off.
-        milliseconds: that each is seen.
+        milliseconds: duration of each picture.
 
     Raises:
         MissingError: R301, there is no ffmpeg, or it fails; R201, the file cannot be written.
@@ -310,7 +310,7 @@ def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Call
 
         def write(picture: Image) -> None:
             assert running.stdin is not None
-            with suppress(BrokenPipeError):  # why it went away is told below
+            with suppress(BrokenPipeError):  # the reason is reported below
                 running.stdin.write(picture.crop((0, 0, width, height)).tobytes())
 
         try:

@@ -1,7 +1,7 @@
 """Failures on held-out starts: the region of the initial set that has most of them, in words and drawn.
 
-The sentence is a conjunction of simple conditions that covers many failing starts and few others: subgroup
-discovery by beam search, with the F-score as its measure.
+The region is a conjunction of simple conditions that covers many failing starts and few others, found by
+subgroup discovery: a beam search that maximises the F-score.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 MAX_CONDITIONS = 4
 BEAM = 12
-ENOUGH = 10  # failing starts; fewer do not make a region
-LEAST_GAIN = 1.04  # an added condition has to better the F-score by this factor
-FEW_VALUES = 8  # columns with at most so many distinct values are compared by `=` alone
-COMMON = 0.05  # a single value of a continuous column counts from this share of the starts on
+ENOUGH = 10  # minimum number of failing starts for a region
+LEAST_GAIN = 1.04  # factor by which an added condition must improve the F-score
+FEW_VALUES = 8  # columns with at most so many distinct values are compared by `=` only
+COMMON = 0.05  # minimum share of the starts for a single value of a continuous column
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,7 +39,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """The held-out starts of a run and how the policy's plans fared.
+    """The held-out starts of a run and the robustness of the policy's plans.
 
     Attributes:
         names: of the columns of `x0`.
@@ -47,8 +47,8 @@ class HeldOut:
         x0: (starts, columns).
         rho: (starts,) over all requirements.
         each: (starts, requirements).
-        known: starts that some satisfying plan is known for, (starts,); None in runs that did not keep it.
-        searched: starts that the policy solves or that were searched for any plan, (starts,); None: all.
+        known: starts with a known satisfying plan, (starts,); None in runs that did not record it.
+        searched: starts that the policy solves or for which a plan was searched, (starts,); None: all.
     """
 
     names: tuple[str, ...]
@@ -61,24 +61,24 @@ class HeldOut:
 
     @property
     def unsearched(self) -> int:
-        """Starts whose plan fails and that were not searched."""
+        """Number of failing starts for which no plan was searched."""
         return 0 if self.searched is None else int((~self.searched).sum())
 
     @property
     def worst(self) -> int:
-        """Index of the requirement that fails most often."""
+        """Index of the most violated requirement."""
         return int(np.argmax((self.each < -TOLERANCE).mean(axis=0)))
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Starts whose plan fails, and how many of these a satisfying plan is known for."""
+        """Number of failing starts, and of those among them with a known satisfying plan."""
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """`column op value` on a start."""
+    """The condition `column op value` on a start."""
 
     column: int
     op: Literal["<=", ">=", "="]
@@ -98,10 +98,10 @@ class Weakness:
     Attributes:
         requirement: index of the requirement.
         failing: share of all starts that fail it.
-        conditions: whose conjunction is the region.
+        conditions: their conjunction is the region.
         inside: share of the region's starts that fail.
         covered: share of the failing starts that lie in the region.
-        axes: the two columns that tell most about failing.
+        axes: the two columns that separate failures best.
     """
 
     requirement: int
@@ -132,7 +132,7 @@ def load_held_out(path: Path) -> HeldOut | None:
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """Region in which `requirement` (by default the worst) fails; None if it never fails."""
+    """Region in which `requirement` (default: the worst) fails; None if it never fails."""
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
@@ -150,7 +150,7 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
-    """The best conjunction that a beam search finds; a condition more has to be worth its reading."""
+    """Best conjunction of a beam search; each added condition must improve the score enough."""
     best: tuple[Condition, ...] = ()
     best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
     values = [_Values.of(column) for column in x0.T]
@@ -183,7 +183,7 @@ def _f_score(region: Mask, failing: Mask) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """Values of a column: single values that many starts share, and whether there are others.
+    """Frequent single values of a column, and whether there are others.
 
     A continuous column may have such values too: a timer that starts at 0, a sentinel for "nothing there".
     """
@@ -201,7 +201,7 @@ class _Values:
 
 
 def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
-    """Conditions that may narrow the region."""
+    """Candidate conditions that narrow the region."""
     found: list[Condition] = []
     bad = x0[region & failing]
     for column, kinds in enumerate(values):
@@ -214,13 +214,13 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
 
 
 def _rounded(cuts: Array, span: float) -> list[float]:
-    """Cuts to about a hundredth of the column's span."""
+    """Cuts rounded to about a hundredth of the column's span."""
     digits = 2 - int(np.floor(np.log10(span)))
     return [round(float(cut), max(digits, 0)) for cut in cuts]
 
 
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """The two columns for a picture: those of the region's inequalities first, then by separation."""
+    """The two columns for a picture: those in the region's inequalities first, then by separation."""
     used = [condition.column for condition in conditions if condition.op != "="]
     focus = _region(x0, tuple(condition for condition in conditions if condition.op == "="))
     many = [c for c in range(x0.shape[1]) if len(np.unique(x0[focus, c])) > FEW_VALUES] or list(
@@ -232,7 +232,7 @@ def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tup
 
 
 def _separation(values: Array, failing: Mask) -> float:
-    """The Kolmogorov-Smirnov distance between the failing and the satisfied starts along one column."""
+    """Kolmogorov-Smirnov distance between failing and satisfied starts along one column."""
     if failing.all() or not failing.any():
         return 0.0
     order = np.sort(values)
@@ -304,10 +304,10 @@ def unsolved_text(held: HeldOut) -> str:
 def draw_failures(
     held: HeldOut, signature: Signature | None = None, units: Mapping[str, str] | None = None
 ) -> Picture | None:
-    """The worst requirement over the two columns that tell most; None if nothing fails.
+    """Draw the worst requirement over the two most separating columns; None if nothing fails.
 
     Args:
-        held: starts and how their plans fared.
+        held: starts and robustness of their plans.
         signature: of the system, for units and labels of states.
         units: requirement -> that of its robustness, where it has one.
     """

@@ -1,4 +1,4 @@
-"""HTML that cannot be broken from outside: whatever is not `Html` is text and gets escaped."""
+"""Injection-safe HTML: everything that is not `Html` is text and gets escaped."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _VOID = frozenset({"br", "hr", "img", "input", "meta"})
 
 
 class Html(str):
-    """Markup that is safe to stand in a page. Plain `str` is text and gets escaped."""
+    """Trusted markup. Plain `str` is text and gets escaped."""
 
     __slots__ = ()
 
@@ -61,7 +61,7 @@ def table(
     numeric: Sequence[int] = (),
     kind: str = "plain",
 ) -> Html:
-    """A table of class `kind`; the columns `numeric` stand right."""
+    """A table of class `kind`; the columns `numeric` are right-aligned."""
 
     def row(cell: str, cells: Sequence[Child]) -> Html:
         return el("tr", [_cell(cell, value, i in numeric) for i, value in enumerate(cells)])
@@ -76,7 +76,7 @@ def _cell(name: str, value: Child, numeric: bool) -> Html:
 
 
 def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
-    """A picture with its words."""
+    """A picture with its caption."""
     image = classed("div", "scroll", el("img", attrs={"src": uri, "alt": alt}))
     return classed("figure", kind, image, el("figcaption", caption) if caption else None)
 
@@ -102,7 +102,7 @@ class Section:
 
     Attributes:
         anchor: its name in links; also the file name of its picture.
-        title: its heading; nothing for one that stands at the head of the page.
+        title: its heading; empty for the section at the head of the page.
         body: its content.
         picture: the one drawn figure in it, if any.
     """
@@ -126,10 +126,10 @@ def page(
 
     Args:
         title: of the browser's tab.
-        head: what stands above the links.
+        head: content above the links.
         sections: in order.
         foot: the last line.
-        script: what runs in the page; nothing else may.
+        script: the only script that the page's security policy allows.
     """
     links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -168,12 +168,12 @@ _YAML = re.compile(r"(?P<cm>(?:^|(?<=\s))#[^\n]*)|(?P<kw>^[ ]*(?:- )?[\w.-]+(?=:
 
 
 def spec_html(text: str) -> Html:
-    """A specification's text."""
+    """A specification's text, highlighted."""
     return _marked(text, _SPEC)
 
 
 def yaml_html(text: str) -> Html:
-    """A system file's text."""
+    """A system file's text, highlighted."""
     return _marked(text, _YAML)
 
 

@@ -1,4 +1,4 @@
-"""Recorded drives under the specification that they carry: monitor, margins, violations as events."""
+"""Verdicts on recorded runs by their own specification: monitor, margins, violation events."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ENOUGH = 0.4
-"""Least share of model-consistent instants for which margins of these alone are shown."""
+"""Minimum share of model-consistent instants for which only their margins are shown."""
 AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
 MOST = 240
-"""Events of one requirement that are looked for."""
+"""Maximum number of events per requirement."""
 FLASH = (True, True, True, False)
-"""Frames in which a mark is shown, repeated."""
+"""Blink pattern of a mark, in frames."""
 FLASHES = 4
 
 
 def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
-    """The monitor of the specification that a trace carries, or else of `text`.
+    """The monitor of the specification stored in a trace, or else of `text`.
 
     Args:
         trace: the recording.
-        text: specification for a trace that carries none.
+        text: specification for a trace without one.
         system: the system file, which provides external functions.
-        drives: judge by the rules of drives where the trace carries them, not by the specification of plans.
+        drives: use the stored rules for closed-loop runs, if any, instead of the specification of plans.
 
     Raises:
         SpecError: the specification is invalid.
@@ -54,7 +54,7 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, driv
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
     """Robustness of each judged requirement from each sample on, (traces, samples); NaN where undefined.
 
-    A requirement that is judged once has that value at every sample.
+    A requirement judged once has that value at every sample.
     """
     found = monitor.requirement_robustness(trace)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
@@ -69,13 +69,13 @@ def units_of(verdict: Verdict) -> dict[str, str]:
 
 
 def judged_once(verdict: Verdict) -> list[str]:
-    """Names of the requirements that are judged at the start of a trace alone."""
+    """Names of the requirements judged only at the start of a trace."""
     planned = verdict.subject.horizon is not None
     return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
 
 
 def trace_names(trace: Trace) -> list[str]:
-    """Names of traces: their numbers, with seed and agent where these were recorded."""
+    """Names of traces: their numbers, with seed and agent if recorded."""
     seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
     if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
         return [f"trace {index}" for index in range(trace.traces)]
@@ -90,15 +90,15 @@ def trace_names(trace: Trace) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """The drives of a scene's agents, those of the first seed, and the verdict on them.
+    """The runs of a scene's agents (those of the first seed) and the verdict on them.
 
     Attributes:
         trace: of these agents.
         monitor: of the specification of plans.
-        verdict: by it.
-        drove: verdict by the rules of drives, where the trace carries them; else the same.
-        foreseen: samples from which the world followed the model for the length of a plan,
-            (agents, samples); None: not recorded.
+        verdict: of that monitor.
+        drove: verdict by the rules for closed-loop runs, if stored; else the same.
+        foreseen: model-consistent samples: the world followed the model for the length of a plan, (agents,
+            samples); None: not recorded.
     """
 
     trace: Trace
@@ -109,14 +109,14 @@ class Judged:
 
     @property
     def marked(self) -> set[str]:
-        """Requirements whose violations are marked: all rules of drives, else what is tagged `@safety`."""
+        """Requirements whose violations are marked: all rules for runs, else those tagged `@safety`."""
         names = {judgement.name for judgement in self.drove if "safety" in judgement.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
         return names if names and not ruled else {judgement.name for judgement in self.drove}
 
 
 def judged_in(trace: Trace, agents: int, *, system: Path) -> Judged:
-    """The first `agents` of a trace, judged by the specification that it carries.
+    """Judge the first `agents` of a trace by its own specification.
 
     Raises:
         StlcError: the trace cannot be judged.
@@ -141,10 +141,10 @@ def strip_of(judged: Judged, decisions: NDArray[np.int64] | None) -> Strip:
 
 
 def as_foreseen(trace: Trace, agents: int) -> Mask | None:
-    """Model-consistent samples: the world follows the model from there for the length of a plan.
+    """Mask of model-consistent samples: the world follows the model for the length of a plan.
 
     Returns:
-        (agents, samples), or None where that was not recorded.
+        (agents, samples), or None if not recorded.
     """
     steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
     if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
@@ -154,7 +154,7 @@ def as_foreseen(trace: Trace, agents: int) -> Mask | None:
 
 
 def least(rho: Floats, counts: Mask | bool = True) -> Floats:
-    """Least robustness of the agents that count, (agents, samples) -> (samples,); NaN where none is known."""
+    """Least robustness over the masked agents, (agents, samples) -> (samples,); NaN if unknown for all."""
     known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
     return np.where(np.isfinite(known), known, np.nan)
 
@@ -174,8 +174,8 @@ class Event:
         requirement: its name.
         agent: number of the trace.
         sample: of the violation.
-        until: last sample of violations that follow one another without a gap.
-        start: first sample of the window in which it was judged.
+        until: last sample of consecutive violations.
+        start: first sample of the violated window.
         because: cause in one line.
     """
 
@@ -188,10 +188,10 @@ class Event:
 
 
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
-    """Violations by the first `agents` traces, in the order of time.
+    """Violations by the first `agents` traces, in order of time.
 
-    A violation is placed at the instant that explains it. The search goes on with windows that begin after
-    that instant, so that each instant is found once; it ends after `most` of a requirement.
+    A violation is placed at its cause. The search continues with windows that begin after that instant, so
+    that each cause is found once; it ends after `most` events of a requirement.
     """
     found: list[Event] = []
     for judgement in verdict:
@@ -219,7 +219,7 @@ def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> li
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:
-    """Marks of a film, (frames, agents): during a violation, and flashing for a moment after it.
+    """Mask of marked agents in a film, (frames, agents): during a violation, and blinking after it.
 
     Args:
         events: violations.

@@ -1,7 +1,7 @@
-"""The verdict on a training: how much of what is known to be feasible a policy reaches, and what would help.
+"""The verdict on a training: the share of the known feasible starts that a policy solves, and advice.
 
-Numbers and sentences only; nothing is drawn here. The terminal, the JSON document, the report and
-`stlc report` say the same.
+Numbers and sentences only, no drawing. The terminal, the JSON document, the report and `stlc report` share
+this verdict.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from stlc.view.words import seconds as duration
 Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
 
 UNDERTRAINED, TRAINED = 0.5, 0.95
-"""Shares of what is known to be feasible: below is undertrained; from there on is trained."""
+"""Shares of the known feasible starts: below the first undertrained, from the second on trained."""
 MUCH_INFEASIBLE = 0.5
-"""Share of the starts without a known plan from which on that is said first."""
+"""Share of starts without a known plan from which on infeasibility is reported first."""
 LEAST_ROUNDS = 5
-"""Search rounds that a learning curve must have before anything is foretold from it."""
+"""Minimum number of search rounds for an extrapolation of a learning curve."""
 FLAT = 0.1
-"""Growth of the odds (their logarithm, for twice the steps) below which a learning curve is flat."""
+"""Growth of the log-odds per doubling of the steps below which a learning curve is flat."""
 MOST_TIMES = 32.0
-"""Multiples of the steps beyond which nothing is foretold."""
+"""Multiple of the steps up to which the curve is extrapolated."""
 ROUND_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 900.0, 1200.0, 1800.0, 3600.0)
-"""Budgets, seconds, that are proposed; multiples of an hour beyond."""
+"""Budgets to propose, in seconds; multiples of an hour beyond."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +43,10 @@ class Curve:
     """Extrapolation of a learning curve.
 
     Attributes:
-        state: `short`: too few rounds to say; `flat`: twice the steps would change little; `rising`.
-        times: how many times the steps would lead to the share `TRAINED` if the curve went on as steeply as
-            it was; curves flatten, so that its square is the other end of what is foretold. None beyond
-            `MOST_TIMES`, and where the curve is not rising.
+        state: `short`: too few rounds; `flat`: twice the steps would change little; `rising`.
+        times: multiple of the steps that reaches the share `TRAINED` at the present slope; curves flatten, so
+            its square is the upper end of the forecast. None beyond `MOST_TIMES`, or if the curve is not
+            rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -58,12 +58,12 @@ class Learning:
     """Verdict on a training.
 
     Attributes:
-        level: in a word.
-        share: accuracy over what is known to be feasible; None where nothing is.
-        sentence: the same as a sentence.
-        worst: the worst requirement and where it fails, as a sentence; "" where none fails.
-        advice: what would help, a sentence each.
-        command: what to do next.
+        level: in one word.
+        share: accuracy over the known feasible starts; None without any.
+        sentence: level and share as a sentence.
+        worst: the worst requirement and its failure region, as a sentence; "" if none fails.
+        advice: one sentence each.
+        command: the next command.
     """
 
     level: Level
@@ -87,12 +87,12 @@ class Learning:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """The commands that a verdict may name, of one run.
+    """Commands of one run that a verdict may recommend.
 
     Attributes:
-        train_on: that goes on with the training, without a budget.
-        simulate: that drives the policy under the guard that is recommended.
-        report: that writes the report.
+        train_on: resumes the training, without a budget.
+        simulate: simulates the policy under the recommended guard.
+        report: writes the report.
     """
 
     train_on: str
@@ -101,9 +101,9 @@ class Commands:
 
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
-        """Commands of the run with the name `run`; `newest` need not be named to be driven.
+        """Commands of the run with the name `run`; the `newest` run is simulated without its name.
 
-        `guard` is the one that is recommended: `none`, `paper` or `full`.
+        `guard` is the recommended one: `none`, `paper` or `full`.
         """
         run = shell((operand(run),))
         simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))
@@ -111,7 +111,7 @@ class Commands:
 
 
 def recommended(record: Mapping[str, Any]) -> str:
-    """The guard that a run's record recommends, `paper` where none was driven."""
+    """The guard that a run's record recommends; `paper` without closed-loop results."""
     result = record.get("result")
     driven = result.get("closed_loop") if isinstance(result, Mapping) else None
     guard = driven.get("recommended") if isinstance(driven, Mapping) else None
@@ -119,9 +119,9 @@ def recommended(record: Mapping[str, Any]) -> str:
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
-    """Closed-loop results of a run, best first: a line for each guard, and the recommendation.
+    """Closed-loop results of a run: a line for each guard, best first, and the recommendation.
 
-    Empty where nothing is on record; a reason where nothing could be driven.
+    Empty without a record; the reason if no simulation was possible.
     """
     found = result.get("closed_loop")
     if not isinstance(found, Mapping):
@@ -141,7 +141,7 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
                 f"recommended: {words.noun} (`{words.option or 'stlc simulate'}`), by what was driven"
             )
         return lines
-    except (KeyError, TypeError, ValueError):  # what somebody else has written
+    except (KeyError, TypeError, ValueError):  # a damaged or foreign record
         return []
 
 
@@ -155,7 +155,7 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """Drives that a guard gains and loses on the starts that were also driven without it."""
+    """Runs that a guard gains and loses, compared on the same starts with no guard."""
     if not each.get("compared"):
         return ""
     return (
@@ -166,7 +166,7 @@ def _changed_line(each: Mapping[str, Any]) -> str:
 
 
 def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
-    """The verdict on the training of a run; None where that is not finished.
+    """The verdict on the training of a run; None if it is not finished.
 
     Raises:
         RunError: R101, its record is damaged.
@@ -182,7 +182,7 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
 def learning_on_record(
     record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
 ) -> Learning | None:
-    """The verdict on the training that `run.json` and `train.jsonl` tell of; None where none is finished."""
+    """The verdict on the training in `run.json` and `train.jsonl`; None if it is not finished."""
     result = record.get("result")
     if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
         return None
@@ -203,8 +203,8 @@ def learning_of(
     Args:
         result: that of `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
         rows: of `train.jsonl`.
-        commands: that may be named.
-        where: where in the initial set the worst requirement fails, as a clause ("fails in …"), or "".
+        commands: that may be recommended.
+        where: failure region of the worst requirement as a clause ("fails in …"), or "".
     """
     accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
     if feasible <= 0.0:
@@ -246,9 +246,9 @@ def learning_of(
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
     """Extrapolation of plan accuracy towards `feasible`, from rows and the final `accuracy`.
 
-    The logarithm of the odds of success is fitted by a line over the logarithm of the step, from a quarter
-    of the steps on, and goes on from where the policy is. The learning rate falls at the end of every
-    training, which helps, and will do so again: a rough figure.
+    The log-odds of success are fitted by a line over the logarithm of the step, from a quarter of the steps
+    on; its slope is continued from the final accuracy. A rough figure, as the learning rate decays at the end
+    of every training.
     """
     pairs = [
         (float(row["step"]), float(row["accuracy"]) / feasible)
@@ -276,7 +276,7 @@ def _log_odds(value: float) -> float:
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
-    """Advice on a longer training, and its command; "" where that would not help."""
+    """Advice on a longer training, and its command; "" if that would not help."""
     twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
     match curve.state, curve.times:
         case "rising", float(times):
@@ -325,7 +325,7 @@ def _rough(seconds: float) -> float:
 
 
 def budget_text(seconds: float) -> str:
-    """The next round budget from so many seconds on: `60s`, `5min`, `2h`."""
+    """The next round budget of at least `seconds`: `60s`, `5min`, `2h`."""
     fitting = [time for time in ROUND_TIMES if time >= 0.95 * seconds]
     time = fitting[0] if fitting else 3600.0 * math.ceil(0.95 * seconds / 3600.0)
     if time < 120.0:

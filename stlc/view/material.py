@@ -1,4 +1,4 @@
-"""Contents of a run's folder for a report; every part may be missing."""
+"""Contents of a run's folder for a report; every part is optional."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Material:
         record: of `run.json`.
         rows: of `train.jsonl`.
         requirements: name -> declaration, parsed from the run's specification.
-        texts: `spec.stl`, `system.yaml`, `compiled.txt`, `config.resolved.yaml`, as far as they are there.
+        texts: `spec.stl`, `system.yaml`, `compiled.txt`, `config.resolved.yaml`, if present.
         signature: of the system, for units and labels.
-        held_out: starts and how their plans fared.
+        held_out: starts and robustness of their plans.
         simulation: of `eval/simulate.json`.
         units: requirement -> the unit of its robustness, where it has one.
-        usual: how many agents and steps the system deploys, under the scenario of the deployment.
+        usual: default numbers of agents and steps of the system, under the deployment's scenario.
         trace: the recorded deployment.
     """
 
@@ -61,7 +61,7 @@ class Material:
 
     @property
     def outside(self) -> bool:
-        """True if the specification takes external functions, which its system provides."""
+        """True if the specification uses external functions of its system."""
         return any(isinstance(item, ast.Extern) for item in _items(self.texts.get("spec.stl", "")))
 
     @property

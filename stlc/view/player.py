@@ -1,7 +1,7 @@
-"""The film at the head of the report: played, scrubbed through, and left at the instant of a violation.
+"""The film at the head of the report: playback, scrubbing, and jumps to violations.
 
-Without scripts the page shows a still. What is drawn travels as commands (`stlc.view.tape`), not as pixels:
-it is sharp at every width and follows the light or dark scheme of the reader; `player.js` replays it.
+Without scripts the page shows a still. The film is stored as drawing commands (`stlc.view.tape`), not as
+pixels: it is sharp at every width and follows the reader's light or dark scheme; `player.js` replays it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from stlc.view.words import count, labelled
 
 SCRIPT = "player.js"
 MOST_FRAMES = 160
-"""Instants of the page's film; others are left out evenly."""
+"""Maximum number of frames of the page's film; others are subsampled evenly."""
 MOST_ROWS = 60
-"""Events of a requirement that are listed."""
+"""Maximum number of listed events per requirement."""
 _WIDE, _HIGH = 1000, 40  # of a track
 
 
@@ -47,7 +47,7 @@ class _Track:
 
 
 def player_section(material: Material) -> Section | None:
-    """The film of the newest deployment; None where nothing was recorded."""
+    """The film of the newest deployment; None without a recording."""
     shots = shots_of(material.run)
     if not shots:
         return None
@@ -68,7 +68,7 @@ def player_section(material: Material) -> Section | None:
 
 
 def script() -> Html:
-    """Script of the page; it reads nothing but the page."""
+    """Script of the page; it loads nothing else."""
     return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
 
 
@@ -76,7 +76,7 @@ def script() -> Html:
 
 
 def _stage(shots: Sequence[Shot], tapes: Sequence[Taped], material: Material) -> Html:
-    """A canvas for each drive, and a still for readers without scripts."""
+    """A canvas for each run, and a still for readers without scripts."""
     panels = [
         el(
             "figure",
@@ -99,7 +99,7 @@ def _stage(shots: Sequence[Shot], tapes: Sequence[Taped], material: Material) ->
 
 
 def _still(material: Material) -> Html | None:
-    """The picture of the animation's most telling instant, which may have been drawn already."""
+    """The still of the animation, drawn if it is missing."""
     path = material.run.path / STILL
     if current(material.run) and path.is_file():
         kind, content = "png", path.read_bytes()
@@ -133,7 +133,7 @@ def _controls(frames: int) -> Html:
 
 
 def _keys(shots: Sequence[Shot]) -> Html:
-    """The legend of all drives."""
+    """The legend of all runs."""
     keys = {key.word: key for shot in shots for key in shot.keys}
     swatches = [
         classed(
@@ -148,7 +148,7 @@ def _keys(shots: Sequence[Shot]) -> Html:
 
 
 def _inks(color: str) -> str:
-    """A colour on light and on dark paper."""
+    """Inline style of a colour in the light and in the dark scheme."""
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
 
 
@@ -245,7 +245,7 @@ def _svg(parts: Iterable[Html]) -> Html:
 
 
 def _up(values: NDArray[np.float64], span: float) -> NDArray[np.float64]:
-    """Heights of a track, from its upper edge."""
+    """Vertical coordinates of values in a track, from its upper edge."""
     return np.asarray(_HIGH - _HIGH * values / (span or 1.0))
 
 
@@ -255,7 +255,7 @@ def _across(times: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _line(times: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
-    """A staircase, with gaps where nothing is known."""
+    """SVG path of a step function, with gaps at NaN."""
     words, last = list[str](), np.nan
     for x, y in zip(_across(times), heights, strict=True):
         if np.isnan(y):
@@ -272,7 +272,7 @@ def _line(times: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
 
 
 def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
-    """Outline of the area between two staircases."""
+    """SVG path of the area between two step functions."""
     x = np.append(_across(times), _WIDE)
     words, begin = list[str](), 0
     same = (heights[1:] == heights[:-1]) & (base[1:] == base[:-1])
@@ -289,7 +289,7 @@ def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArra
 
 
 def _events(shots: Sequence[Shot]) -> Html | None:
-    """Violations by requirement; each line leads to its instant."""
+    """List of violations by requirement; each line links to its instant."""
     names = list(dict.fromkeys(name for shot in shots for name in shot.requirements))
     if not names:
         return None
@@ -332,7 +332,7 @@ def _event_table(rows: list[tuple[Shot, Event]], count_: int) -> Html:
 def _data(
     shots: Sequence[Shot], tapes: Sequence[Taped], tracks: Sequence[Sequence[_Track]], shown: range
 ) -> Html:
-    """Replayed data as JSON that no text in it can end."""
+    """The replayed data as JSON, escaped for a `<script>` element."""
     dt = shots[0].dt
     document: dict[str, Any] = {
         "times": [round(index * dt, 9) for index in shown],

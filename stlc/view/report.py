@@ -1,8 +1,8 @@
-"""`report.html`: one page that says what a run achieved, how, where it fails and how to repeat it.
+"""`report.html`: results of a run, its settings, its failures and the commands that repeat it.
 
-It begins with a film of the newest deployment that can be scrubbed through. The page is whole by itself:
-style, pictures and the one script stand inside it, it needs no network, shows a still where scripts do not
-run, and follows the reader's light or dark scheme. What a run does not have (a deployment, say) is left out.
+It begins with an interactive film of the newest deployment. The page is self-contained: style, pictures and
+its one script are embedded, and it needs no network. Without scripts it shows a still; it follows the
+reader's light or dark scheme. Missing parts (a deployment, say) are left out.
 """
 
 from __future__ import annotations
@@ -106,9 +106,9 @@ def render_report(material: Material, sections: list[Section]) -> str:
 
 
 def headline(material: Material) -> Html:
-    """Result of the run in one sentence, with the advice that follows from it.
+    """Result of the run in one sentence, with advice.
 
-    A run that was deployed is judged by its drives, one that was not by its plans.
+    A deployed run is judged by its closed-loop runs, another by its plans.
     """
     record, result, simulation = material.record, material.result, material.simulation or {}
     driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
@@ -153,7 +153,7 @@ def _beside(result: Mapping[str, Any]) -> str:
 
 
 def _sampled(result: Mapping[str, Any]) -> str:
-    """Remark that the share is an estimate, where not all starts were searched."""
+    """Remark that the share is an estimate if not all starts were searched."""
     searched, held_out = result.get("searched"), result.get("held_out")
     if not searched or not held_out or searched >= held_out:
         return ""
@@ -161,7 +161,7 @@ def _sampled(result: Mapping[str, Any]) -> str:
 
 
 def _advice(material: Material) -> Html | None:
-    """Level of the training and advice, where the policy falls short."""
+    """Level of the training and advice if the policy falls short."""
     where = clause(material.held_out, material.signature)
     commands = Commands.of(shlex.quote(material.run.shown), guard=recommended(material.record))
     learning = learning_on_record(material.record, material.rows, commands, where)
@@ -174,7 +174,7 @@ def _advice(material: Material) -> Html | None:
 
 
 def _spoken(advice: str) -> list[Child]:
-    """A sentence whose commands are set apart, and that begins and ends as sentences do."""
+    """Advice as a sentence, capitalised and with a full stop, commands marked as code."""
     sentence = f"{advice[0].upper()}{advice[1:]}."
     return [el("code", part) if i % 2 else part for i, part in enumerate(sentence.split("`"))]
 
@@ -200,7 +200,7 @@ def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
 
 
 def requirements_section(material: Material) -> Section | None:
-    """Every requirement with its text and how often the policy's plans meet it."""
+    """Every requirement with its text and the share of plans that satisfy it."""
     shares: Mapping[str, float] = material.result.get("requirements") or {}
     names = list(shares) or list(material.requirements)
     if not names:
@@ -288,12 +288,12 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
 
 
 def _clock(record: Mapping[str, Any]) -> str:
-    """Clock of a budget, where that is not the wall clock."""
+    """Clock of a budget if it is not the wall clock."""
     return " of processor time" if (record.get("options") or {}).get("clock") == "processor" else ""
 
 
 def _options(record: Mapping[str, Any]) -> str:
-    """Resolved options, as far as the run records them."""
+    """Resolved options that the run records."""
     engine = record.get("engine") or record.get("options") or {}
     shown = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
     if record.get("margin") is not None:
@@ -320,7 +320,7 @@ def _hashed(record: Mapping[str, Any], what: str) -> Child:
 
 
 USUAL_LIMIT = 0.1
-"""Seconds of a decision of the full guard, where nothing else was said."""
+"""Default time limit of a decision of the full guard, in seconds."""
 _TITLES = {
     "spec.stl": "The specification",
     "system.yaml": "The system",
@@ -348,7 +348,7 @@ def failures_section(material: Material) -> Section | None:
 
 
 def repeat_section(material: Material) -> Section:
-    """The commands that lead here again."""
+    """The commands that reproduce the run."""
     intro = el(
         "p",
         "The same seed and steps give the same weights on the same machine. The folder of the run "
@@ -382,13 +382,13 @@ def _commands(material: Material) -> list[str]:
 
 
 def _set(record: Mapping[str, Any]) -> list[str]:
-    """The options for what was changed in specification and system."""
+    """The `--set` options of the run's overrides."""
     changed = record.get("overrides") or {}
     return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
 
 
 def _simulate(material: Material) -> list[str]:
-    """The command of the newest deployment; with the backup where there was none."""
+    """The command of the newest deployment, or one with the backup policy if there is none."""
     done = material.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
     words = ["stlc", "simulate", material.run.shown, *guard_words(guard).option.split()]
@@ -422,7 +422,7 @@ def _limits(done: Mapping[str, Any]) -> list[str]:
 
 
 def texts_section(material: Material) -> Section | None:
-    """The specification and the system word by word; what was derived from them can be unfolded."""
+    """The texts of specification and system, and collapsed the files derived from them."""
     if not material.texts:
         return None
     blocks = []

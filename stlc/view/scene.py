@@ -1,4 +1,4 @@
-"""The film of a recorded scene: what its world draws, a legend above it, and a strip of margins beneath."""
+"""The film of a recorded scene: the world's drawing, a legend above it, and strip charts of margins below."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Scene = Mapping[str, NDArray[Any]]
 DrawScene = Callable[[Any, Scene, int], None]
 
 WIDTH, TALLEST = 7.6, 4.4
-"""Inches: of a picture, and of a scene that has its strip beneath it; a taller one has it beside."""
+"""Width of a picture, and maximum height of a scene with its strip below (else beside), in inches."""
 _HEAD, _KEYS, _EDGE = 0.36, 0.24, 0.12
 _ROW, _GAP, _FOOT = 0.27, 0.07, 0.42
 _NAMES, _VALUES = 1.15, 0.62
@@ -36,8 +36,8 @@ class Key:
     """An entry of a legend.
 
     Attributes:
-        word: what it is.
-        color: of it.
+        word: label.
+        color: of the symbol.
         kind: `dot`, `ring`, or a line, `dash` or `solid`.
     """
 
@@ -54,8 +54,8 @@ class Staging:
         draw: what draws one frame of it.
         dt: seconds between frames.
         title: of the picture.
-        keys: word -> colour of what else is seen, for the legend.
-        strip: what is shown over time; None leaves it out.
+        keys: label -> colour of further legend entries.
+        strip: strip charts; None leaves them out.
     """
 
     draw: DrawScene
@@ -80,7 +80,7 @@ def frames_of(scene: Scene) -> int:
 
 
 def scene_film(scene: Scene, staging: Staging) -> Film:
-    """The film of arrays (instants, …)."""
+    """The film of a scene, arrays (instants, …)."""
     frames = frames_of(scene)
     keys = keys_of(scene, staging.keys)
     plan = _planned(ratio_of(staging.draw, scene), 0 if staging.strip is None else staging.strip.height, keys)
@@ -93,7 +93,7 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
         axes = _panel(figure, plan, plan.scene)
         moving = [axes, clock, *(artist for mover in movers for artist in mover.artists)]
         for artist in moving:
-            artist.set_animated(True)  # left out of the ground, which is drawn once
+            artist.set_animated(True)  # not part of the background, which is drawn once
         canvas: Any = figure.canvas
         canvas.draw()
         ground = canvas.copy_from_bbox(figure.bbox)
@@ -116,7 +116,7 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
 
 
 def _moment(scene: Scene, frames: int) -> int:
-    """Frame with most interventions, the ends left out; the middle where there was none."""
+    """Frame with most interventions, without the first and last ones; the middle one if there are none."""
     middle = frames // 2
     if "decision" not in scene:
         return middle
@@ -130,7 +130,7 @@ def _moment(scene: Scene, frames: int) -> int:
 
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
-    """Height over width of what the world draws."""
+    """Aspect ratio (height / width) of the world's drawing."""
     with look():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)
@@ -192,7 +192,7 @@ def _handle(key: Key) -> Line2D:
 
 
 def _head(figure: Figure, plan: _Plan, title: str, keys: list[Key]) -> Text:
-    """The title, the clock and the legend; returns the clock."""
+    """Draw title, clock and legend; return the clock."""
     width, height = plan.size
     top = 1 - 0.5 * _HEAD / height
     figure.text(_EDGE / width, top, title, color=INK, va="center", weight="bold", fontsize=10)
@@ -215,7 +215,7 @@ def _head(figure: Figure, plan: _Plan, title: str, keys: list[Key]) -> Text:
 
 
 def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[Mover]:
-    """The strip and what it is, above its first row."""
+    """Draw the strip charts with a heading above the first one."""
     if strip is None or not plan.rows:
         return []
     movers = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])

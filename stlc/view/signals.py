@@ -50,19 +50,19 @@ DECISIONS = {
 }
 """Source of a decision -> its word and its colour."""
 MOST_LINES = 10
-"""Panels of numeric signals; of more, the signals that change come first."""
+"""Maximum number of panels of numeric signals; signals that change come first."""
 MOST_LETTERS = 44
-"""Letters of a title in one line."""
+"""Maximum number of characters of a title in one line."""
 MOST_ROWS = 7
-"""Requirements in a strip chart, those with the least margin first."""
+"""Maximum number of requirements in a strip chart, least margins first."""
 MOST_PANELS, MOST_AGENTS = 6, 40
-"""Signals and agents in the film of a trace."""
+"""Maximum numbers of signals and agents in the film of a trace."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
 _VEIL = 0.72
 
 
 def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
-    """Sources of the decisions, (traces, steps); None where they were not recorded."""
+    """Sources of the decisions, (traces, steps); None if not recorded."""
     recorded = trace.extras.get("decision")
     if recorded is None or recorded.ndim != 2 or len(recorded) != trace.traces:
         return None
@@ -70,7 +70,7 @@ def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def acted_in(trace: Trace) -> NDArray[np.int64] | None:
-    """Number of interventions of the guard, (traces,); None where decisions were not recorded."""
+    """Number of interventions of the guard, (traces,); None if decisions were not recorded."""
     decisions = decisions_of(trace)
     return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
 
@@ -79,13 +79,13 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def margin_limits(rho: Floats) -> tuple[float, float]:
-    """Vertical limits for robustness: large margins are cut so that violations stay visible; 0 is inside."""
+    """Vertical limits for robustness, 0 included: large margins are cut so that violations stay visible."""
     finite = rho[np.isfinite(rho)]
     if not len(finite):
         return -1.0, 1.0
     low, high = min(float(finite.min()), 0.0), max(float(np.quantile(finite, 0.95)), 0.0)
     if low >= -TOLERANCE:
-        low = 0.0  # rounding: nothing to make visible
+        low = 0.0  # rounding errors only
     else:
         high = min(high, 4 * -low)
     room = 0.12 * (high - low) or 1.0
@@ -103,7 +103,7 @@ def margin_text(rho: float, unit: str = "") -> str:
 
 
 def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
-    """Robustness as a staircase over zero, blue where it holds, red where it is violated."""
+    """Draw robustness as a step function, blue where positive, red where negative."""
     rho = finite(rho)
     fails = rho < -TOLERANCE
     axes.axhline(0, color=MUTED, lw=0.6)
@@ -127,12 +127,12 @@ class Choice:
 def choose_traces(
     least: Floats, names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
 ) -> tuple[Choice, ...]:
-    """The worst trace, and that with most interventions or else a typical one; one if both are the same.
+    """The worst trace, and the one with most interventions or else a typical one; one if they coincide.
 
     Args:
-        least: robustness per trace, (traces,); NaN where it is not known.
-        names: of the traces; by default their numbers.
-        acted: number of interventions of the guard in each, (traces,).
+        least: robustness per trace, (traces,); NaN if unknown.
+        names: of the traces; default: their numbers.
+        acted: number of interventions in each, (traces,).
     """
     order = np.argsort(least, kind="stable")
     worst, other, word = int(order[0]), int(order[max(1, int(np.isfinite(least).sum())) // 2]), "typical"
@@ -153,7 +153,7 @@ class _Agent:
     index: int
 
     def decided(self) -> Iterator[tuple[float, float, int]]:
-        """Intervals of time with one source of decisions: from, to, source."""
+        """Time intervals with a constant source of decisions: from, to, source."""
         decisions, trace = decisions_of(self.trace), self.trace
         if decisions is not None:
             for start, stop, value in _runs(decisions[self.index].astype(np.float64)):
@@ -163,7 +163,7 @@ class _Agent:
 def draw_signals(
     trace: Trace, margins: Margins, choices: Sequence[Choice], units: Mapping[str, str] | None = None
 ) -> Picture:
-    """A column of panels per chosen trace: signals, decisions, and the robustness of each requirement.
+    """Draw a column of panels per chosen trace: signals, decisions, and robustness of each requirement.
 
     Args:
         trace: the recording.
@@ -196,7 +196,7 @@ def draw_signals(
 
 
 def left_out(trace: Trace) -> list[str]:
-    """Names of the numeric signals that have no panel."""
+    """Names of the numeric signals without a panel."""
     shown = {name for kind, name in _rows(trace, {}) if kind == "line"}
     return [c.name for c in trace.signature.columns if c.kind in ("real", "int") and c.name not in shown]
 
@@ -214,7 +214,7 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
 
 
 def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
-    """Colours of margins and of decisions."""
+    """Draw the legend of margins and decisions."""
     from matplotlib.patches import Patch
 
     handles = []
@@ -232,7 +232,7 @@ def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
 
 
 def _wrapped(title: str) -> str:
-    """A title in one line, or in two where it is wider than its panel."""
+    """A title in one line, or in two if it is wider than its panel."""
     return title if len(title) <= MOST_LETTERS else title.replace(": ", ":\n", 1)
 
 
@@ -263,7 +263,7 @@ def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
 
 
 def _broken(values: Floats) -> Floats:
-    """A signal with a gap where it jumps (a reset, the next junction); a staircase stays whole."""
+    """A signal with NaN at jumps (a reset, the next junction); a step function is unchanged."""
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
     span = float(np.ptp(values))
@@ -292,7 +292,7 @@ def _draw_discrete(axes: Axes, agent: _Agent, column: Column) -> None:
 
 
 def _runs(values: Floats) -> list[tuple[int, int, float]]:
-    """(start, stop, value) of each run of equal values."""
+    """(start, stop, value) of each range of equal values."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, float(values[a])) for a, b in pairwise(edges) if b > a]
 
@@ -302,14 +302,14 @@ def _runs(values: Floats) -> list[tuple[int, int, float]]:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """Strip charts beneath a film: least margin of each requirement, and interventions of the guard.
+    """Strip charts below a film: least margin of each requirement, and interventions of the guard.
 
     Attributes:
         times: of the frames, in seconds, (frames,).
-        margins: requirement -> least robustness of all agents from each instant on, (frames,); NaN where it
-            is not known.
-        decisions: sources of the decisions, (frames, agents); None where they were not recorded.
-        words: meaning of the margins.
+        margins: requirement -> least robustness of all agents from each instant on, (frames,); NaN if
+            unknown.
+        decisions: sources of the decisions, (frames, agents); None if not recorded.
+        words: meaning of the margins, for a heading.
         units: requirement -> unit of its margin, where it has one.
     """
 
@@ -321,7 +321,7 @@ class Strip:
 
     @property
     def rows(self) -> list[str]:
-        """Names of the requirements that are shown, in their order."""
+        """Names of the shown requirements, in order."""
         known = [name for name, rho in self.margins.items() if np.isfinite(rho).any()]
         least = sorted(known, key=lambda name: float(np.nanmin(finite(self.margins[name]))))[:MOST_ROWS]
         return [name for name in known if name in least]
@@ -350,14 +350,14 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class Mover:
-    """Function that turns artists to a frame, and the artists that it changes."""
+    """Function that updates artists to a frame, and these artists."""
 
     turn: Callable[[int], None]
     artists: tuple[Artist, ...]
 
 
 def draw_strip(strip: Strip, panels: list[Axes]) -> list[Mover]:
-    """Draw the strip charts, one a panel; returns the parts that change from frame to frame."""
+    """Draw the strip charts, one per panel; return the artists that change from frame to frame."""
     movers: list[Mover] = []
     free = list(panels)
     if strip.acted.any():
@@ -405,7 +405,7 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
 
 
 def _titled(axes: Axes, name: str) -> Text:
-    """Write a chart's name on its left; returns the text on its right, which holds the present value."""
+    """Write a chart's name on its left; return the text on its right for the present value."""
     axes.axhspan(*axes.get_ylim(), color=FAINT, alpha=0.25, lw=0, zorder=0)
     beside: Any = {"transform": axes.transAxes, "va": "center", "fontsize": 8, "color": INK}
     axes.text(-0.012, 0.5, picture(name), ha="right", **beside)
@@ -413,7 +413,7 @@ def _titled(axes: Axes, name: str) -> Text:
 
 
 def _veil(axes: Axes, times: Floats) -> Mover:
-    """A cover over the future, and a line at the present."""
+    """A cover over the future and a line at the present time."""
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))
@@ -434,7 +434,7 @@ def _veil(axes: Axes, times: Floats) -> Mover:
 
 
 def signal_film(trace: Trace, *, title: str = "") -> Film:
-    """The film of a trace without a world or places: the signals of all agents, a panel each."""
+    """The film of a trace without a world or regions: a panel per signal, with all agents."""
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 
@@ -459,7 +459,7 @@ def signal_film(trace: Trace, *, title: str = "") -> Film:
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
-    """A signal of at most `MOST_AGENTS` agents; all curves are one line with gaps."""
+    """Draw a signal of at most `MOST_AGENTS` agents, as one line with gaps; return its update function."""
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     axes.set_ylabel(labelled(name, trace.signature[name].unit.text).replace(" [", "\n[", 1))

@@ -1,6 +1,6 @@
-"""Style of all pictures: few inks, colour-blind safe, legible on light and on dark paper.
+"""Style of all pictures: few colours, colour-blind safe, legible on light and dark backgrounds.
 
-Figures are built without pyplot and inside `look`, so no picture leaves a trace in matplotlib's settings.
+Figures are built without pyplot and inside `look`, so matplotlib's global settings stay unchanged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, three greys, and a red far darker than their orange. `ON_DARK` is for dark paper.
+# Okabe and Ito's colours, three greys, and a red far darker than their orange. `ON_DARK`: dark scheme.
 INK, PAPER, MUTED, FAINT = "#1f2430", "#ffffff", "#6a7280", "#e4e7eb"
 BLUE, ORANGE, GREEN, RED, SKY, PINK = "#0072b2", "#e69f00", "#009e73", VIOLATED, "#56b4e9", "#cc79a7"
 ON_DARK = {
@@ -50,7 +50,7 @@ ON_DARK = {
     SKY: "#8fd0f5",
     PINK: "#e39cc2",
 }
-_SCENERY = {  # of worlds: grounds, walls and what stands around, as `stlc.controller.sketch` has them
+_SCENERY = {  # colours of worlds: ground, walls and scenery, as in `stlc.controller.sketch`
     GROUND: "#1d2229",
     WALL: "#5a616d",
     STONE: "#7b828e",
@@ -97,13 +97,13 @@ _RC: Any = {
     "legend.fontsize": 8,
     "svg.fonttype": "path",
     "svg.hashsalt": "stlc",
-    "text.parse_math": False,  # a dollar in a name is a dollar
+    "text.parse_math": False,  # no TeX mode: a dollar sign in a name is literal
 }
 
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Matplotlib's settings for the pictures, and its own again afterwards."""
+    """Apply matplotlib's settings for pictures within the block."""
     require_drawing()
     import matplotlib as mpl
 
@@ -114,7 +114,7 @@ def look() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of that size in inches. To be called inside `look`."""
+    """An empty figure of a size in inches. Call it inside `look`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -124,7 +124,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def narrow_gaps(figure: Figure) -> None:
-    """Less room between panels than is usual, for many small ones."""
+    """Reduce the gaps between panels, for many small ones."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     engine = figure.get_layout_engine()
@@ -133,7 +133,7 @@ def narrow_gaps(figure: Figure) -> None:
 
 
 def quiet(axes: Axes) -> None:
-    """Take frame, ticks and grid away; ticks shared with other axes stay theirs."""
+    """Remove frame, ticks and grid; shared axes keep their ticks."""
     axes.grid(visible=False)
     axes.tick_params(labelbottom=False, labelleft=False)
     for spine in axes.spines.values():
@@ -142,18 +142,18 @@ def quiet(axes: Axes) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure and the sentence that stands in for it where it cannot be seen."""
+    """A drawn figure and its alternative text."""
 
     figure: Figure
     alt: str
 
     def svg(self) -> str:
-        """The figure as SVG whose inks follow the reader's light or dark scheme."""
+        """The figure as SVG that follows the reader's light or dark scheme."""
         from matplotlib.text import Text
 
         buffer = io.StringIO()
         for text in self.figure.findobj(Text):
-            text.set_text(lawful(text.get_text()))  # its comments may hold what XML may not
+            text.set_text(lawful(text.get_text()))  # its comments may contain characters that XML forbids
         with look():
             self._lay_out()
             self.figure.savefig(
@@ -162,25 +162,25 @@ class Picture:
         return _themed(buffer.getvalue())
 
     def data_uri(self) -> str:
-        """The SVG as a `data:` address, to stand inside a page."""
+        """The SVG as a `data:` URI."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
-        """Write the figure on white paper to `path`."""
+        """Write the figure on a white background to `path`."""
         with look(), atomic_path(path) as beside:
             self._lay_out()
             self.figure.savefig(beside, format="png", dpi=dpi, facecolor=PAPER)
         return path
 
     def _lay_out(self) -> None:
-        """Place the panels once: matplotlib would do so twice each time that it saves."""
+        """Compute the layout once: matplotlib would do so twice for every save."""
         if self.figure.get_layout_engine() is not None:
             self.figure.draw_without_rendering()
             self.figure.set_layout_engine("none")
 
 
 def _themed(svg: str) -> str:
-    """`svg` with its inks as variables, set for light paper and, where the reader prefers it, for dark."""
+    """`svg` with its colours as CSS variables, set for the light and the dark scheme."""
     svg = svg[svg.index("<svg") :]
     for light in ON_DARK:
         svg = re.sub(rf"{light}\b", f"var(--c{light[1:]})", svg)

@@ -1,7 +1,7 @@
-"""A film as what is drawn, not as pixels: paths, letters and pictures, for a page that replays it.
+"""A film as drawing commands, not pixels: paths, texts and images, for a page that replays them.
 
-`Tape` is what matplotlib draws on here instead of a canvas. What frames share is kept once. Coordinates are
-whole quarters of a dot from the upper left.
+`Tape` is the matplotlib renderer that records them. Commands shared by frames are stored once. Coordinates
+are whole quarters of a dot from the upper left.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     pass
 
 FINE = 4
-"""Steps of a coordinate in a dot."""
+"""Coordinate steps per dot."""
 DPI = 100
 PICTURE = 720
-"""The most dots across an embedded picture; its quality is that of WebP."""
+"""Maximum width of an embedded image in dots, and its WebP quality."""
 QUALITY = 60
 _LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outline.CURVE4: "c"}
 
 
 def taped(draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]) -> Taped:
-    """Draw frames by `draw(axes, index)`, on axes that fill a figure of that size in inches."""
+    """Record frames drawn by `draw(axes, index)` on axes that fill a figure of a size in inches."""
     with look():
         figure = new_figure(*size)
         figure.set_dpi(DPI)
@@ -50,7 +50,7 @@ def taped(draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[f
 
 
 def taped_film(film: Film, frames: Sequence[int]) -> Taped:
-    """Record a whole picture as `film` draws it."""
+    """Record the frames of a film."""
     with look():
         figure = new_figure(*film.size)
         figure.set_dpi(DPI)
@@ -85,10 +85,10 @@ class Tape(RendererBase):
     def _enter(self, command: Command) -> None:
         self._frames[-1].append(self._known.setdefault(command, len(self._known)))
 
-    # ------------------------------------------------------------- what matplotlib asks of a renderer
+    # ------------------------------------------------------------- matplotlib's renderer interface
 
     def draw_path(self, gc: Any, path: Any, transform: Any, rgbFace: Any = None) -> None:  # noqa: N803
-        """An outline, filled where it has a face."""
+        """Record a path, filled if it has a face colour."""
         line = None if gc.get_linewidth() == 0 else _color(gc.get_rgb(), gc)
         face = None if rgbFace is None else _color(rgbFace, gc)
         text = self._path(path, transform)
@@ -97,7 +97,7 @@ class Tape(RendererBase):
             self._enter(("p", text, face, line, width if line else 0, self._dash(gc), self._clip(gc)))
 
     def draw_image(self, gc: Any, x: float, y: float, im: Any, transform: Any = None) -> None:  # noqa: ARG002
-        """A picture, made smaller where it is large."""
+        """Record an image, scaled down if it is large."""
         from PIL import Image
 
         height, width = im.shape[:2]
@@ -122,7 +122,7 @@ class Tape(RendererBase):
         ismath: Any = False,
         mtext: Any = None,
     ) -> None:
-        """A line of letters; `align` says where (x, y) is in it, on its foot."""
+        """Record a line of text; `align` is the horizontal anchor of (x, y), on the baseline."""
         wide, _, _ = self.get_text_width_height_descent(s, prop, ismath)
         align = "left" if mtext is None else mtext.get_horizontalalignment()
         along = {"left": 0.0, "center": 0.5, "right": 1.0}[align] * wide
@@ -146,17 +146,17 @@ class Tape(RendererBase):
         return points * DPI / 72
 
     def flipy(self) -> bool:
-        """Letters and pictures are placed from above."""
+        """True: the origin is the upper left."""
         return True
 
     def option_image_nocomposite(self) -> bool:
-        """Pictures stay apart."""
+        """True: images are not merged."""
         return True
 
     # ------------------------------------------------------------------------------------- pieces
 
     def _path(self, path: Any, transform: Any) -> str:
-        """An outline as SVG writes it, in steps from point to point."""
+        """A path in SVG notation, with relative coordinates."""
         flip = transform + Affine2D().scale(FINE, -FINE).translate(0, FINE * self.height)
         words: list[str] = []
         x = y = 0
@@ -170,7 +170,7 @@ class Tape(RendererBase):
             if code == Outline.MOVETO:
                 begun = (int(ends[0, 0]), int(ends[0, 1]))
                 if words and (x, y) == begun and words[-1] != "z":
-                    continue  # the line goes on
+                    continue  # the line continues
                 words.append(f"M{begun[0]} {begun[1]}")
             else:
                 words.append(_LETTERS[code] + " ".join(f"{a - x} {b - y}" for a, b in ends.tolist()))
@@ -184,17 +184,17 @@ class Tape(RendererBase):
         return " ".join(f"{self.points_to_pixels(length):.3g}" for length in pattern)
 
     def _clip(self, gc: Any) -> str | None:
-        """The outline that something is cut to, where it is not the frame of the axes."""
+        """The clip path, if it is not the frame of the axes."""
         path, transform = gc.get_clip_path()
         return None if path is None else self._path(path, transform)
 
 
 _measuring: Any = RendererAgg
-"""What knows how wide letters are."""
+"""Renderer that measures text."""
 
 
 def _color(color: Any, gc: Any) -> str | None:
-    """`#rrggbb`, with two more digits where it can be seen through; None where it cannot be seen."""
+    """`#rrggbb`, with two more digits for opacity below 1; None if fully transparent."""
     alpha = gc.get_alpha() if gc.get_forced_alpha() else color[3] if len(color) > 3 else 1.0
     if not alpha:
         return None

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them."""
+"""Numbers and names formatted for readers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """0.957 as `95.7 %`; nothing for None. What is not all, or not nothing, never reads as if it were."""
+    """0.957 as `95.7 %`; "" for None. A share below 1 never rounds to 100 %, one above 0 never to 0 %."""
     if value is None:
         return ""
     while digits < 4 and 0 < value < 1 and round(100 * value, digits) in (0, 100):
@@ -23,7 +23,7 @@ def interval(ends: Sequence[float] | None) -> str:
 
 
 def number(value: float | None, unit: str = "") -> str:
-    """Three significant digits, thousands set apart, then the unit."""
+    """A number with three significant digits, grouped thousands, and its unit."""
     if value is None:
         return ""
     text = f"{value:,.0f}" if abs(value) >= 1000 or value == round(value) else f"{value:.3g}"
@@ -64,12 +64,12 @@ class GuardWords:
 
     @property
     def noun(self) -> str:
-        """With its article: `the full guard`, `no guard`."""
+        """Name with its article: `the full guard`, `no guard`."""
         return f"the {self.title}" if self.option else self.title
 
     @property
     def beside(self) -> str:
-        """With its preposition: `with the full guard`, `without a guard`."""
+        """Name with its preposition: `with the full guard`, `without a guard`."""
         return f"with {self.noun}" if self.option else "without a guard"
 
 
@@ -81,12 +81,12 @@ GUARDS = {
 
 
 def guard_words(name: object) -> GuardWords:
-    """Names of a guard; those of an unknown one are made from its name."""
+    """Names of a guard; for an unknown one derived from its name."""
     return GUARDS.get(str(name)) or GuardWords(f"guard {name}", f"--guard {name}")
 
 
 def labelled(name: str, unit: str) -> str:
-    """A name with its unit, `v [m/s]`, as axes have it; the name alone for a number without unit."""
+    """A name with its unit, `v [m/s]`, for axes; the name alone without a unit."""
     return f"{name} [{unit}]" if unit not in ("", "1") else name
 
 
@@ -96,7 +96,7 @@ def count(many: int, what: str) -> str:
 
 
 def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
-    """Guard -> what became of its drives, from the document of a deployment; none in an older one."""
+    """Guard -> results of its runs, from the document of a deployment; empty for an older document."""
     guards = (simulation or {}).get("guards")
     each = guards.items() if isinstance(guards, Mapping) else ()
     found = {name: guard.get("drives") for name, guard in each if isinstance(guard, Mapping)}
@@ -106,8 +106,8 @@ def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, An
 def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
     """`198 of 200 drives obeyed every rule; without the guard 150`, from the document of a deployment.
 
-    A drive is one agent over one seed. Without a specification of drives it is judged as plans are: from
-    every start by the one that they are made for. "" for a document that says nothing of drives.
+    A drive is one agent over one seed. Without a separate specification for drives it is judged by that of
+    plans, from every start. "" for a document without drives.
     """
     each = drives_of(simulation)
     if not each:
@@ -128,11 +128,11 @@ CAUSES = {
     "later": "no plan is known from {} on, although the one followed until then was good",
     "missed": "a plan is known at {}, and another one was followed",
 }
-"""Why a rule was broken, as `stlc.controller.evaluation.rules.Lost` has it."""
+"""Causes of a violation, from `stlc.controller.evaluation.rules.Lost`."""
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Number and time of lost drives, and share of the others that obeyed; "" where none was lost."""
+    """Number and time of lost drives, and share of the others that obeyed; "" if none was lost."""
     each = list(drives_of(simulation).values())
     if not each:
         return ""
@@ -157,7 +157,7 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
-    """Reason for which a drive broke a rule, an entry of `broken`; "" where none is known."""
+    """Reason for which a drive broke a rule, for an entry of `broken`; "" if unknown."""
     cause = broken.get("cause")
     if cause is None:
         return "lost from its start" if broken["lost"] else ""
