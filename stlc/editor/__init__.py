@@ -1,1 +1,1 @@
-"""Answers to an editor about a specification while it is written."""
+"""Language support for editors: findings, hover, completion, rename."""

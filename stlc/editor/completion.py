@@ -1,7 +1,7 @@
 """Completion at a cursor: words that the grammar accepts there, and names of the kind that it accepts.
 
-The parser reads the declaration up to the cursor and says which terminals may follow; where it cannot read
-that far, everything is offered.
+The parser reads the declaration up to the cursor and gives the terminals that may follow; if it fails before
+the cursor, everything is offered.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Offer:
     """A completion.
 
     Attributes:
-        text: as it is inserted, in place of what is written already.
-        kind: of what.
+        text: inserted in place of the partial word.
+        kind: of the symbol or word.
         detail: one line beside it.
-        doc: Markdown for the one that is looked at.
+        doc: Markdown shown for the selected offer.
         order: offers with smaller numbers come first.
     """
 
@@ -59,14 +59,14 @@ class Offer:
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """The offers at a cursor, and the offset at which they would begin."""
+    """The offers at a cursor, and the offset of the text that they replace."""
 
     start: int
     offers: tuple[Offer, ...]
 
 
 def complete(document: Document, offset: int) -> Completion:
-    """Completions at `offset`; the text behind it is not looked at."""
+    """Completions at `offset`; the text after it is ignored."""
     text = document.source.text[:offset]
     if _SILENT.fullmatch(text[text.rfind("\n") + 1 :]):
         return Completion(offset, ())
@@ -98,7 +98,7 @@ def _piece_start(text: str) -> int:
 
 
 def _units_at(piece: str, text: str) -> str | None:
-    """Beginning of a unit in brackets, or None where no unit stands."""
+    """Partial text of a unit in brackets; None if the cursor is not in one."""
     head, bracket, tail = piece.rpartition("[")
     written = _UNIT_PREFIX.search(text)
     assert written is not None
@@ -161,7 +161,7 @@ def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:
-    """Values that can be used here, nearest first."""
+    """Value symbols in scope, nearest first."""
     for symbol in inside(document.spec, offset):
         yield Offer(own_name(symbol.name), "name", about(document, symbol), order=1)
     for symbol in document.names.values.values():
@@ -190,7 +190,7 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
 
 
 def _shared(document: Document, alias: str) -> Iterator[Offer]:
-    """Completions from a module."""
+    """Completions after the alias of an imported module."""
     for module in document.modules:
         if module.alias == alias:
             for item in shared(module):

@@ -1,4 +1,4 @@
-"""A specification as it stands in an editor: what is wrong with it, and what its names mean."""
+"""Analysis of a specification in an editor: findings, symbols and their meaning."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Finding:
     """A diagnostic and its place in the text.
 
     Attributes:
-        diagnostic: as the command line would show it.
-        span: where, always in the text itself.
-        mild: it only keeps the specification from being trained on.
+        diagnostic: as on the command line.
+        span: its place, always in the edited text.
+        mild: it prevents training, not monitoring.
     """
 
     diagnostic: Diagnostic
@@ -62,10 +62,10 @@ class Document:
 
     Attributes:
         source: the text, under the path of its file.
-        spec: the tree of what can be read of it.
-        unread: what cannot be read.
-        system: what the system file says that it names, or None.
-        missing: why there is no system although the text names one.
+        spec: syntax tree of the declarations without syntax errors.
+        unread: diagnostics of the others.
+        system: declaration of the system that it names, or None.
+        missing: the reason if the named system cannot be loaded.
     """
 
     source: Source
@@ -76,12 +76,12 @@ class Document:
 
     @cached_property
     def names(self) -> Names:
-        """Its symbols and where they are written."""
+        """Its symbols and their occurrences."""
         return names_of(self.spec)
 
     @property
     def grid(self) -> Grid:
-        """The step and the horizon of its system."""
+        """Time step and horizon of its system."""
         return Grid() if self.system is None else Grid(self.system.dt, self.system.horizon)
 
     @cached_property
@@ -94,7 +94,7 @@ class Document:
 
     @cached_property
     def meaning(self) -> Meaning:
-        """Meaning of its names and intervals."""
+        """Resolved names and intervals."""
         interface = None if self.system is None else self.system.interface()
         return understand(self.spec, self.modules, interface=interface, grid=self.grid)
 
@@ -102,7 +102,7 @@ class Document:
     def findings(self) -> tuple[Finding, ...]:
         """Findings of `stlc lint`, in the order of the text.
 
-        Where only training is in the way of it, errors are mild: a monitor takes such a specification.
+        Errors that prevent training but not monitoring are mild.
         """
         found = [self._about_system(self.missing)] if self.missing else []
         said = self.unread or lint(self.source, within=self._surroundings())
@@ -115,7 +115,7 @@ class Document:
         return None if self.system is None else Surroundings(self.system.interface(), self.grid)
 
     def _place(self, finding: Diagnostic) -> Finding:
-        """A finding with its place in this text; one about another file stands where that is named."""
+        """A finding placed in this text; one in another file is placed where that file is named."""
         span = finding.span
         if span is not None and span.source.name == self.source.name:
             return Finding(finding, self.source.span(span.start, span.end))
@@ -132,13 +132,13 @@ class Document:
 
 
 class Systems:
-    """System files, read again when they change."""
+    """Cache of system files, reread when they change."""
 
     def __init__(self) -> None:
         self._known: dict[Path, tuple[tuple[int, int], SystemDecl | StlcError]] = {}
 
     def load(self, name: str, spec_path: Path) -> SystemDecl:
-        """The system that a specification names. Raises StlcError, with what is wrong with it."""
+        """Load the system that a specification names. Raises StlcError if it is missing or invalid."""
         path = find_system(name, spec_path)
         status = path.stat()
         stamp = (status.st_mtime_ns, status.st_size)
@@ -159,7 +159,7 @@ def _load(path: Path) -> SystemDecl | StlcError:
 
 
 def look_at(source: Source, systems: Systems) -> Document:
-    """A text as a document."""
+    """Analyse a text."""
     spec, unread = read(source)
     if spec.system is None:
         return Document(source, spec, unread, None, ())
@@ -181,7 +181,7 @@ _INK = re.compile(r"[^\r\n]")
 
 
 def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
-    """The tree of everything that can be read, and what is wrong with the rest.
+    """The tree of all declarations without syntax errors, and the diagnostics of the others.
 
     Spans of the tree point into `source` or into a text of the same length.
     """
@@ -201,7 +201,7 @@ def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
 
 
 def _without(source: Source, faults: tuple[Diagnostic, ...]) -> Source:
-    """The text with every declaration blanked out that holds one of the faults; all of it if none does."""
+    """The text with each faulty declaration blanked out; entirely blank if a fault lies in no declaration."""
     starts = declaration_starts(source.text)
     ends = [*starts[1:], len(source.text)]
     text = source.text
@@ -223,13 +223,13 @@ _OUTWARD = ("always", "historically", "release")
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """A specification as far as it can be understood.
+    """The resolved part of a specification.
 
     Attributes:
-        scope: the names of the file.
+        scope: name table of the file.
         columns: signals and parameters by the name of their declaration, with their ranges.
         formulas: requirements and assumptions, and definitions without arguments that are formulas.
-        grid: of the system; empty where there is none.
+        grid: time grid of the system; empty without one.
         interface: of the system, if there is one.
     """
 
@@ -240,7 +240,7 @@ class Meaning:
     interface: Interface | None = field(default=None, repr=False)
 
     def value(self, name: str) -> Value | None:
-        """Value of a signal, constant, region or definition without arguments; None where that fails."""
+        """Value of a signal, constant, region or definition without arguments; None if unresolved."""
         entry = self.scope.entries.get(name)
         if isinstance(entry, Known):
             return entry.value
@@ -253,7 +253,7 @@ class Meaning:
             return None
 
     def steps(self, name: str) -> int | None:
-        """Lookahead of a formula, steps; None where the grid does not say."""
+        """Lookahead of a formula in steps; None if the grid is unknown."""
         formula = self.formulas.get(name)
         if formula is None:
             return None
@@ -264,7 +264,7 @@ class Meaning:
         return reach(simplify(lowered)).future
 
     def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
-        """The interval that is written at `span`, and its window in steps where the grid is known."""
+        """The interval written at `span`, and its window in steps if the grid is known."""
         for formula in self.formulas.values():
             for node in _temporal(formula):
                 if node.interval.span == span:
@@ -280,7 +280,7 @@ class Meaning:
 def understand(
     spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
 ) -> Meaning:
-    """Meaning of a specification as far as it resolves; findings are dropped, the compiler reports them."""
+    """Resolve as much of a specification as possible; findings are dropped, as the compiler reports them."""
     scope = Scope(temporal=True, time_unit=spec.time_unit)
     file = declared(spec, modules, interface, {}, scope)
     columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
@@ -332,11 +332,11 @@ def _temporal(formula: object) -> Iterator[typed.Temporal | typed.Until]:
 
 @dataclass(frozen=True, slots=True)
 class Borrowed:
-    """A name behind a dot.
+    """A name imported from a module: the part after the dot.
 
     Attributes:
         span: of the name.
-        module: where it comes from.
+        module: its module.
         item: its declaration there; None where the module has no such name.
     """
 
@@ -351,7 +351,7 @@ def shared(module: Module) -> tuple[ast.Item, ...]:
 
 
 def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Borrowed | None:
-    """The name of a module that a cursor at `offset` touches."""
+    """The imported name under the cursor at `offset`."""
     by_alias = {module.alias: module for module in modules}
     for node in (part for item in spec.items for part in descendants(item)):
         if not isinstance(node, ast.Attr) or not isinstance(node.base, ast.Name):
@@ -373,8 +373,8 @@ def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Bor
 def definition(document: Document, offset: int) -> tuple[Span, ...]:
     """Places of the declaration of the name at a cursor.
 
-    From a use to the declaration; from the declaration of a signal, a parameter or a constant to the system
-    file that has it too; from `system "file"` into that file; from `module.name` into the module.
+    A use leads to its declaration; the declaration of a signal, parameter or constant to its entry in the
+    system file; from `system "file"` into that file; from `module.name` into the module.
     """
     place = document.spec.system_span
     if place is not None and place.start <= offset <= place.end:

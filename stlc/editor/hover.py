@@ -1,4 +1,4 @@
-"""Hover text of the word under a cursor: sort, unit, range, value, time in seconds and steps."""
+"""Hover text of the word under the cursor: sort, unit, range, value, time in seconds and steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PAST = ("once", "historically", "since")
 
 
 def hover(document: Document, offset: int) -> tuple[Span, str] | None:
-    """The place that a cursor touches and what to say about it, in Markdown."""
+    """The span under the cursor and its hover text, in Markdown; None if there is none."""
     found = document.names.at(offset)
     if found is not None:
         return found.span, about(document, found.symbol)
@@ -45,7 +45,7 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
 
 
 def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
-    """The lexeme at an offset, a word where two meet, and the text of the one before."""
+    """The lexeme at an offset (of two adjacent ones the word), and the text of the one before."""
     found, before, last = None, "", ""
     for lexeme in lexemes(text):
         if lexeme.start > offset:
@@ -61,7 +61,7 @@ def _is_temporal(lexeme: Lexeme) -> bool:
 
 
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
-    """Span from the word at a cursor to the end of the interval behind it."""
+    """Span from the word under the cursor to the end of its interval."""
     word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
     if node.interval is None:
         return document.source.span(*word)
@@ -98,7 +98,7 @@ def duration(steps: int, grid: Grid) -> str:
 
 
 def about(document: Document, symbol: Symbol) -> str:
-    """The declaration of a symbol, its `##` comment, and what it comes to."""
+    """Hover text of a symbol: its declaration, `##` comment, and summary."""
     item = symbol.item
     parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
@@ -108,17 +108,17 @@ def about(document: Document, symbol: Symbol) -> str:
 
 
 def _code(item: ast.Item) -> str:
-    """A declaration as a block of code, on lines of its own whatever its names hold."""
+    """A declaration as a fenced code block, safe for names with back quotes."""
     return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
 
 
 def _told(doc: str) -> str:
-    """A `##` comment: text, not mark-up."""
+    """A `##` comment with mark-up escaped."""
     return "\n".join(map(markdown, doc.split("\n")))
 
 
 def about_shared(item: ast.Item, key: str) -> str:
-    """A declaration of an imported file."""
+    """Hover text of a declaration in an imported file."""
     origin = "library std" if key == STD else markdown_code(key)
     parts = [_code(item), f"from {origin}", _told(item.doc)]
     return "\n\n".join(filter(None, parts))
@@ -200,7 +200,7 @@ def _ahead(document: Document, name: str) -> str:
 
 
 def _temporal_at(node: object, offset: int) -> ast.Temporal | ast.Until | None:
-    """The innermost temporal operator whose word or interval a cursor touches."""
+    """The innermost temporal operator with its word or interval under the cursor."""
     found: ast.Temporal | ast.Until | None = None
     for part in _parts(node):
         if isinstance(part, ast.Node) and part.span.start <= offset <= part.span.end:

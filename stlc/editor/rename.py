@@ -1,4 +1,4 @@
-"""A new name for a symbol, everywhere, such that nothing else changes its meaning."""
+"""Rename of a symbol at all its occurrences, without changing any other binding."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class RenameError(Exception):
 
 
 _FROM_ELSEWHERE = ("module", "extern", "param")
-"""What other files call by its name, and nothing here can say so."""
+"""Kinds of symbols that other files may refer to by name; they cannot be renamed safely."""
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """Occurrence that would be renamed, if that is possible."""
+    """Occurrence at `offset` if its symbol can be renamed, else None."""
     found = document.names.at(offset)
     return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
 
@@ -35,10 +35,10 @@ def can_rename(document: Document, offset: int) -> Occurrence | None:
 def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
     """The edits that give the symbol at `offset` the name `new`.
 
-    A signal goes on to read the same column: `from "old"` is added to its declaration.
+    A renamed signal still reads the same column: `from "old"` is added to its declaration.
 
     Raises:
-        RenameError: there is nothing to rename, the text has errors, or `new` would mean something else.
+        RenameError: there is nothing to rename, the text has errors, or `new` would capture another name.
     """
     found = can_rename(document, offset)
     if found is None:
@@ -61,7 +61,7 @@ def _line(document: Document) -> int:
 
 
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
-    """Edit that keeps the column of a renamed signal."""
+    """Edit that adds `from "old"` to a renamed signal."""
     if not isinstance(item, ast.Signal) or item.column is not None:
         return []
     together = [other.name for other in document.spec.items if other.span == item.span]
@@ -72,7 +72,7 @@ def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
 
 
 def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
-    """Every name must be bound to what it was bound to before."""
+    """Raise RenameError unless every name keeps its binding."""
     text = apply(document.source.text, edits)
     try:
         after = names_of(parse(Source(document.source.name, text)))
@@ -83,7 +83,7 @@ def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> Non
 
 
 def apply(text: str, edits: Sequence[Edit]) -> str:
-    """The text with all edits done."""
+    """Apply all edits to a text."""
     for span, replacement in sorted(edits, key=lambda edit: edit[0].start, reverse=True):
         text = text[: span.start] + replacement + text[span.end :]
     return text
@@ -96,5 +96,5 @@ def _bindings(names: Names) -> list[int]:
 
 
 def _declared(names: Names) -> tuple[int, int, int]:
-    """Numbers of declared names; two declarations of one name count once."""
+    """Numbers of distinct declared values, types and rules."""
     return len(names.values), len(names.types), len(names.rules)

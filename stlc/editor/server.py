@@ -1,4 +1,4 @@
-"""The language server: what an editor asks, answered from `Document`."""
+"""The language server: requests of an editor, answered from `Document`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from stlc.version import __version__
 
 
 class Server(LanguageServer):
-    """Answers for every specification that is open, each looked at once per change."""
+    """State of the server: all open specifications, each analysed once per change."""
 
     def __init__(self) -> None:
         super().__init__("stlc", __version__, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)
@@ -36,28 +36,28 @@ class Server(LanguageServer):
 
     @property
     def encoding(self) -> Encoding:
-        """Unit in which the client counts columns."""
+        """Position encoding of the client."""
         chosen = str(getattr(self.workspace.position_encoding, "value", self.workspace.position_encoding))
         return "utf-8" if chosen == "utf-8" else "utf-32" if chosen == "utf-32" else "utf-16"
 
     @property
     def opened(self) -> tuple[str, ...]:
-        """The addresses of the texts that are open."""
+        """URIs of the open texts."""
         return tuple(self._documents)
 
     def look(self, uri: str) -> Document:
-        """The text at an address, looked at again."""
+        """Analyse the text at a URI anew."""
         text = self.workspace.get_text_document(uri).source
         source = Source(uris.to_fs_path(uri) or uri if uri.startswith("file:") else uri, text)
         self._documents[uri] = look_at(source, self.systems)
         return self._documents[uri]
 
     def document(self, uri: str) -> Document:
-        """The text at an address."""
+        """The analysed text at a URI."""
         return self._documents.get(uri) or self.look(uri)
 
     def forget(self, uri: str) -> None:
-        """A text has been closed."""
+        """Remove a closed text."""
         self._documents.pop(uri, None)
 
     def offset(self, document: Document, position: lsp.Position) -> int:
@@ -65,13 +65,13 @@ class Server(LanguageServer):
         return Layout(document.source.text, self.encoding).offset(Place(position.line, position.character))
 
     def publish(self, uri: str) -> None:
-        """Look at a text and tell the client what was found."""
+        """Analyse a text and publish its diagnostics."""
         findings = self.look(uri).findings
         shown = [diagnostic(finding, self.encoding) for finding in findings]
         self._publish(uri, shown)
 
     def clear(self, uri: str) -> None:
-        """Take back what was told of a text."""
+        """Clear the published diagnostics of a text."""
         self._publish(uri, [])
 
     def _publish(self, uri: str, shown: list[lsp.Diagnostic]) -> None:
@@ -103,7 +103,7 @@ def _closed(server: Server, params: lsp.DidCloseTextDocumentParams) -> None:
 
 
 def _files_changed(server: Server, _: Any) -> None:
-    """A system file may be another one now."""
+    """Analyse all texts again, as a system file may have changed."""
     for uri in server.opened:
         server.publish(uri)
 
@@ -187,7 +187,7 @@ def _rename(server: Server, params: lsp.RenameParams) -> lsp.WorkspaceEdit:
 
 
 def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[lsp.TextEdit]:
-    """The whole text in its one layout; nothing while it cannot be read."""
+    """Edits that format the whole text; none if it has syntax errors."""
     source = server.document(params.text_document.uri).source
     try:
         text = format_text(source)
@@ -199,7 +199,7 @@ def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[ls
 
 
 def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeAction]:
-    """The repairs of the findings in a range."""
+    """Code actions: the fixes of the findings in a range."""
     uri = params.text_document.uri
     document = server.document(uri)
     first, last = (server.offset(document, place) for place in (params.range.start, params.range.end))
@@ -274,30 +274,30 @@ _OFFERS: dict[OfferKind, lsp.CompletionItemKind] = {
 
 
 def position(place: Place) -> lsp.Position:
-    """A place."""
+    """A place as an LSP position."""
     return lsp.Position(place.line, place.column)
 
 
 def range_of(span: Span, encoding: Encoding) -> lsp.Range:
-    """A span of its own text."""
+    """A span as an LSP range."""
     layout = Layout(span.source.text, encoding)
     return lsp.Range(position(layout.place(span.start)), position(layout.place(span.end)))
 
 
 def location(span: Span, encoding: Encoding) -> lsp.Location:
-    """A span and the file that it is in."""
+    """A span as an LSP location."""
     return lsp.Location(uri_of(span.source.name), range_of(span, encoding))
 
 
 def uri_of(name: str) -> str:
-    """The address of a file; a text that has none yet keeps the address that it was opened under."""
+    """The URI of a file; an unsaved text keeps the URI under which it was opened."""
     if "://" in name or name.startswith("untitled:"):
         return name
     return uris.from_fs_path(str(Path(name).resolve())) or name
 
 
 def diagnostic(finding: Finding, encoding: Encoding) -> lsp.Diagnostic:
-    """A finding, its secondary places and its advice."""
+    """A finding as an LSP diagnostic, with its secondary places and advice."""
     inner = finding.diagnostic
     warns = finding.mild or inner.severity == "warning"
     return lsp.Diagnostic(
@@ -321,12 +321,12 @@ def _lines(finding: Diagnostic) -> list[str]:
 
 
 def text_edit(span: Span, text: str, encoding: Encoding) -> lsp.TextEdit:
-    """A replacement."""
+    """A replacement as an LSP text edit."""
     return lsp.TextEdit(range_of(span, encoding), text)
 
 
 def completion_item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
-    """An offer, in place of what is written already."""
+    """An offer as an LSP completion item that replaces the partial word."""
     return lsp.CompletionItem(
         label=offer.text,
         kind=_OFFERS[offer.kind],
@@ -342,7 +342,7 @@ def completion_item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
 
 
 Encoding: TypeAlias = Literal["utf-8", "utf-16", "utf-32"]
-"""What a column counts: bytes, 16-bit units, or characters."""
+"""Position encoding: columns count bytes, 16-bit units, or characters."""
 
 _BREAK = re.compile(r"\r\n|\r|\n")
 
@@ -356,7 +356,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The lines of a text. Columns beyond the end of a line mean its end, lines beyond the last the end."""
+    """The lines of a text. Positions beyond the end of a line or of the text are clipped to that end."""
 
     text: str
     encoding: Encoding = "utf-16"
@@ -392,7 +392,7 @@ class Layout:
 
     @property
     def end(self) -> Place:
-        """Behind the last character."""
+        """The place after the last character."""
         return self.place(len(self.text))
 
     def _units(self, text: str) -> int:

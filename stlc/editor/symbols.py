@@ -47,7 +47,7 @@ class Symbol:
         name: without backticks.
         kind: of what.
         span: where its name is declared.
-        item: the declaration that it is, or stands in; None for a module and for a variable.
+        item: its declaration, or the one that contains it; None for a module and for a variable.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Occurrence:
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """The symbols of a specification, by the three kinds of names that do not see each other.
+    """The symbols of a specification, in three separate namespaces.
 
     Attributes:
         values: signals, constants, definitions and whatever else stands in expressions.
@@ -86,7 +86,7 @@ class Names:
     occurrences: tuple[Occurrence, ...]
 
     def at(self, offset: int) -> Occurrence | None:
-        """The occurrence that a cursor at `offset` touches."""
+        """The occurrence under the cursor at `offset`."""
         touching = [one for one in self.occurrences if one.span.start <= offset <= one.span.end]
         return max(touching, key=lambda one: one.span.start, default=None)
 
@@ -99,7 +99,7 @@ Scope: TypeAlias = Mapping[str, Symbol]
 
 
 def names_of(spec: ast.Spec) -> Names:
-    """Names of a specification and their occurrences. The first declaration of a name has it."""
+    """Names of a specification and their occurrences. A duplicate refers to the first declaration."""
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}
     rules: dict[str, Symbol] = {}
@@ -120,7 +120,7 @@ def names_of(spec: ast.Spec) -> Names:
 
 
 def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
-    """Arguments and variables that can be used at `offset`, innermost last."""
+    """Arguments and variables in scope at `offset`, innermost last."""
     found: list[Symbol] = []
     for item in spec.items:
         if item.span.start <= offset <= item.span.end:
@@ -149,7 +149,7 @@ def _words(span: Span, start: int | None = None, end: int | None = None) -> list
 
 
 def _module(module: ast.Import) -> Symbol:
-    """The name under which a module is used: the last word, or the file where no other name is given."""
+    """The alias of a module, by default its file name."""
     words = _words(module.span)
     if module.alias is None and module.is_file:
         name = module.target.replace("\\", "/").rpartition("/")[2].removesuffix(".stl").removesuffix(".stlc")
@@ -215,7 +215,7 @@ def _of_item(item: ast.Item, names: Names) -> Iterator[Occurrence]:
 
 
 def _uses(node: object, scope: Scope, names: Names) -> Iterator[Occurrence]:
-    """Names in a part of a declaration that are bound to something; built-in names are not."""
+    """Occurrences of bound names in a part of a declaration, without built-in names."""
     match node:
         case ast.Name(span, name, quoted):
             if name in scope and (quoted or name not in ("T", "end", "dt")):
@@ -239,7 +239,7 @@ def _uses(node: object, scope: Scope, names: Names) -> Iterator[Occurrence]:
 
 
 def _sees(node: object, part: object) -> bool:
-    """True if the variables that a node binds can be used in this part of it."""
+    """True if the variables that a node binds are in scope in this part of it."""
     return isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
 
 

@@ -1,7 +1,7 @@
-"""The words of the language as a TextMate grammar, which editors colour texts by.
+"""The TextMate grammar of the language, for syntax highlighting.
 
-Made from the same lists as the parser's grammar (`stlc.grammar.words`, `stlc.units`, the function table), so
-that a word that the language gains is coloured without anybody thinking of it.
+Generated from the same tables as the parser's grammar (`stlc.grammar.words`, `stlc.units`, functions), so
+that new words are highlighted without further changes.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _COMMENT = r"(?:#|//).*$"
 
 
 def _declarations() -> list[dict[str, Any]]:
-    """Keyword and name: requirements stand out from what only names something."""
+    """Keyword and name; requirements have their own scope."""
     rules = ("require", "assume")
     callables = ("def", "region", "enum")
     rest = [word for word in DECLARATIONS if word not in (*rules, *callables, "extern", "import")]
@@ -90,7 +90,7 @@ def _declarations() -> list[dict[str, Any]]:
 
 
 def _pragmas() -> list[dict[str, Any]]:
-    """`spec name`, `system "file"`, `time s`: words of the language only where a line begins."""
+    """`spec name`, `system "file"`, `time s`: keywords only at the beginning of a line."""
     head = rf"^\s*({_any(PRAGMAS)})\s+"
     return [
         _captures(rf"{head}({_NAME})", {"1": "keyword.control.pragma", "2": "entity.name.type"}),
@@ -99,7 +99,7 @@ def _pragmas() -> list[dict[str, Any]]:
 
 
 def _numbers() -> dict[str, Any]:
-    """A number and its unit; a `%` that an operand follows is the modulo."""
+    """A number and its unit; a `%` followed by an operand is the modulo operator."""
     number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
     percent = rf"%(?!\s*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
     return _captures(
@@ -119,7 +119,7 @@ def _temporal() -> list[str]:
 
 
 def _logic() -> list[str]:
-    """Reserved words that are nothing else."""
+    """Reserved words without a pattern of their own."""
     other = {*DECLARATIONS, *_temporal(), *_CONSTANTS}
     return [*sorted(RESERVED - other), "from", "as"]
 
