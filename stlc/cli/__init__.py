@@ -1,1 +1,1 @@
-"""The terminal: arguments, one call, one rendering."""
+"""The command line: a module for each command."""

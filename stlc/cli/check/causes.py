@@ -24,7 +24,7 @@ _WIDTH = 72
 
 
 def explain_trace(name: str, question: Question, runs: Path, *, as_json: bool) -> None:
-    """Judge a trace, print the tree of causes of every violated requirement, exit with the answer."""
+    """Judge a trace, print the tree of causes of every violation, and exit with the verdict's code."""
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
@@ -47,7 +47,7 @@ def _told(result: Checked) -> str:
 
 
 def _lines(cause: Cause, result: Checked) -> Iterator[str]:
-    """The place as `stlc check` shows it, and the tree below it."""
+    """The place of a violation as in `stlc check`, and its tree of causes."""
     from stlc.cli.framework.render import render_place
 
     judged = cause.judgement
@@ -63,7 +63,7 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
 
 
 def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
-    """The tree, the part that decides first, without recursion."""
+    """The nodes of the tree with their depths, the deciding child first, without recursion."""
     stack = [(0, tree)]
     while stack:
         depth, node = stack.pop()
@@ -74,7 +74,7 @@ def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
 
 
 def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
-    """One sub-formula: its text, what it is, when, and what its signals were."""
+    """One sub-formula: text, value, instant, and values of its signals."""
     text = " ".join(node.span.text.split())
     short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
     subject = result.verdict.subject
@@ -102,7 +102,7 @@ def _readings(node: CauseNode, cause: Cause, result: Checked) -> Sequence[str]:
 
 
 def _values(cause: Cause, result: Checked) -> dict[str, Any]:
-    """A cause as values for JSON; the tree as a list with the depth of every node."""
+    """A cause as JSON values; the tree as a list of nodes with depths."""
     subject = result.verdict.subject
     nodes = [
         {

@@ -1,4 +1,4 @@
-"""Results of `stlc check` for other programs: JSON, JUnit XML, and robustness as a trace of its own."""
+"""Machine-readable results of `stlc check`: JSON, JUnit XML, and robustness as a trace."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 def document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """What `--json` says: the result of one trace; of several, one verdict and the list of them."""
+    """Document of `--json`: the result of one trace, or one verdict and the list of results."""
     entries = [outcome.entry for outcome in outcomes]
     return entries[0] if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
 
 
 def entry_of(result: Checked, end: str) -> dict[str, Any]:
-    """Everything about one trace."""
+    """The result of one trace as JSON values."""
     verdict = result.verdict
     horizon = verdict.subject.horizon
     return {
@@ -85,13 +85,13 @@ def _least(values: NDArray[np.float64]) -> float | None:
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """Divided first: the sum of margins may be more than a float holds."""
-    with np.errstate(invalid="ignore"):  # of +inf and -inf there is none
+    """The mean; values are divided first, as their sum may overflow."""
+    with np.errstate(invalid="ignore"):  # +inf and -inf have no mean
         return float((values / values.size).sum()) if values.size else None
 
 
 def cause_entry(cause: Cause) -> dict[str, Any]:
-    """Why a requirement is violated."""
+    """The cause of a violation as JSON values."""
     first = cause.readings[0] if cause.readings else None
     return {
         "signal": None if first is None else first.signal,
@@ -111,7 +111,7 @@ def cause_entry(cause: Cause) -> dict[str, Any]:
 
 
 def junit(outcomes: Sequence[Outcome]) -> str:
-    """The document."""
+    """The JUnit XML document."""
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites{_counts(outcomes)}>"]
     for outcome in outcomes:
         lines += _suite(outcome)

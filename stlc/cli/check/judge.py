@@ -32,7 +32,7 @@ _TIME = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]+)")
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked of every trace.
+    """Options that apply to every trace.
 
     Attributes:
         spec: path of a specification; None takes the one in the trace.
@@ -40,11 +40,11 @@ class Question:
         names: specification's name of a signal -> its name in the trace.
         require: names of the requirements; none means all.
         at: `0`, `all`, a sample or a time; None leaves it to the requirements.
-        end: what to do where a trace is too short.
+        end: treatment of traces that are too short.
         tolerance: a robustness of at least minus this is satisfied.
-        resample: put the signals on a grid of so many seconds.
+        resample: time step of the grid for resampling, seconds.
         overrides: constant -> its value, as text.
-        semantics: of the robustness that is told.
+        semantics: of the reported robustness.
         dt: seconds between samples that have no clock.
         max_gap: the longest gap between samples, in seconds, in which signals are known.
     """
@@ -92,7 +92,7 @@ def usage(message: str, *advice: str) -> UsageError:
 
 
 def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
-    """`["x=px"]` as `{"x": "px"}`. Raises UsageError (U101) for what is of another form."""
+    """`["x=px"]` as `{"x": "px"}`. Raises UsageError (U101) for any other form."""
     names: dict[str, str] = {}
     for pair in pairs or ():
         signal, sign, name = (part.strip() for part in pair.partition("="))
@@ -105,10 +105,10 @@ def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
 
 
 def judge(name: str, question: Question, runs: Path, *, talk: bool) -> Checked:
-    """Load, judge and explain one trace; where `talk` says so, tell which one it is and what is to be said.
+    """Load, judge and explain one trace; with `talk`, print which trace it is, and remarks.
 
     Raises:
-        StlcError: of whatever kind fits.
+        StlcError: the trace or the specification is invalid, or they do not fit.
     """
     result, said = judged(found(name, runs), question)
     if talk:
@@ -127,13 +127,13 @@ def found(name: str, runs: Path) -> Path:
 
 
 def taken(name: str, runs: Path) -> list[str]:
-    """What is to be said about where a trace was found."""
+    """Remark on a trace that was found in a run folder."""
     path = found(name, runs)
     return [] if path == Path(name) else [f"taking {path}, of the newest run"]
 
 
 def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
-    """The result for one file, and what is to be said about it."""
+    """The result for one file, and remarks."""
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.report import explain_all
     from stlc.trace import read_recording
@@ -143,7 +143,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     source, note = specification(recording.name, question.spec, carried)
     monitor = monitor_of(source, question, carried)
     trace = laid_out(recording, monitor, question)
-    del recording  # what was converted is not kept twice
+    del recording  # do not keep converted signals twice
     verdict = monitor.check(
         trace,
         at=instant(question.at, trace),
@@ -156,7 +156,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
 
 
 def spoken(question: Question) -> tuple[str, ...]:
-    """The words of the command line that say how a trace is read and judged."""
+    """The command-line options that determine how a trace is read and judged."""
     words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
@@ -171,14 +171,14 @@ def spoken(question: Question) -> tuple[str, ...]:
 
 
 def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:
-    """The trace of a file, renamed and resampled as was asked."""
+    """The trace of a file, with renamed and resampled signals."""
     from stlc.trace import trace_of
 
     return trace_of(recording, laid_reading(monitor, question))
 
 
 def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
-    """How files are read: names and the grid; what a signal's values mean, where there is a monitor."""
+    """Reading options of files: names and grid; with a monitor also the types of signals."""
     from stlc.monitor.reading import reading_of
     from stlc.trace import Reading
 
@@ -187,12 +187,12 @@ def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
 
 
 def _below(path: Path) -> Path:
-    """Relative to the working folder where it is below it."""
+    """The path relative to the working folder if it lies below it."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
-    """The specification to judge the trace `name` by, which carries one, and what is to be said about it."""
+    """The specification for the trace `name`: the given one, else the one it carries; and a remark."""
     if spec is not None:
         return read_source(find_spec(spec)), ""
     if not carried.text:
@@ -210,10 +210,10 @@ def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Sourc
 
 
 def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
-    """The monitor for a specification; the same for every trace that carries the same one.
+    """The monitor of a specification, cached for traces with the same one.
 
-    `carried` says what a trace keeps of imported files and of constants that were set; where the
-    specification was given as a file, only the question counts.
+    `carried` holds the imported files and set constants stored in a trace; it is ignored if the specification
+    was given as a file.
     """
     library: Mapping[str, str] = {}
     changed = question.overrides
@@ -245,10 +245,10 @@ def instant(text: str | None, trace: Trace) -> At:
 
 
 def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
-    """The same of a trace that runs from `t0` on; None: nobody knows how long.
+    """The same for a trace that starts at `t0`; `samples` None: of unknown length.
 
     Raises:
-        UsageError: U101, it is no instant, or the trace has no sample then.
+        UsageError: U101, it is not an instant, or the trace has no sample there.
     """
     if text is None or text == "all":
         return "all" if text else None
@@ -273,7 +273,7 @@ def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int |
 
 
 def time_step(option: str, text: str | None) -> float | None:
-    """The seconds that an option gives as a step. Raises UsageError (U101)."""
+    """Parse a time step in seconds. Raises UsageError (U101)."""
     if text is None:
         return None
     seconds = _seconds(option, text, "a time with its unit: 0.1s, 20ms")

@@ -1,4 +1,4 @@
-"""Many traces: judged side by side, summed up in a table."""
+"""Several traces: judged in parallel, summarised in a table."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.stopping import leaving
 
 SMALL = 1_000_000
-"""Bytes: no file of less unpacks to more than fits into memory."""
+"""File size in bytes below which the unpacked content always fits into memory."""
 
 
 def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
-    """The outcomes in order; with several jobs, from as many processes.
+    """The outcomes in order, computed by `jobs` processes.
 
-    One file that cannot be judged raises; among several it is an outcome.
+    A single file that cannot be judged raises; among several it gives an outcome with errors.
     """
     if len(works) == 1:
         yield outcome_of(works[0])
@@ -39,13 +39,13 @@ def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
 
 
 def _end_all(_code: int = 0) -> None:
-    """End the processes of all jobs at once: an interrupted check asks for no more outcomes."""
+    """Kill the processes of all jobs after an interruption."""
     for process in multiprocessing.active_children():
         process.kill()
 
 
 def safe_outcome(work: Work) -> Outcome:
-    """The outcome, of a file that cannot be judged too."""
+    """The outcome of a file; errors become part of it."""
     try:
         return outcome_of(work)
     except StlcError as error:
@@ -54,7 +54,7 @@ def safe_outcome(work: Work) -> Outcome:
 
 
 def outcome_of(work: Work) -> Outcome:
-    """Judge one file. Raises StlcError where that cannot be done."""
+    """Judge one file. Raises StlcError if that fails."""
     from stlc.cli.check.document import entry_of
     from stlc.cli.check.text import describe_result, rows_of
 
@@ -86,7 +86,7 @@ def outcome_of(work: Work) -> Outcome:
 
 
 def _too_large(path: Path) -> bool:
-    """Whether a file is better read in pieces; a small one never is, however well it is compressed."""
+    """Whether a file should be read in chunks; never for small files, however well compressed."""
     if path.stat().st_size < SMALL:
         return False
     from stlc.trace.chunks import LARGE, size_of
@@ -98,7 +98,7 @@ def _too_large(path: Path) -> bool:
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """A line for each file, and one for all."""
+    """A table with a line for each file, and a total."""
     names = list(dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows))
     head = ("trace", "verdict", "least robustness", "requirement", "where")
     lines = [_line(outcome) for outcome in outcomes]
@@ -127,7 +127,7 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _worst(rows: Sequence[Row]) -> Row:
-    """The requirement to look at first: a violated one, then one that is not known, then the tightest."""
+    """The most important requirement: a violated one, else an inconclusive one, else the least robust."""
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
     return min(rows, key=lambda row: (order[row.status], _number(row.robustness)))
 
@@ -146,7 +146,7 @@ def _per_requirement(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 
 def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
-    """Where the robustness signals of each file go; several files need a folder. Raises UsageError (U101)."""
+    """Output paths of robustness signals; several files need a folder. Raises UsageError (U101)."""
     if out is None:
         return [None] * len(names)
     if len(names) == 1 and not out.is_dir():

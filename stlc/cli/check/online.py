@@ -1,8 +1,7 @@
-"""Traces judged sample by sample: the standard input, and files larger than memory, read in pieces.
+"""Online monitoring: the standard input, and files larger than memory, read in chunks.
 
-The lines of the standard input are a `.csv` with a header, or one JSON object each. Their time step is that
-of `--dt`, or what the first two values of `t` say, or that of the system; `--resample` lays any times
-on a grid.
+The lines of the standard input are a `.csv` with a header, or one JSON object each. The time step is that of
+`--dt`, of the first two values of `t`, or of the system; `--resample` puts any times on a grid.
 """
 
 from __future__ import annotations
@@ -42,14 +41,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What was judged.
+    """Description of a stream.
 
     Attributes:
         name: of the trace.
         source: text of the specification.
         dt: time step in seconds.
-        samples: how many there were.
-        color: reasons are printed in colours.
+        samples: their number.
+        color: print reasons in colours.
     """
 
     name: str
@@ -60,7 +59,7 @@ class Told:
 
 
 def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], seconds: float) -> Outcome:
-    """The outcome of a stream that is over. Raises TraceError as `Online.finish`."""
+    """The outcome of a finished stream. Raises TraceError as `Online.finish`."""
     tallies = online.finish()
     status = status_of(online, tallies)
     causes = {
@@ -88,7 +87,7 @@ def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], second
 
 
 def status_of(online: Online, tallies: Mapping[str, Tally]) -> Status:
-    """Over all requirements."""
+    """Status over all requirements."""
     if online.in_scope is False:
         return "out of scope"
     found = {tally.status for tally in tallies.values()}
@@ -123,7 +122,7 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
 
 
 def _gap_texts(online: Online) -> dict[str, str]:
-    """Samples that are unknown, a line a signal."""
+    """Unknown samples, one line per signal."""
     return {
         name: gap_text(name, gap, online.samples, (_moment(online, gap.first), _moment(online, gap.last)))
         for name, gap in online.gaps.items()
@@ -225,11 +224,11 @@ CLOCK = "t"
 
 
 def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
-    """Judge the standard input; where `talk` says so, print verdicts as soon as they are decided.
+    """Judge the standard input; with `talk`, print verdicts as soon as they are decided.
 
     Raises:
         UsageError: U101, no specification, or an option that needs the whole trace.
-        TraceError: a line that is no sample, or signals that are missing or not finite.
+        TraceError: a line is not a sample, or signals are missing or not finite.
     """
     from stlc.trace.live import MAX_LINE, SampleStream, on_grid
 
@@ -270,10 +269,10 @@ def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
 
 
 def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversion]:
-    """Conversions of recorded numbers whose unit is another one than is declared.
+    """Conversions of recorded numbers to the declared units, where these differ.
 
     Raises:
-        TraceError: E605, a unit that is none, or of something else.
+        TraceError: E605, an invalid unit, or one of another dimension.
     """
     from stlc.monitor.signals import conversion
     from stlc.units import CELSIUS, means_celsius, parse_unit
@@ -295,13 +294,13 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
 
 
 def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
-    """The sample in the units that are declared, and its time."""
+    """The sample in declared units, and its time."""
     converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}
 
 
 def _tell(decision: Decision, online: Online) -> None:
-    """A violation always; that a requirement is satisfied only where it is judged once."""
+    """Print a violation always, satisfaction only of a requirement that is judged once."""
     repeated = online.repeats(decision.requirement)
     if decision.status == "satisfied" and repeated:
         return
@@ -314,11 +313,11 @@ def _tell(decision: Decision, online: Online) -> None:
 
 
 CHUNK = 250_000
-"""Samples that are read at a time."""
+"""Samples per chunk."""
 
 
 def outcome_in_chunks(path: Path, work: Work) -> Outcome:
-    """Judge a file in pieces.
+    """Judge a file in chunks.
 
     Raises:
         UsageError: U101, an option that needs the whole trace.
@@ -346,7 +345,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
 
 
 def _require_pieces(path: Path, work: Work) -> None:
-    """Refuse what needs all samples at once."""
+    """Raise UsageError for options that need all samples at once."""
     question = work.question
     whole = {
         "--resample": question.resample is not None,

@@ -48,7 +48,7 @@ Chunk = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """How traces are read, and by what they are judged."""
+    """Options on reading and judging of traces."""
 
     spec: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
@@ -77,7 +77,7 @@ class Traces:
     runs: RunsOption = Path("runs")
 
     def question(self, **more: Any) -> Question:
-        """What is asked of every trace; `more` are further fields of it. Raises UsageError (U101)."""
+        """The options as a `Question`; `more` are further fields of it. Raises UsageError (U101)."""
         asked = {
             "spec": self.spec,
             "system": self.system,

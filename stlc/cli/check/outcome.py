@@ -1,4 +1,4 @@
-"""Results of `stlc check`: a trace that was judged, what is told of it, and the exit code."""
+"""Results of `stlc check`: judged traces, their rows and texts, and the exit code."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Row:
     Attributes:
         name: of the requirement.
         status: its verdict.
-        robustness: the least, as text.
-        where: trace and time of it, as text.
+        robustness: the least one, as text.
+        where: trace and time of the least robustness, as text.
         why: one line for a requirement that is not satisfied.
     """
 
@@ -51,21 +51,21 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A file that was judged, or could not be.
+    """Result of one file, judged or not.
 
     Attributes:
         name: of the file.
         status: over all traces and requirements.
         rows: one for each requirement.
-        text: everything as it is printed.
+        text: printed form of everything.
         entry: the same for a JSON document.
-        traces: how many count.
+        traces: number of traces in scope.
         holds: share of the starts at which all requirements hold.
         fails: share of the starts at which one is violated.
-        seconds: how long it took.
+        seconds: run time.
         warnings: of the compiler.
-        said: what is to be said besides.
-        errors: why the file could not be judged.
+        said: further remarks.
+        errors: reasons for which the file could not be judged.
         exit_code: that of the errors.
     """
 
@@ -87,7 +87,7 @@ class Outcome:
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
     """0 satisfied, 1 violated, 4 inconclusive; with `fail_under` the share of satisfied starts decides.
 
-    A file that cannot be judged outweighs every answer. Traces out of scope count for nothing.
+    A file that cannot be judged takes precedence over every verdict. Traces out of scope do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:
@@ -98,7 +98,7 @@ def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> i
 
 
 def overall(outcomes: Sequence[Outcome]) -> Status:
-    """Over all files that count."""
+    """Status over all files in scope."""
     found = {outcome.status for outcome in outcomes if not outcome.errors}
     if "violated" in found:
         return "violated"
@@ -118,14 +118,14 @@ def _by_share(outcomes: Sequence[Outcome], least: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A trace, by what it was judged, and the result.
+    """A judged trace: its specification, verdict and causes.
 
     Attributes:
         trace: as read, signals renamed.
         source: text of the specification.
         verdict: per requirement.
-        causes: violated requirement -> why.
-        asked: the words of the command line that say how it was read and judged.
+        causes: violated requirement -> causes.
+        asked: the command-line options of reading and judging.
     """
 
     trace: Trace
@@ -140,6 +140,6 @@ class Checked:
         return self.verdict.subject.compiled.warnings
 
     def needs(self, judged: Judgement) -> tuple[float, float]:
-        """Seconds of signal that the judged instants of a requirement need, and seconds that there are."""
+        """Seconds of signal that the judged instants of a requirement need, and available seconds."""
         last = judged.start + judged.instants - 1 + judged.rule.reach
         return last * self.trace.dt, (self.trace.samples - 1) * self.trace.dt

@@ -1,4 +1,4 @@
-"""What `stlc check` prints: a table, and for each violated requirement the place and the reason."""
+"""Output of `stlc check`: a table, and the place and reason of each violation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stlc.monitor.prepared import beside, gap_text
 
 
 def describe_result(result: Checked, *, color: bool) -> str:
-    """Everything about one trace."""
+    """The printed result of one trace."""
     return "\n".join(_parts(result, color))
 
 
@@ -84,19 +84,19 @@ def _robustness(judged: Judgement, result: Checked) -> str:
 
 
 def in_unit(value: str, unit: str) -> str:
-    """A robustness with its unit, where it has one: `+1.500 m`."""
+    """A robustness with its unit, if any: `+1.500 m`."""
     return f"{value} {visible(unit)}".rstrip()
 
 
 def signed(value: float) -> str:
-    """A robustness, three digits behind the point, or what there is of a tiny or a huge one."""
+    """A robustness with three decimals, or in scientific notation if tiny or huge."""
     if math.isfinite(value) and (0 < abs(value) < 0.0005 or abs(value) >= 1e9):
         return f"{value:+.1e}"
     return f"{value:+.3f}"
 
 
 def percent(share: float) -> str:
-    """Rounded so that only all is 100 %, and only nothing 0 %."""
+    """A percentage; only 1 is shown as 100 %, and only 0 as 0 %."""
     percent = 100 * share
     if 0 < percent < 0.1 or 99.9 < percent < 100:
         return "< 0.1 %" if percent < 1 else "> 99.9 %"
@@ -117,7 +117,7 @@ def _where(judged: Judgement, result: Checked) -> str:
 
 
 def rows_of(result: Checked) -> tuple[Row, ...]:
-    """The table as data, with a reason for what is not satisfied."""
+    """The rows of the table, with a reason for each unsatisfied requirement."""
     return tuple(
         Row(
             judged.name,
@@ -160,7 +160,7 @@ def _count(judged: Judgement, verdict: Verdict) -> str:
 
 
 def _gaps(result: Checked) -> list[str]:
-    """Samples that are needed and unknown, a line a signal."""
+    """Needed but unknown samples, one line per signal."""
     return [f"  {text}" for text in _gap_texts(result).values()]
 
 
@@ -206,6 +206,6 @@ def _summary_of(verdict: Verdict, traces: int) -> str:
 
 
 def _run_of(result: Checked) -> str | None:
-    """The run whose folder holds the trace."""
+    """The run whose folder contains the trace, if any."""
     folder = Path(result.trace.name).parent
     return str(folder) if (folder / "run.json").is_file() else None

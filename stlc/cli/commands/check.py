@@ -1,4 +1,4 @@
-"""`stlc check`: recorded traces in, a verdict per requirement and its reasons out."""
+"""`stlc check`: verdicts on recorded traces, per requirement and with reasons."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def check(
 ) -> None:
     """Judge recorded traces: verdicts, and the reasons of violations.
 
-    A trace is looked up as given, then in the newest run. It carries its specification, and constants
-    that were set; a specification before it, or --spec, is taken instead. With - the samples come from
-    the standard input, as a table with a header or as JSON, one a line. A file that is larger than memory
-    is judged in pieces. Exit code: 0 all satisfied, 1 violated,
-    4 a trace is too short to say; with -q nothing else is said.
+    A trace is searched as given, then in the newest run. It is judged by the specification stored in it, with
+    its constants, unless a specification precedes it or --spec is given. With - the samples come from the
+    standard input, as CSV with a header or as one JSON object per line. A file larger than memory is judged
+    in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with -q nothing is
+    printed.
     """
     from stlc.cli.check.many import all_outcomes, out_paths
     from stlc.cli.check.outcome import exit_code
@@ -93,7 +93,7 @@ def _stream(traces: Sequence[str], question: Question, *, talk: bool) -> Outcome
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
-    """What is to be said, what is not satisfied in full, and of several files a table."""
+    """Print remarks, unsatisfied results in full, and a table if there are several files."""
     from stlc.cli.check.many import summary
 
     told = set()
@@ -136,7 +136,7 @@ def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
-    """The specification, if one stands in front, and the traces."""
+    """The specification, if the first file is one, and the traces."""
     specs = [name for name in files if Path(name).suffix in _SPECS]
     traces = [name for name in files if name not in specs]
     if len(specs) > 1 or (specs and spec is not None):

@@ -1,4 +1,4 @@
-"""`stlc compile`: a specification as the solver sees it, or its syntax tree."""
+"""`stlc compile`: the compiled form of a specification, or its syntax tree."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def compile_(
     watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a specification as the solver sees it, or its syntax tree.
+    """Show the compiled form of a specification, or its syntax tree.
 
-    Each interval in seconds and in steps, added states, the safety part, the horizon. With --show ast the
-    syntax tree, with --show dot the same for Graphviz: syntax only, names, types and units are looked at by
-    `stlc lint`.
+    Intervals in seconds and in steps, added states, the safety part, the horizon. --show ast prints the
+    syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc lint` also names, types
+    and units.
     """
     from stlc.diagnostics import Diagnostic, StlcError, UsageError
 
@@ -69,7 +69,7 @@ def compile_(
 
 
 def _trees(names: Sequence[str], show: Part, *, as_json: bool) -> None:
-    """Print syntax trees; the findings of all files that have none are raised together."""
+    """Print syntax trees; the syntax errors of all files are raised together."""
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
@@ -92,7 +92,7 @@ def _trees(names: Sequence[str], show: Part, *, as_json: bool) -> None:
 
 
 def _files(spec: Path, system: str | None) -> list[str]:
-    """The specification, and the system file as far as it can be found now."""
+    """The files to watch: the specification, and the system file if it is found."""
     from stlc.diagnostics import StlcError
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
@@ -128,7 +128,7 @@ def _show(
 def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
     """Read both files and run the compiler; torch is not needed.
 
-    The specification by which a system has its closed-loop runs judged is compiled for recorded traces.
+    A specification that judges closed-loop runs of its system is compiled for recorded traces.
     """
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
@@ -175,7 +175,7 @@ def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
 
 
 def _parameter(each: typed.Parameter) -> dict[str, Any]:
-    """A parameter that the system does not carry."""
+    """A parameter that the compiler adds to the state."""
     column = each.column
     return {
         "name": column.name,
@@ -187,7 +187,7 @@ def _parameter(each: typed.Parameter) -> dict[str, Any]:
 
 
 def _added(timer: Timer) -> dict[str, Any]:
-    """A state that the compiler adds."""
+    """A timer that the compiler adds to the state."""
     return {
         "name": timer.name,
         "kind": timer.kind,

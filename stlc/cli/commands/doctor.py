@@ -1,4 +1,4 @@
-"""`stlc doctor`: what is installed, what is missing, and what that means."""
+"""`stlc doctor`: installed and missing packages, and their consequences."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One checked item.
 
     Attributes:
         name: of it.
-        state: "off" is a thing that is only needed for some commands.
-        detail: a version, a path, or what to do.
+        state: "off" for a missing item that only some commands need.
+        detail: a version, a path, or advice.
     """
 
     name: str
@@ -43,9 +43,9 @@ def doctor(
     quick: Annotated[bool, typer.Option("--quick", help="Do not import torch to look for devices.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look at the installation: versions, devices, packages.
+    """Check the installation: versions, devices, packages.
 
-    Completion of the shell too. Exit code: 0, or 5 if something that is always needed is missing.
+    Shell completion too. Exit code: 0, or 5 if a required package is missing.
     """
     findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools()]
     missing = [finding.name for finding in findings if finding.state == "missing"]
@@ -78,7 +78,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _optional() -> dict[str, str]:
-    """Package -> the extra that brings it, from the metadata of stlc itself."""
+    """Package -> the extra that installs it, from the metadata of stlc."""
     from importlib.metadata import PackageNotFoundError, requires
 
     try:
@@ -130,7 +130,7 @@ def _tools() -> Iterator[Finding]:
 
 
 def _cache() -> Finding:
-    """Where kernels and the tables of the parser are kept between commands."""
+    """The cache folder of kernels and parser tables."""
     from stlc.cache import Unusable, opened, why_not
 
     try:
@@ -146,7 +146,7 @@ def _cache() -> Finding:
 
 
 def _compiler() -> Finding:
-    """Whether plans are judged and searched for as C, or by torch; and what was remembered of failures."""
+    """Whether plans are evaluated by C kernels or by torch, and remembered failures of the compiler."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()

@@ -53,8 +53,8 @@ def explain(
     """Explain a code, a specification, or the violations of a trace.
 
     A code's page has a wrong and a right example; without an argument all codes are listed. `precedence`
-    tells how operators bind. A specification is told in English, requirement by requirement. Of a trace
-    each violated requirement is traced back to the sub-formula, the instant, the signal and its value.
+    shows how operators bind. A specification is translated into English, requirement by requirement. For a
+    trace, each violation is traced back to the sub-formula, the instant, the signal and its value.
     """
     if guarantee:
         _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_), as_json=as_json)
@@ -160,7 +160,7 @@ class Example:
 
     Attributes:
         language: `stl`, `yaml`, `csv` or `console`.
-        notes: `wrong`, `right`, and what else stands behind the language.
+        notes: `wrong`, `right`, and other words after the language.
         body: the text.
     """
 
@@ -178,14 +178,14 @@ class Page:
 
     @property
     def examples(self) -> tuple[Example, ...]:
-        """The blocks, in order."""
+        """The example blocks, in order."""
         return tuple(
             Example(match["language"], tuple(match["notes"].split()), match["body"])
             for match in _FENCE.finditer(self.text)
         )
 
     def having(self, note: str) -> tuple[Example, ...]:
-        """The blocks with this note."""
+        """The example blocks with this note."""
         return tuple(example for example in self.examples if note in example.notes)
 
 
@@ -199,7 +199,7 @@ def read_page(name: str) -> Page | None:
 
 
 def in_terminal(page: Page) -> str:
-    """The page as plain text: blocks indented, marks taken away."""
+    """The page as plain text: blocks indented, mark-up removed."""
     return "\n".join([page.title, "", *_plain_lines(page.text)]).rstrip() + "\n"
 
 

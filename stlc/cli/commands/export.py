@@ -1,4 +1,4 @@
-"""`stlc export`: a trained controller to take away."""
+"""`stlc export`: a trained controller for other programs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def export(
 ) -> None:
     """Export a trained controller, monitor included.
 
-    `torch` is a torch.export program: states in, plans and their robustness out. `c` is one C99 header
-    that needs nothing but libm, with the backup policy inside, and an example program. `onnx` are graphs
-    for onnxruntime, which `stlc.runtime` drives without torch, the backup policy included. What is
-    written has been checked against the run on random states.
+    `torch` is a torch.export program: states in, plans and their robustness out. `c` is a C99 header that
+    depends only on libm and includes the backup policy, with an example program. `onnx` are graphs for
+    onnxruntime, run by `stlc.runtime` without torch, the backup policy included. Every export is checked
+    against the run on random states.
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write

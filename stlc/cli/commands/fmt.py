@@ -1,4 +1,4 @@
-"""`stlc fmt`: the one layout of a specification."""
+"""`stlc fmt`: the standard layout of specifications."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Formatted:
 
     @property
     def differs(self) -> bool:
-        """Whether there is something to change."""
+        """Whether formatting changes the text."""
         return self.before != self.after
 
 
@@ -41,11 +41,11 @@ def fmt(
     diff: Annotated[bool, typer.Option("--diff", help="Write nothing; print what would change.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Give specifications their one layout; what they mean stays.
+    """Format specifications in the standard layout; their meaning is unchanged.
 
-    Comments and groups of lines stay. Words and signs of other tools (G, &&, =>, □) become those of the
-    language; where other tools read a formula differently, parentheses are added. A second run changes
-    nothing. Exit code: 0, or 1 if --check or --diff found a difference.
+    Comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □) become those of
+    the language; parentheses are added where other tools parse a formula differently. Formatting is
+    idempotent. Exit code: 0, or 1 if --check or --diff found a difference.
     """
     names = spec_files(files or ["."])
     findings: list[Diagnostic] = []
@@ -66,7 +66,7 @@ def fmt(
 
 
 def _format(name: str, findings: list[Diagnostic]) -> _Formatted | None:
-    """Both texts of a file; None, and its findings, where it cannot be read."""
+    """Both texts of a file; None, with its findings, on syntax errors."""
     from stlc.files import read_source
     from stlc.grammar.format.format import format_text
 
@@ -90,7 +90,7 @@ def _write(results: Sequence[_Formatted], *, as_json: bool) -> None:
 
 
 def _tell(results: Sequence[_Formatted], changed: Sequence[_Formatted], *, check: bool, diff: bool) -> None:
-    """Which files differ, and how many do not."""
+    """Print which files differ, and how many do not."""
     if diff and changed:
         emit("".join(map(_diff, changed)).rstrip("\n"))
     verb = "would change" if check or diff else "changed"
@@ -103,7 +103,7 @@ def _tell(results: Sequence[_Formatted], changed: Sequence[_Formatted], *, check
 
 
 def _diff(result: _Formatted) -> str:
-    """What would change, as a unified diff."""
+    """The changes as a unified diff."""
     before, after = (text.splitlines(keepends=True) for text in (result.before, result.after))
     lines = unified_diff(before, after, f"{result.name}", f"{result.name} (formatted)")
     return "".join(

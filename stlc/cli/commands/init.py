@@ -1,4 +1,4 @@
-"""`stlc init`: a project, or one specification or system of it."""
+"""`stlc init`: create a project, or one specification or system."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 
 
 def examples(incomplete: str = "") -> list[str]:
-    """Names of all examples that begin so: those of the installed systems that specifications name."""
+    """Names of examples with a prefix: installed systems that a specification refers to."""
     found = {system.removesuffix(".yaml") for _, system in _pairs()}
     return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
 
@@ -67,11 +67,11 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Begin a project, or a specification or system of one.
+    """Create a project, or one specification or system.
 
-    The example trains in a minute. Settings of git and of the editor come with it. Nothing that is there is
-    overwritten unless --force is given. --spec and --system write one file, into `specs/` and `systems/`
-    where there are such folders.
+    The example trains in a minute; settings for git and the editor are included. Existing files are
+    overwritten only with --force. --spec and --system write one file, into `specs/` and `systems/` if these
+    folders exist.
     """
     if sum(given is not None for given in (example, spec, system)) > 1:
         raise UsageError(Diagnostic("U101", "`--example`, `--spec` and `--system` contradict each other"))
@@ -100,7 +100,7 @@ def init(
 
 
 def _require_new(paths: Iterable[Path], *, force: bool) -> None:
-    """Raise UsageError (U101) if one of the files is there already, unless `force` is given."""
+    """Raise UsageError (U101) if one of the files exists, unless `force` is given."""
     there = [str(path) for path in paths if path.exists()]
     if there and not force:
         verb = "is" if len(there) == 1 else "are"
@@ -112,7 +112,7 @@ def _require_new(paths: Iterable[Path], *, force: bool) -> None:
 
 
 def _project(example: str) -> dict[str, str]:
-    """Path within the project -> text. Raises UsageError (U101) where there is no such example."""
+    """Path within the project -> text. Raises UsageError (U101) if there is no such example."""
     if example == EMPTY:
         return dict(_SETTINGS)
     if example == FIRST:
@@ -122,7 +122,7 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """The command to go on with: training for the first specification that plans are made for."""
+    """The next command: training for the first specification of plans."""
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}
     for path in files:
@@ -132,7 +132,7 @@ def _following(files: Mapping[Path, str]) -> str:
 
 
 def _example_files(name: str) -> dict[str, str]:
-    """An installed system, what it needs, and its specifications: path within the project -> text."""
+    """An installed system, its dependencies and its specifications: path within the project -> text."""
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
         near = closest(name, examples())
@@ -153,7 +153,7 @@ def _example_files(name: str) -> dict[str, str]:
 
 
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
-    """Every specification (of those given) whose system is installed, and the name of that file."""
+    """The given specifications with an installed system, and the name of its file."""
     for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
         if named and (SYSTEMS / named[2]).is_file():
@@ -172,7 +172,7 @@ def _template(name: str) -> str:
 
 
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
-    """`NAME.stl` with a signal line for each state of a system, and the command to go on with."""
+    """`NAME.stl` with a signal line for each state of a system, and the next command."""
     from stlc.grammar.format.format import format_text
     from stlc.source import Source
 
@@ -188,7 +188,7 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
 
 
 def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
-    """`NAME.yaml`, and the command to go on with."""
+    """`NAME.yaml`, and the next command."""
     path = _path(folder, name, "systems", ".yaml")
     text = _template("system.yaml").format(name=path.stem)
     return {path: text}, shell(("stlc", "system", "show", operand(str(path))))
@@ -198,7 +198,7 @@ def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
     """The path as given, or in the folder of its kind.
 
     Raises:
-        UsageError: U101, it is no name of the language.
+        UsageError: U101, it is not a valid name of the language.
     """
     from stlc.grammar.words import BUILT_IN, RESERVED
 
@@ -211,11 +211,11 @@ def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
 
 
 def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
-    """A specification to begin with.
+    """The text of a new specification.
 
     Args:
         name: of the specification.
-        system: whose states are its signals.
+        system: its states become the signals.
         reference: the path of that system as the specification writes it.
     """
     if system is None:

@@ -1,4 +1,4 @@
-"""`stlc lint`: what is wrong with a specification, and what is worth a thought."""
+"""`stlc lint`: errors and warnings in specifications."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CLEAN, FOUND, INVALID = 0, 1, 3
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What to do with every file."""
+    """Options for every file."""
 
     selection: Selection
     system: str | None
@@ -38,7 +38,7 @@ class _Job:
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """What was found and repaired."""
+    """Findings and number of repairs."""
 
     files: tuple[str, ...]
     findings: tuple[Diagnostic, ...]
@@ -70,11 +70,11 @@ def lint(
     watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what is wrong with specifications, or worth a thought.
+    """Report errors and warnings in specifications.
 
-    Syntax, types, units, parentheses, unused names, requirements that say nothing; with --system also
-    what only the system knows. Exit code: 0 nothing wrong, 1 warnings and --strict, 3 errors. `stlc
-    explain CODE` says what a code means.
+    Syntax, types, units, parentheses, unused names, vacuous requirements; with --system also checks against
+    the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors. `stlc explain CODE` says what a
+    code means.
     """
     from stlc.lint.lint import Selection
 
@@ -108,7 +108,7 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 
 def _look(names: Sequence[str], job: _Job) -> _Result:
-    """Lint every file, repairing it first where that is wanted."""
+    """Lint every file, after repairing it if requested."""
     from stlc.files import find_spec, read_source
 
     findings: list[Diagnostic] = []
@@ -126,7 +126,7 @@ def _look(names: Sequence[str], job: _Job) -> _Result:
 
 
 def _one(source: Source, job: _Job) -> tuple[int, Sequence[Diagnostic]]:
-    """How much of a file was repaired, and what is left to say."""
+    """Number of repairs in a file, and the remaining findings."""
     from stlc.files import write_atomic
     from stlc.lint.lint import fix
     from stlc.lint.lint import lint as lint_text
@@ -145,7 +145,7 @@ def _one(source: Source, job: _Job) -> tuple[int, Sequence[Diagnostic]]:
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """The system to look with; without one nothing of it is read."""
+    """Load the system to check against; None without one."""
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
@@ -182,7 +182,7 @@ def _show(result: _Result, layout: Format, code: int) -> None:
 
 
 def _summary(result: _Result) -> str:
-    """The last line: how many findings, in how many files, and what to do next."""
+    """The last line: numbers of findings and files, and the next step."""
     count = {"error": 0, "warning": 0}
     for finding in result.findings:
         count[finding.severity] += 1

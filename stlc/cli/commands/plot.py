@@ -1,4 +1,4 @@
-"""`stlc plot`: what was recorded, and the robustness of each requirement beneath it."""
+"""`stlc plot`: recorded signals, with the robustness of each requirement below."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def plot(
     reading: given.Traces = given.TRACES,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw signals, and the robustness of requirements beneath them.
+    """Draw signals, and below them the robustness of the requirements.
 
-    A run stands for the trace in its folder. The worst and a typical trace are shown unless --trace names
-    one. With --places all paths are drawn over the places of the requirements: `[x, y] in dock` names
-    one. The suffix of -o says what is written: .svg, .png or .pdf.
+    For a run, the trace in its folder is drawn. The worst and a typical trace are shown unless --trace
+    selects one. With --places all paths are drawn over the regions of the requirements, such as `dock` in
+    `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
     from stlc.cli.check.judge import laid_out, monitor_of, specification
     from stlc.trace import read_recording
@@ -86,7 +86,7 @@ def plot(
 
 
 def _find(what: str, runs: Path) -> Path:
-    """The trace called `what`, or that of the run called `what`."""
+    """Find the trace called `what`, or that of the run called `what`."""
     from stlc.files import find_trace
     from stlc.rundir import RunDir
 
@@ -119,7 +119,7 @@ def _target(output: Path | None, trace: Path) -> Path:
 
 
 def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
-    """The trace with the units that the specification declares, where the file has none."""
+    """The trace with the declared units of the specification where the file has none."""
     from stlc.grammar import ast
     from stlc.signature import Signature
     from stlc.units import parse_unit
@@ -144,7 +144,7 @@ def _one(trace: Trace, wanted: int | None) -> Trace:
 
 
 def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
-    """Paths over the places of the requirements. Raises UsageError U101 where they name none."""
+    """Paths over the regions of the requirements. Raises UsageError (U101) if they name none."""
     from stlc.view.chart import chart_of, draw_chart
 
     chart = chart_of(monitor.spec, monitor.check(trace, require=wanted), trace)

@@ -1,4 +1,4 @@
-"""`stlc report`: the page that shows a run."""
+"""`stlc report`: the HTML report of a run."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def report(
 ) -> None:
     """Write a self-contained report.html with the pictures of a run.
 
-    It goes into the run's folder: training curves, signals with the robustness of each requirement, and
-    the animation of a simulation, as far as the run has them. The page opens without a network.
+    It is written to the run's folder: training curves, signals with the robustness of each requirement, and
+    the animation of a simulation, if available. The page needs no network.
     """
     from stlc.rundir import RunDir
     from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended

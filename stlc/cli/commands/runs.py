@@ -51,7 +51,7 @@ def list_(
 
 @subcommand(GROUP, "show", "stlc runs show latest")
 def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) -> None:
-    """Show what a run was, and what came of it."""
+    """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
     files = sorted(str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if path.is_file())
@@ -73,9 +73,9 @@ def diff(
     runs: _Runs = RUNS,
     as_json: JsonOption = False,
 ) -> None:
-    """Say in what two runs differ: options, inputs, results.
+    """Show the differences of two runs: options, inputs, results.
 
-    Exit code: 0, or 1 if they do.
+    Exit code: 0, or 1 if they differ.
     """
     one, other = RunDir.open(first, runs), RunDir.open(second, runs)
     facts = differences(flattened(one.record()), flattened(other.record()))
@@ -105,7 +105,7 @@ def rm(
 ) -> None:
     """Remove the folders of runs.
 
-    A run that is still going needs --force. The links to the newest run follow.
+    A running one needs --force. The links to the newest run are updated.
     """
     from stlc.rundir import remove_run
 
@@ -125,7 +125,7 @@ def rm(
 
 
 def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """A record as `key.sub` -> text."""
+    """A nested record as `key.sub` -> text."""
     flat: dict[str, str] = {}
     for key, value in record.items():
         if isinstance(value, Mapping):
@@ -171,7 +171,7 @@ class Row:
         return float(value) if isinstance(value, int | float) else None
 
     def cells(self) -> tuple[str, ...]:
-        """As text."""
+        """Table cells as text."""
         record, accuracy = self.record, self.accuracy
         result = record.get("result")
         seconds = result.get("seconds") if isinstance(result, Mapping) else None
@@ -186,13 +186,13 @@ class Row:
         )
 
     def values(self) -> dict[str, Any]:
-        """For JSON."""
+        """The row as JSON values."""
         kept = {key: self.record.get(key) for key in ("spec", "system_path", "steps", "seed", "started")}
         return {"run": self.run, "path": self.path, "status": self.status, "accuracy": self.accuracy, **kept}
 
 
 def overview(root: Path, sort: str) -> list[Row]:
-    """All runs below a folder; a damaged one is listed, not raised."""
+    """All runs below a folder; a damaged one is listed instead of raising an error."""
     rows = [_row(run) for run in every_run(root)]
     if sort == "acc":
         return sorted(rows, key=lambda row: -1.0 if row.accuracy is None else row.accuracy)
@@ -209,6 +209,6 @@ def _row(run: RunDir) -> Row:
 
 
 def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """(key, value, other value) where two flat records differ; times of day are left out."""
+    """(key, value, other value) where two flat records differ; timestamps are left out."""
     keys = [key for key in {**one, **other} if key not in _VOLATILE]
     return [(key, one.get(key, ""), other.get(key, "")) for key in keys if one.get(key) != other.get(key)]

@@ -1,4 +1,4 @@
-"""`stlc schema`: what the JSON documents of the commands look like."""
+"""`stlc schema`: JSON Schemas of the commands' documents."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def schema(
         str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
     ] = None,
 ) -> None:
-    """Print the JSON Schema of what --json prints, or list them.
+    """Print the JSON Schema of a command's --json output, or list all.
 
-    Within a major number schemas only grow.
+    Within a major version keys are only added.
     """
     if name is None:
         emit("\n".join(names()))
@@ -40,7 +40,7 @@ def names() -> list[str]:
 
 
 def load_schema(name: str) -> dict[str, Any]:
-    """The schema of a whole document: the frame that all have, and the result of one command.
+    """The schema of a whole document: the common frame, and the result of one command.
 
     Raises:
         UsageError: U101, there is no such schema.

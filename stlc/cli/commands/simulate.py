@@ -1,4 +1,4 @@
-"""`stlc simulate`: a trained policy in closed loop, in the world of its system."""
+"""`stlc simulate`: closed-loop runs of a trained policy in the world of its system."""
 
 from __future__ import annotations
 
@@ -45,30 +45,30 @@ GUARDS: dict[Mode, tuple[Mode, ...]] = {
 
 GuardOption = Annotated[
     str | None,
-    typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
+    typer.Option(metavar="none|paper|full", help="Guard of the policy; `full` repairs plans first."),
 ]
 LimitOption = Annotated[
     str | None,
     typer.Option(
         metavar="TIME",
-        help="Of a guard's decision, per agent, or `none`; 100ms for the full guard if not given.",
+        help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
     ),
 ]
 
-WindowsOption = Annotated[bool, typer.Option("--windows", help="Show how plans fared window by window, too.")]
+WindowsOption = Annotated[bool, typer.Option("--windows", help="Also show the verdict on plans per window.")]
 MarginOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="M|NAME=M|auto",
-        help="What a guard asks safety requirements to spare; repeatable. `auto` measures it.",
+        help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
     ),
 ]
 RecordOption = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz, .csv, .mcap).")
+    Path | None, typer.Option(metavar="FILE", help="Also write the trace to this file (.npz, .csv, .mcap).")
 ]
 ScenarioOption = Annotated[
     str | None,
-    typer.Option(metavar="NAME", help="An overlay of the system file; all of them, or `disturbed`."),
+    typer.Option(metavar="NAME", help="An overlay of the system file, `all` of them, or `disturbed`."),
 ]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")]
 MarginsOption = Annotated[
@@ -76,7 +76,7 @@ MarginsOption = Annotated[
     typer.Option(
         "--robustness",
         metavar="FILE",
-        help="Write robustness margins there, a JSON object per agent and step; `-` prints them.",
+        help="Write robustness margins to it, a JSON object per agent and step; `-` prints them.",
     ),
 ]
 
@@ -94,9 +94,7 @@ def simulate(
     ] = None,
     guard: GuardOption = None,
     time_limit: LimitOption = None,
-    ceiling: Annotated[
-        int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
-    ] = 0,
+    ceiling: Annotated[int, typer.Option(min=0, help="Visited states to check for a feasible plan.")] = 0,
     margin: MarginOption = None,
     seeds: SeedsOption = "0..9",
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
@@ -115,12 +113,11 @@ def simulate(
 ) -> None:
     """Deploy a trained policy in the world of its system.
 
-    The newest run unless one is named. With --backup the paper's backup policy guards it, and the same
-    seeds are driven without it too, to compare. Trace, scene and figures go into the run's folder.
-    Drives, one agent over one seed each, are judged by the specification that the system names (test:
-    judge). Means over seeds come with 95 % intervals (Student's t). Every system has the scenarios
-    mismatch, disturb and noise, also with a number of per cent (mismatch-20); --scenario disturbed drives
-    them all.
+    The newest run by default. With --backup the paper's backup policy guards it, and the same seeds are
+    simulated without it for comparison. Trace, scene and figures are written to the run's folder. Drives
+    (closed-loop runs, one agent over one seed each) are judged by the specification that the system names
+    (test: judge). Means over seeds have 95 % intervals (Student's t). Every system has the scenarios
+    mismatch, disturb and noise, also with a percentage (mismatch-20); --scenario disturbed runs them all.
     """
     chosen = _guard(backup, guard)
     printed = _printed(json=json, margins=margins)
@@ -145,7 +142,7 @@ def simulate(
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
     document = _all(order, several) if several else _driven(order, scenario)
     code = 1 if fail_under is not None and _satisfied(document, chosen) < fail_under else 0
-    if not json:  # before the pictures: they must not change what was measured
+    if not json:  # before the pictures, so that they do not affect the measurements
         _print(screen(document, windows=windows), printed)
     drawn = _pictures(opened) if pictures else {}
     if json:
@@ -156,7 +153,7 @@ def simulate(
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
-    """W604 where what is required for ever is driven for longer than the policy was judged."""
+    """W604 if an unbounded mission is simulated for longer than the policy was validated."""
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
     seconds = steps * run.task.dt
@@ -176,7 +173,7 @@ def _end(run: Run, *, window: bool, code: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """What is to be deployed and kept."""
+    """Options of a deployment."""
 
     run: Run
     guard: Mode
@@ -189,7 +186,7 @@ class _Order:
 
 
 def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
-    """Deploy without and with the guard under a scenario; margins are written where it is `kept`."""
+    """Deploy without and with the guard under a scenario; margins are written if its results are `kept`."""
     from stlc.cli.framework.output import show_diagnostics
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
@@ -211,12 +208,12 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
         except RunError as error:
             if mode == order.guard:
                 raise
-            show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
+            show_diagnostics(error.diagnostics)  # only the comparison fails: the guarded run continues
     return _save(run, replace(order, setting=setting), found, rules)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
-    """Where what a person reads goes: the standard output, unless the margins are wanted there."""
+    """Printer of readable output: to the standard output, unless margins are written there."""
     from stlc.cli.framework.output import emit, say
     from stlc.cli.simulate.watch import STANDARD_OUTPUT
 
@@ -229,7 +226,7 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
 
 
 def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
-    """The scenarios that are driven beside the deployment as it is; none where one is named."""
+    """The scenarios to simulate besides the nominal deployment; none if a single one is named."""
     from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
 
     decl = run.task.system.decl
@@ -242,18 +239,18 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _needed_system(run: Run) -> str | None:
-    """The system file that a trace cannot be judged without: functions are not in traces."""
+    """The system file if a trace needs it for judging: external functions are not stored in traces."""
     return f"{run.dir.shown}/system.yaml" if run.task.system.decl.functions else None
 
 
 def _satisfied(document: Record, guard: Mode) -> float:
-    """The share of drives that satisfy everything, the least one over all scenarios that were driven."""
+    """The share of drives that satisfy everything; the least one over all scenarios."""
     each = [one["guards"][guard]["drives"] for one in (document, *document.get("scenarios", {}).values())]
     return min(float(drives["obeyed"] / drives["count"]) for drives in each)
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
-    """The deployment as it is, and scenarios beside it; the trace is that of the former."""
+    """Deploy nominally and under scenarios; the trace is that of the nominal deployment."""
     found = {
         name: {
             "doc": scenario.doc,
@@ -274,7 +271,7 @@ def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
 
 
 def _hurried(setting: Setting, given: str | None) -> Setting:
-    """With the time limit that is given; the paper's guard has none of its own."""
+    """The setting with the given time limit; the paper's guard has no default limit."""
     if given is None:
         return setting
     limit = parse_limit(given)
@@ -302,7 +299,7 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """One deployment that is watched; what was driven before a failure or Ctrl-C is saved."""
+    """Run one watched deployment; results up to a failure or Ctrl-C are saved."""
     from stlc.cli.framework.output import PULSE, say
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
@@ -318,7 +315,7 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Record:
-    """Write trace, scene and figures into the run's folder; returns what was measured."""
+    """Write trace, scene and figures into the run's folder; return the metrics."""
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import RESULT, SCENE, save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
@@ -357,7 +354,7 @@ def _laid_over(run: Run) -> str | None:
 
 
 def _pictures(run: Run) -> dict[str, str]:
-    """The animation and the report, where matplotlib is there; what was drawn, by kind."""
+    """Draw the animation and the report if matplotlib is installed; return kind -> file."""
     from stlc.cli.framework.output import PULSE, say
     from stlc.view import available
 
@@ -388,7 +385,7 @@ def _pictures(run: Run) -> dict[str, str]:
 
 
 def _require_robots(run: Run) -> None:
-    """Said before anything is driven: that a window can be opened, and that there is something for it.
+    """Check before the simulation that the world has robots and a window can be opened.
 
     Raises:
         UsageError: U101, the run's world has no robots.

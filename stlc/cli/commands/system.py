@@ -1,4 +1,4 @@
-"""`stlc system`: look at a system file, try it out, list those there are."""
+"""`stlc system`: show, validate and list system files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 @subcommand(GROUP, "show", "stlc system show car.yaml")
 def show(system: _File, set_: SetOption = None, as_json: JsonOption = False) -> None:
-    """Show what a system file declares, from states to scenarios."""
+    """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.describe import describe as in_words
 
     decl = _load(system, parse_overrides(set_))
@@ -48,11 +48,11 @@ def check(
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate a system file, draw initial states, and let it move.
+    """Validate a system file, draw initial states, and simulate random controls.
 
-    The file is read without torch; with --steps above 0 states are drawn and driven with random controls:
-    initial sets that reject nearly all and dynamics that explode are found. Kinematics from a URDF are
-    compared with pytorch-kinematics where that is installed.
+    With --steps 0 the file is only read, without torch; otherwise random rollouts find initial sets that
+    reject nearly all samples, and dynamics that diverge. Kinematics from a URDF are compared with
+    pytorch-kinematics if that is installed.
     """
     decl = _load(system, parse_overrides(set_))
     warnings = [*decl.warnings, *(_drive(decl, steps, seed) if steps else ())]
@@ -103,7 +103,7 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 
 
 def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
-    """Draw states and drive them with random controls; what goes wrong is raised."""
+    """Roll out random controls from drawn states. Raises SystemFileError on failures."""
     import torch
 
     from stlc.dynamics.model.system import System
@@ -119,7 +119,7 @@ def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Forward kinematics against another library's; what disagrees is raised."""
+    """Compare forward kinematics with another library's; raises an error on a mismatch."""
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:
         return []
@@ -129,7 +129,7 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
 
 
 def _values(decl: SystemDecl) -> dict[str, Any]:
-    """What the file says, as values for JSON."""
+    """The declarations as JSON values."""
     flow = {assign.name: assign.text for assign in decl.flow}
     return {
         "name": decl.name,
@@ -156,7 +156,7 @@ def _values(decl: SystemDecl) -> dict[str, Any]:
 
 
 def _all_systems() -> Iterator[tuple[str, str, str]]:
-    """Name, path and first sentence of every system file in the places that are looked at."""
+    """Name, path and first sentence of every system file in the search path."""
     from stlc.diagnostics import StlcError
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS

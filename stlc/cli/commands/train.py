@@ -1,4 +1,4 @@
-"""`stlc train`: a specification and a system in, a run folder with a trained policy out."""
+"""`stlc train`: train a policy for a specification and a system, in a new run folder."""
 
 from __future__ import annotations
 
@@ -99,11 +99,11 @@ PicturesOption = Annotated[bool, typer.Option(help="Draw the curves and the repo
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """How far a resumed run is to go; what is left of it where neither is given.
+    """Length of a resumed run; by default its remaining steps or budget.
 
     Attributes:
         steps: a new total of steps.
-        more: seconds of training more.
+        more: additional seconds of training.
     """
 
     steps: int | None
@@ -142,11 +142,11 @@ def train(
     set_: SetOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Learn a policy that satisfies a specification.
+    """Train a policy that satisfies a specification.
 
-    The run's folder holds everything that repeats it. Ctrl-C saves a checkpoint and stops.
+    The run's folder contains everything to reproduce it. Ctrl-C saves a checkpoint and stops.
     """
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not busy-wait
     specs = tuple(dict.fromkeys(spec or ()))
     _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
     _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
@@ -193,7 +193,7 @@ def train(
 
 
 def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: str | None) -> None:
-    """Options that exclude each other."""
+    """Reject options that exclude each other."""
     if budget is not None and steps is not None:
         raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
     if seeds is not None and seed is not None:
@@ -203,7 +203,7 @@ def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, 
 def _check_many(
     specs: Sequence[Path], *, seeds: str | None, system: str | None, jobs: int, cluster: str | None
 ) -> None:
-    """Options that mean nothing for one run, or for several, or where a cluster divides the work."""
+    """Reject options that do not apply to one run, to several, or to a cluster."""
     if len(specs) > 1 and system is not None:
         help_ = ('a line `system "FILE"` in every specification',)
         raise UsageError(Diagnostic("U101", "`--system` is for one specification", help=help_))
@@ -216,7 +216,7 @@ def _check_many(
 
 
 def _logbook(name: str | None) -> Opener | None:
-    """What `--log` asks for. Raises MissingError R301 where it is not installed."""
+    """The logger of `--log`. Raises MissingError (R301) if it is not installed."""
     if name is None:
         return None
     if name != "tensorboard":
@@ -227,14 +227,14 @@ def _logbook(name: str | None) -> Opener | None:
 
 
 def _method(name: str) -> str:
-    """A method by its name. Raises UsageError (U101) where there is none."""
+    """Check the name of a method. Raises UsageError (U101) if there is none."""
     if name not in METHODS:
         raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(METHODS.suggest(name),)))
     return name
 
 
 def _steps(text: str) -> int | StepSchedule:
-    """A number of steps, or the schedule that a run with a budget has on record."""
+    """Parse a number of steps, or the recorded schedule of a run with a budget."""
     from stlc.controller.training.budget import StepSchedule
 
     if text.strip().isdecimal():
@@ -249,14 +249,14 @@ def _steps(text: str) -> int | StepSchedule:
 
 
 def _rate(value: float) -> float:
-    """A learning rate: a positive number."""
+    """Parse a learning rate: a positive number."""
     if not 0.0 < value < math.inf:
         raise UsageError(Diagnostic("U101", f"`--lr {value:g}` is not a learning rate", help=("--lr 1e-3",)))
     return value
 
 
 def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
-    """Read, compile, and say which system file was taken."""
+    """Read and compile the specification, and print which system file is used."""
     from stlc.controller.problem.task import Task
     from stlc.dynamics.model.feedback import unstable
     from stlc.dynamics.model.system import System
@@ -281,7 +281,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
 
 def _launch(runs: Path, name: str | None, changes: Sequence[str] | None) -> Launch:
-    """Where a run is made, and what `--set` changes in it."""
+    """The launch options: folder, name, and overrides of `--set`."""
     from stlc.controller.training.launch import Launch
 
     return Launch(root=runs, name=name, overrides=parse_overrides(changes), command=sys.argv[1:])
@@ -304,7 +304,7 @@ def _go_on(
 
 
 def _train_many(many: Many, *, json: bool) -> NoReturn:
-    """Several runs; what is wrong with an only specification is said once, before any begins."""
+    """Train several runs; errors of a single specification are reported once, before the first run."""
     if len(many.specs) < 2:
         with one_voice():
             _task(many.specs, many.system, many.launch.overrides)
@@ -312,7 +312,7 @@ def _train_many(many: Many, *, json: bool) -> NoReturn:
 
 
 def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | None) -> Sitting:
-    """A new run, from its folder to its verdict."""
+    """Train a new run."""
     from stlc.cli.train.sitting import Sitting
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
@@ -329,7 +329,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | No
 
 
 def _resume(where: str, *, runs: Path, length: Length, device: str, logbook: Opener | None) -> Sitting:
-    """An old run, from its last checkpoint to its verdict."""
+    """Resume a run from its last checkpoint."""
     from stlc.cli.train.sitting import Sitting
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.loop import resume
@@ -344,7 +344,7 @@ def _resume(where: str, *, runs: Path, length: Length, device: str, logbook: Ope
 
 
 def _refuse_on_resume(given: Mapping[str, object]) -> None:
-    """A resumed run goes on with what it was started with; how far it goes and `--device` may change."""
+    """Reject options on resume: only the length and `--device` of a run may change."""
     named = [option for option, value in given.items() if value is not None]
     if named:
         raise UsageError(
@@ -363,9 +363,9 @@ LOST = "R403"
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Let the first rank of those that `torchrun` started speak; the others only of what is theirs alone.
+    """Print only from the first rank that `torchrun` started; other ranks report only errors of their own.
 
-    What is wrong with a specification all of them find; what a machine lacks perhaps one, which says so.
+    Every rank finds errors of a specification; a missing package may concern one machine only.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

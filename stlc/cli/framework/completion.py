@@ -1,4 +1,4 @@
-"""What a shell may complete: names of runs, and of the requirements of what stands before the cursor."""
+"""Shell completion: names of runs, and of requirements of the files on the command line."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
-    """The requirements of the specification that is named, or that a named trace carries."""
+    """The requirements of the named specification, or of the one stored in a named trace."""
     names: dict[str, None] = {}
     for path in _named(context):
-        with suppress(Exception):  # a shell wants no diagnostics
+        with suppress(Exception):  # no diagnostics during completion
             text = _COMMENT.sub("", _specification(path))
             names |= dict.fromkeys(name.strip("`") for name in _REQUIRE.findall(text))
         if names:
@@ -38,14 +38,14 @@ def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def _fitting(names: Iterable[str], incomplete: str) -> list[str]:
-    """Those that go on as written and that a shell takes as they are: what is completed is not quoted."""
+    """Names with the prefix that need no quoting, as completions are not quoted."""
     plain = (name for name in dict.fromkeys(names) if shell((name,)) == name and not name.startswith("-"))
     return [name for name in plain if name.startswith(incomplete)]
 
 
 def _named(context: typer.Context) -> Iterator[Path]:
     """Files on the command line, a specification first."""
-    given = list(context.args)  # of a line that is not complete nothing has been assigned yet
+    given = list(context.args)  # parameters of an incomplete line are not assigned yet
     for key in ("spec", "files", "what"):
         value = context.params.get(key)
         given += [str(item) for item in (value if isinstance(value, list | tuple) else [value]) if item]

@@ -1,4 +1,4 @@
-"""The error boundary: whatever a command raises becomes a message and an exit code, here and nowhere else."""
+"""The error boundary: the only place where exceptions become messages and exit codes."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ _EXTRAS = {
 
 
 class BugError(StlcError):
-    """Something that should not have happened; the crash report says what."""
+    """An internal error; see the crash report."""
 
     exit_code = INTERNAL_ERROR
 
 
 def report(error: BaseException, argv: Sequence[str]) -> int:
-    """Tell the user about `error` and return the exit code it stands for."""
+    """Report `error` to the user and return its exit code."""
     match error:
         case SystemExit() if isinstance(error.__context__, BrokenPipeError):
-            return 0  # the reader has seen enough of a help text
+            return 0  # the reader closed the pipe
         case SystemExit(code=int() as code):
             return _stopped(code, argv)
         case SystemExit(code=code):
@@ -57,7 +57,7 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
 
 
 def _stopped(code: int, argv: Sequence[str]) -> int:
-    """Nothing is said about a command that was stopped, but a reader of JSON gets its document."""
+    """Exit of an interrupted command: no message, but a JSON document if one was requested."""
     if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
         emit_json(_schema(argv), ok=False, exit_code=code)
     return code
@@ -71,14 +71,14 @@ def wants_json(argv: Sequence[str]) -> bool:
 
 
 def _schema(argv: Sequence[str]) -> str:
-    """That of the command, where it has one; `stlc/1` is the frame with no result."""
+    """Name of the command's schema; `stlc/1`, the frame without a result, if it has none."""
     from stlc.cli.framework.documents import RESULTS
 
     return f"{argv[0]}/1" if argv and argv[0] in RESULTS else "stlc/1"
 
 
 def _known(error: BaseException) -> StlcError | None:
-    """`error` in the user's terms, or None if it is a bug."""
+    """`error` as an StlcError, or None if it is a bug."""
     match error:
         case StlcError():
             return error
@@ -114,9 +114,9 @@ def _missing_package(name: str) -> StlcError:
 
 
 def _usage(error: BaseException) -> Diagnostic:
-    """What typer says about a command line. Its error classes are not public, their methods are."""
+    """The diagnostic of a typer error. Its error classes are not public, their methods are."""
     message = str(error.format_message()).strip().rstrip(".")  # type: ignore[attr-defined]
-    message = message.replace(": Value error, ", ": ")  # how pydantic introduces what an option said
+    message = message.replace(": Value error, ", ": ")  # pydantic's prefix of messages of validators
     context = getattr(error, "ctx", None)
     command = getattr(context, "command_path", "stlc")
     lowered = message[:1].lower() + message[1:] if message[1:2].islower() else message

@@ -64,7 +64,7 @@ def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
     """`["T_red=3 s"]` as `{"T_red": "3 s"}`.
 
     Raises:
-        UsageError: U101, an entry is no `NAME=VALUE`, or a name is given twice.
+        UsageError: U101, an entry is not `NAME=VALUE`, or a name is given twice.
     """
     values: dict[str, str] = {}
     for pair in pairs or ():
@@ -85,7 +85,7 @@ STDIN = "-"
 
 
 def spec_files(names: Sequence[str]) -> tuple[str, ...]:
-    """The files that are meant, in order and once; a folder stands for all specifications below it.
+    """The specification files, in order and without duplicates; a folder stands for all files below it.
 
     Raises:
         UsageError: U102, a folder without a specification; U101, nothing is named.

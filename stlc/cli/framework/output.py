@@ -1,7 +1,6 @@
-"""What reaches the terminal: the result on the standard output, the talk on the standard error.
+"""Output: results to the standard output, messages to the standard error.
 
-A reader that goes away (`stlc … | head`) is no error: what is left is dropped and the exit code stays
-that of the work.
+A closed pipe (`stlc … | head`) is no error: the remaining output is dropped, and the exit code is unchanged.
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ if TYPE_CHECKING:
 ColorMode = Literal["auto", "always", "never"]
 
 WIDEST = 80
-"""Columns up to which a cell of a table makes room for itself in the others."""
+"""Maximum width up to which a cell widens its column."""
 
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
 QUIET: ContextVar[bool] = ContextVar("stlc_quiet", default=False)
-"""Whether remarks and progress are left out."""
+"""Whether remarks and progress are suppressed."""
 
 
 def emit(text: str, *, styled: bool = False) -> None:
     """Write `text` and a line break to the standard output.
 
-    Of what it holds only line breaks and tabs reach a terminal as such, and colours where it is `styled`;
-    what names hold of them is made `visible` by whoever puts the colours in.
+    Control characters other than line breaks and tabs are replaced on a terminal. A `styled` text may contain
+    colour codes; its author makes names in it `visible`.
     """
     _write(sys.stdout, screen(text, styled=styled))
 
 
 def say(text: str, *, styled: bool = False) -> None:
-    """Write a line to the standard error; what is `styled` may be several, with colours, as for `emit`."""
+    """Write a line to the standard error; a `styled` text may have several, with colours, as for `emit`."""
     if not QUIET.get():
         _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
 
@@ -61,9 +60,9 @@ def emit_json(
     Args:
         schema: name and major number, such as "check/1".
         ok: whether the answer is yes.
-        exit_code: the one that the command is about to exit with.
+        exit_code: of the command.
         diagnostics: findings, warnings among them.
-        result: what was computed; numbers that are not finite become texts.
+        result: computed values; non-finite numbers become texts.
     """
     from stlc.cli.framework.render import to_json
     from stlc.version import __version__
@@ -90,7 +89,7 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
 
 @contextmanager
 def noticing() -> Iterator[None]:
-    """Show what is noticed about the machine (`stlc.diagnostics.notice`), each thing once."""
+    """Show notices about the machine (`stlc.diagnostics.notice`), each once."""
     said: set[str] = set()
     others = warnings.showwarning
 
@@ -118,9 +117,9 @@ def wants_color(stream: TextIO) -> bool:
 
 
 def console(*, stderr: bool = False, width: int | None = None) -> Console:
-    """A rich console for the result (or, with `stderr`, for the talk). Never guesses at markup.
+    """A rich console for results (or, with `stderr`, for messages), without markup.
 
-    What is no terminal gets 120 columns, so that a piped table does not depend on the window.
+    A pipe or file gets 120 columns, so that a table does not depend on the window.
     """
     from rich.console import Console
 
@@ -141,7 +140,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
-    """Columns of text, aligned by width, two blanks apart; numbers, and margins with a unit, stand right."""
+    """Columns of text, two blanks apart; numbers, and margins with a unit, are right-aligned."""
     lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
     if not lines:
         return ""
@@ -161,14 +160,14 @@ def _cell(text: str, width: int) -> str:
     return text.rjust(width) if digits.isdigit() else text.ljust(width)
 
 
-# ------------------------------------------------------------------------- sign of life
+# ------------------------------------------------------------------------- heartbeat
 
 
 class Pulse:
-    """Sign of life of a command that is at work and says nothing: what it does, and for how long.
+    """Heartbeat of a silent command: its current activity and the elapsed time.
 
-    In a terminal a line that is redrawn after `IN_TERMINAL` seconds without output, and removed before the
-    next; elsewhere a line every `IN_LOG` seconds.
+    On a terminal a line redrawn after `IN_TERMINAL` seconds without output and removed before the next
+    output; elsewhere a line every `IN_LOG` seconds.
     """
 
     IN_TERMINAL, IN_LOG = 1.5, 28.0
@@ -181,7 +180,7 @@ class Pulse:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """Show the sign while a command runs; not within another one, and not where remarks are left out."""
+        """Show the heartbeat while a command runs, unless nested or quiet."""
         stream = sys.stderr
         if self._doing or QUIET.get() or stream is None:
             yield
@@ -199,7 +198,7 @@ class Pulse:
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Name what is done for a while; "" for waiting, of which no sign is shown."""
+        """Set the activity within the block; "" for waiting, without a heartbeat."""
         self._doing.append((what, time.monotonic()))
         self.note()
         try:
@@ -208,7 +207,7 @@ class Pulse:
             self._doing.pop()
 
     def note(self) -> None:
-        """Take in that something is written now: the line in the terminal makes room for it."""
+        """Register output: the line on the terminal is removed."""
         with self._lock:
             self._last = time.monotonic()
             if self._shown:
@@ -233,11 +232,11 @@ class Pulse:
 
 
 PULSE = Pulse()
-"""That of the command that runs."""
+"""The heartbeat of the running command."""
 
 
 class _Noted:
-    """A stream of which it is noted when something is written."""
+    """A stream that registers its output at the heartbeat."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -266,7 +265,7 @@ def _write(stream: TextIO | None, text: str) -> None:
 
 @contextmanager
 def tolerate_closed(stream: TextIO) -> Iterator[None]:
-    """Let the reader of `stream` go away: from then on what is written to it goes nowhere."""
+    """Tolerate a closed pipe: afterwards output to `stream` is dropped."""
     try:
         yield
     except BrokenPipeError:
@@ -274,7 +273,7 @@ def tolerate_closed(stream: TextIO) -> Iterator[None]:
 
 
 def silence(stream: TextIO) -> None:
-    """Send what is still buffered, and what is written from now on, nowhere."""
+    """Drop buffered and future output of a stream."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

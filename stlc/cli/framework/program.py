@@ -1,8 +1,8 @@
-"""Programs: a package of commands, a module each, imported when one is asked for, and the error boundary.
+"""Programs: a package of commands, one lazily imported module each, and the error boundary.
 
-`stlc` and `python -m benchmarks` are programs. A new command is a new module in the package of commands that
-holds one function marked with `command`, or a `GROUP` of functions. Nothing is imported that a command does
-not need to be described, so that `--help` stays fast.
+`stlc` and `python -m benchmarks` are programs. A new command is a new module in the package of commands, with
+one function marked with `command`, or a `GROUP` of functions. Modules import little at the top, so that
+`--help` stays fast.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _MARKED: dict[str, tuple[str, ...]] = {}
 
 
 def command(*examples: str) -> Callable[[F], F]:
-    """Mark the function of its module that is the command, with examples of it as they are typed.
+    """Mark the function of a module as the command, with example command lines.
 
-    The docstring is the help: its first paragraph says what the command does, the others come behind the
-    examples. Parameters that are dataclasses are option groups; see `flat`.
+    The docstring is the help text: its first paragraph is the summary, the others follow the examples.
+    Dataclass parameters are option groups; see `flat`.
     """
 
     def mark(function: F) -> F:
@@ -50,14 +50,14 @@ def command(*examples: str) -> Callable[[F], F]:
 
 
 def group(sentence: str, *examples: str, default: Callable[..., None] | None = None) -> typer.Typer:
-    """A group of commands; without one of them `default` is called, else its help is shown."""
+    """A group of commands; without a command `default` is called, or the help shown."""
     made = typer.Typer(help=describe(sentence, *examples), invoke_without_command=True, rich_markup_mode=None)
     made.callback()(default or only_help)
     return made
 
 
 def subcommand(made: typer.Typer, name: str, *examples: str) -> Callable[[F], F]:
-    """Add a function to a group; as for `command`, its docstring is the help."""
+    """Add a function to a group; its docstring is the help, as for `command`."""
 
     def add(function: F) -> F:
         made.command(name, help=_help(function, examples))(flat(function))
@@ -67,7 +67,7 @@ def subcommand(made: typer.Typer, name: str, *examples: str) -> Callable[[F], F]
 
 
 def describe(sentence: str, *examples: str, note: str = "") -> str:
-    """The help of a command: one sentence, examples as they are typed, then what else is to be known."""
+    """The help of a command: a sentence, example command lines, then notes."""
     shown = "\b\nExample:\n" if len(examples) == 1 else "\b\nExamples:\n"
     lines = "\n".join(f"  {example}" for example in examples)
     return "\n\n".join(part for part in (sentence, shown + lines if examples else "", note) if part)
@@ -79,16 +79,16 @@ def _help(function: Callable[..., None], examples: Sequence[str]) -> str:
 
 
 def only_help(context: typer.Context) -> None:
-    """A group of commands without one of them: its help and exit code 2, as for `stlc` alone."""
+    """Default of a group without a command: print its help, exit with 2, as for `stlc` alone."""
     if context.invoked_subcommand is None:
         emit(context.get_help())
         raise typer.Exit(2)
 
 
 def flat(function: Callable[..., None]) -> Callable[..., None]:
-    """A command with its option groups spread: each field of a parameter that is a dataclass is an option.
+    """Flatten option groups: each field of a dataclass parameter becomes an option of the command.
 
-    The defaults are those of the parameter's default, which is a value of the dataclass.
+    The defaults are the fields of the parameter's default value.
     """
     signature = inspect.signature(function, eval_str=True)
     groups: dict[str, Any] = {
@@ -122,14 +122,14 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A program.
+    """A command-line program.
 
     Attributes:
         name: as it is typed.
-        help: of the whole program.
+        help: help text of the program.
         package: of its commands.
-        order: of commands in the help; others stand behind them by name.
-        moved: commands that there were -> what is typed instead.
+        order: of commands in the help; others follow by name.
+        moved: former commands -> their replacements.
     """
 
     name: str
@@ -144,7 +144,7 @@ class Program:
         return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
 
     def made(self, only: str = "") -> typer.Typer:
-        """The program with one command alone, or all of them where there is none of that name."""
+        """The typer program with one command, or with all if there is none of that name."""
         names = self.names()
         app = typer.Typer(
             name=self.name,
@@ -160,7 +160,7 @@ class Program:
         return app
 
     def parser(self, only: str = "") -> Any:
-        """The parser of one command, or of the program, made once in a process; see `name_values`."""
+        """The cached parser of one command, or of the program; see `name_values`."""
         key = (self.package, only if only in self.names() else "")
         if key not in _PARSERS:
             _PARSERS[key] = typer.main.get_command(self.made(only))
@@ -230,7 +230,7 @@ def _global_options(
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The options of the whole program and the rest: those may stand before or after the command."""
+    """Split arguments into options of the program, which may stand anywhere, and the rest."""
     front: list[str] = []
     rest: list[str] = []
     queue = list(arguments)
@@ -246,7 +246,7 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _flush() -> None:
-    """Leave nothing in the buffers: what cannot be written must not become a message of the interpreter."""
+    """Flush the streams, so that a closed pipe causes no message of the interpreter at exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -258,9 +258,9 @@ def _flush() -> None:
 
 @contextmanager
 def _stoppable() -> Iterator[list[int]]:
-    """While a command runs, Ctrl-C and SIGTERM unwind it, so that its `finally` blocks run.
+    """Let Ctrl-C and SIGTERM unwind a running command, so that its `finally` blocks run.
 
-    Gives the exit codes of what came: code in C that is interrupted may raise something else instead.
+    Yields the list of exit codes of received signals: interrupted C code may raise other exceptions.
     """
     stopped: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -285,7 +285,7 @@ def _stoppable() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------- values of options: names, and no pydantic
+# ------------------------------------------------------- option values: metavars, no pydantic
 
 _METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH"}
 _METAVARS |= {"integer": "N", "integer range": "N", "float range": "X", "text": "TEXT", "path": "PATH"}
@@ -302,10 +302,10 @@ def _params(command: Any) -> Iterator[Any]:
 
 
 def name_values(command: Any) -> None:
-    """Give options without a metavar one that says what is expected: no types of Python in a help text."""
+    """Set missing metavars of options, so that help texts show no Python types."""
     for param in _params(command):
         if hasattr(param, "display_type_rich") and param.param_type_name == "argument":
-            param.display_type_rich = lambda **_: ""  # its metavar says it
+            param.display_type_rich = lambda **_: ""  # the metavar suffices
         if param.metavar is None and param.param_type_name == "option" and not param.is_flag:
             kind = getattr(getattr(param, "type_descriptor", None), "annotation", None)
             words = get_args(kind) or getattr(getattr(param, "type", None), "choices", ())
@@ -314,22 +314,22 @@ def name_values(command: Any) -> None:
 
 
 #
-# Newer releases of typer build a pydantic adapter for every parameter of a command that runs, which takes a
-# tenth of a second. Most values are texts already; they are passed on, and typer converts the others.
-# Releases that do without adapters are left alone.
+# Newer releases of typer build a pydantic adapter for every parameter of the running command, which takes a
+# tenth of a second. Most values are texts already and are passed on; typer converts the others.
+# Releases without adapters are not changed.
 
 _SLOT = "_runtime_param"
 
 
 def spare_adapters(command: Any) -> None:
-    """Let the parameters of a command, and of those below it, convert only what needs it."""
+    """Skip pydantic adapters for parameters of a command and its subcommands that need no conversion."""
     for param in _params(command):
         if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
             setattr(param, _SLOT, _AsGiven())
 
 
 def _help_option(command: Any) -> list[Any]:
-    """The option `--help`, which a command makes when it is first asked for it and then keeps."""
+    """The option `--help`, which a command creates on first use and caches."""
     if not hasattr(command, "get_help_option"):
         return []
     option = command.get_help_option(typer.Context(command, help_option_names=list(HELP_NAMES)))
@@ -337,10 +337,10 @@ def _help_option(command: Any) -> list[Any]:
 
 
 class _AsGiven:
-    """Stands in for typer's converter of one parameter until a value needs one."""
+    """Lazy substitute for typer's converter of one parameter."""
 
     def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
-        """The value as the command takes it."""
+        """The converted value."""
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None
@@ -356,7 +356,7 @@ class _AsGiven:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value is already what its annotation says."""
+    """Whether a value already has its annotated type."""
     if annotation in (str, bool, int, float):
         return type(value) is annotation
     if get_origin(annotation) is Literal:

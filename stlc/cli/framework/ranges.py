@@ -1,4 +1,4 @@
-"""Values of options that are written in short: durations and lists of seeds."""
+"""Parsers of option values: durations, counts and lists of seeds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def parse_seconds(text: str) -> float:
     """A duration such as `60s`, `5min`, `1.5 h`, in seconds; a bare number is seconds.
 
     Raises:
-        UsageError: U101, it is none.
+        UsageError: U101, it is not a duration.
     """
     from stlc.units import parse_unit
 
@@ -51,7 +51,7 @@ def parse_limit(text: str) -> float | None:
 
 
 def parse_clock(text: str) -> Clock:
-    """What a budget counts. Raises UsageError (U101) for anything but `wall` and `processor`."""
+    """Parse the clock of a budget. Raises UsageError (U101) for anything but `wall` and `processor`."""
     match text:
         case "wall" | "processor":
             return text
@@ -59,10 +59,10 @@ def parse_clock(text: str) -> Clock:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds such as `0..2`, `3`, or `0..2,7`, in order and each once.
+    """Seeds such as `0..2`, `3`, or `0..2,7`, in that order, without duplicates.
 
     Raises:
-        UsageError: U101, it is no such list.
+        UsageError: U101, it is not such a list.
     """
     seeds: dict[int, None] = {}
     for part in text.split(","):

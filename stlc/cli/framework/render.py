@@ -1,7 +1,7 @@
 """Diagnostics as text, with the source and carets under it, and as JSON.
 
-The primary place is underlined with `^`, the others with `-`, each label in a row of its own; then comes what
-to do (`help`, `fix`), then why (`note`).
+The primary place is underlined with `^`, the others with `-`, each label in a row of its own; then follow
+advice (`help`, `fix`) and reasons (`note`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _STYLES = {
 
 @dataclass(frozen=True, slots=True)
 class _Paint:
-    """Puts text into a style, or leaves it alone."""
+    """Applies a style to text, or leaves it plain."""
 
     color: bool
 
@@ -67,7 +67,7 @@ def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
 def render_place(
     place: Label, labels: Iterable[Label], advice: Iterable[tuple[str, str]], *, color: bool
 ) -> str:
-    """A place that is no finding, laid out as one: carets, dashes, and (word, line) pairs below."""
+    """A place without a finding, in the same layout: carets, dashes, and (word, line) pairs below."""
     marks = [_Mark(place.span, place.text, primary=True)]
     marks += [_Mark(label.span, label.text, primary=False) for label in labels]
     return "\n".join(_body(marks, advice, _Paint(color), "error")) + "\n"
@@ -104,7 +104,7 @@ def _marks(diagnostic: Diagnostic) -> list[_Mark]:
 
 
 def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
-    """The lines of all sources that are marked; that of the primary mark comes first."""
+    """The snippets of all marked sources; that of the primary mark comes first."""
     margin = " " * width
     for index, source in enumerate(dict.fromkeys(mark.span.source for mark in marks)):
         own = [mark for mark in marks if mark.span.source is source]
@@ -133,7 +133,7 @@ def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: _Paint, se
 
 
 class _Row:
-    """One line of a source as it is shown: tabs expanded, control characters visible, cut if very long."""
+    """One displayed source line: tabs expanded, control characters visible, truncated if very long."""
 
     def __init__(self, source: Source, number: int, marks: Sequence[_Mark]) -> None:
         self.marks = marks
@@ -161,7 +161,7 @@ class _Row:
 
 
 def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
-    """Display column of every character (and of the end), and the line as it is printed."""
+    """Display column of every character (and of the end), and the printed line."""
     columns: list[int] = []
     shown: list[str] = []
     column = indent

@@ -29,7 +29,7 @@ def as_tree(spec: ast.Spec) -> str:
 
 
 def _facts(node: ast.Node) -> Iterator[str]:
-    """What a node says itself, without its children."""
+    """Attributes of a node, without its children."""
     for name, value in _own(node):
         if name == "clock" and value == "now":
             continue

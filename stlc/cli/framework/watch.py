@@ -1,4 +1,4 @@
-"""Do it again whenever a file changes."""
+"""Repetition of a command whenever a file changes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
     """Call `action` now, and after each change of a file, until Ctrl-C.
 
     Args:
-        files: to look at.
-        action: what to do; it reports its own errors.
-        rounds: stop after so many looks; None goes on.
+        files: to watch.
+        action: called each time; it reports its own errors.
+        rounds: number of polls; None: without end.
     """
     paths = [Path(file) for file in files]
     before = None
@@ -35,7 +35,7 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """What changes with a file; a file that is not there counts as empty."""
+    """Modification stamp of a file; a missing file counts as empty."""
     try:
         status = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""The live view of a deployment: margins as bars, agents, who decides for them; elsewhere ten lines."""
+"""The live view of a deployment: margins as bars, agents, decision sources; ten lines without a terminal."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from stlc.signature import Column
 
 REDRAWN = 0.5
-"""Seconds between pictures on a terminal."""
+"""Seconds between redraws on a terminal."""
 LINES = 10
-"""How many lines there are elsewhere."""
+"""Number of lines without a terminal."""
 HALF = 10
-"""Half the width of a bar: what stands right of its middle is to spare."""
+"""Half the width of a bar; its right half is a positive margin."""
 NARROW = 4
-"""The same where there is little room."""
+"""The same in a narrow terminal."""
 FIRST = ("agent", "decided by", "plan", "least margin")
-"""What is said of every agent before its states."""
+"""Columns of every agent before its states."""
 
 
 class LiveView:
-    """Shows a deployment: in place on a terminal, ten lines elsewhere.
+    """Shows a deployment: redrawn in place on a terminal, ten lines elsewhere.
 
     Args:
-        oversight: of the deployment.
-        title: what is deployed.
-        console: where; that of the talk.
-        clock: in seconds.
+        oversight: live monitor of the deployment.
+        title: name of the deployment.
+        console: for messages.
+        clock: function that returns seconds.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class LiveView:
             self.console.print(Text(self.title))
 
     def stop(self) -> None:
-        """Close the view; what it showed last stays."""
+        """Close the view; its last state stays on the screen."""
         if self._live is not None:
             self._live.stop()
 
     def tell(self) -> None:
-        """The overseen deployment has gone on by a step."""
+        """Update the view after a step of the deployment."""
         moment = self.oversight.moment
         assert moment is not None
         if moment.planned:
@@ -92,7 +92,7 @@ class LiveView:
     # ------------------------------------------------------------------------- text
 
     def line(self) -> str:
-        """The present moment on a line."""
+        """The present state on one line."""
         worst = min(self.oversight.margins.items(), key=lambda each: float(each[1].high.min()))
         name, agent = worst[0], int(worst[1].high.argmin())
         violated = np.any([margin.violated > 0 for margin in self.oversight.margins.values()], axis=0)
@@ -105,7 +105,7 @@ class LiveView:
         return "  " + "   ".join(parts)
 
     def panel(self) -> Group:
-        """What the terminal shows at this moment."""
+        """The present state as shown on the terminal."""
         width, height = self.console.size
         lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
         lines += self._bars(width)
@@ -136,7 +136,7 @@ class LiveView:
         return f"agent {agent}" + (f", seed {self.oversight.setting.seeds[seed]}" if several else "")
 
     def _bars(self, width: int) -> list[Text]:
-        """A line for each requirement: what the worst agent can still have of it; bars give way to words."""
+        """A line for each requirement: the margin of the worst agent; bars shrink before names do."""
         margins = self.oversight.margins
         units = {rule.name: margin_unit(rule.typed.formula) for rule in self.oversight.task.rules}
         told = {name: self._told(margin, units.get(name, "")) for name, margin in margins.items()}
@@ -156,7 +156,7 @@ class LiveView:
         return found
 
     def _told(self, margin: Margin, unit: str) -> tuple[str, str, str]:
-        """Of one requirement: its least margin in its unit, whose that is, and how many have violated it."""
+        """Texts of a requirement: its least margin with unit, the agent, and the number of violations."""
         row = int(margin.high.argmin())
         open_ = margin.low[row] < margin.high[row]
         count = int((margin.violated > 0).sum())
@@ -164,7 +164,7 @@ class LiveView:
         return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
-        """A margin left or right of the middle, by the largest one so far."""
+        """A bar left or right of the middle, scaled by the largest margin so far."""
         full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
         finite = abs(value) if np.isfinite(value) else 0.0
         scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)
@@ -176,7 +176,7 @@ class LiveView:
         return empty * half + middle + filled[0] + filled[1]
 
     def _agents(self, width: int, most: int) -> list[Text]:
-        """A line for each agent of the first seed, the worst of them where there are more than fit."""
+        """A line for each agent of the first seed; only the worst ones if not all fit."""
         oversight, moment = self.oversight, self.oversight.moment
         assert moment is not None
         agents = range(oversight.setting.agents)
@@ -199,7 +199,7 @@ class LiveView:
 
 
 def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
-    """A table with as many whole columns as there is room for, and `…` where some are left out."""
+    """A table with as many whole columns as fit, and `…` for omitted ones."""
     for count in range(len(header), len(FIRST), -1):
         more = ["…"] if count < len(header) else []
         text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])
@@ -209,7 +209,7 @@ def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
 
 
 def _shown(column: Column, value: float) -> str:
-    """A state as one reads it: the label of an enum, yes or no, a number."""
+    """A state as text: the label of an enum, yes or no, a number."""
     for label, number in column.labels:
         if number == value:
             return label
@@ -219,7 +219,7 @@ def _shown(column: Column, value: float) -> str:
 
 
 def _signed(value: float) -> str:
-    """A margin; rounding around zero is zero."""
+    """A margin with its sign; rounding errors around zero are zero."""
     return "0" if abs(value) <= TOLERANCE else signed(value)
 
 

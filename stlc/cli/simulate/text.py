@@ -1,4 +1,4 @@
-"""What `stlc simulate` measured, as a person reads it."""
+"""Text output of `stlc simulate`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Record: TypeAlias = "dict[str, Any]"
 
 MOST_LISTED = 12
 MOST_BROKEN = 6
-"""Drives that broke rules and are listed."""
+"""Maximum number of listed drives that violated rules."""
 ERRORS = {
     "actuator_gain": "wrong: gains of actuators",
     "parameters": "wrong: numbers of the dynamics",
@@ -24,13 +24,13 @@ ERRORS = {
 }
 """Errors of a scenario, in words."""
 COMPARED = ("obeyed every rule", "plan accuracy")
-"""Columns by which scenarios are compared; drives that are lost are not counted."""
+"""Columns of the comparison of scenarios; lost drives are not counted."""
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
-    """The measured figures, as a person reads them: the drives first; with `windows` plans and starts, too.
+    """The metrics as text: drives first; with `windows` also plans and starts.
 
-    Without a specification of drives these are shown as well: drives are judged as plans are then.
+    Without a specification of drives the latter are always shown, as drives are then judged like plans.
     """
     from stlc.cli.framework.output import table
 
@@ -65,14 +65,14 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """A line on the starts that were taken, where not all were."""
+    """A line on the selection of starts, if they were selected."""
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:
-    """The verdict on what was driven, and who could not have been driven better."""
+    """The verdict on the drives, and the agents for which no better drive is known."""
     from stlc.view.words import obeyed_sentence, viable_sentence
 
     yield f"  {obeyed_sentence(document)}"
@@ -87,14 +87,14 @@ def _drives(document: Record) -> Iterator[str]:
 
 
 def _rules(document: Record) -> Iterator[tuple[str, ...]]:
-    """How many drives obeyed each rule, a column per guard."""
+    """Number of drives that obeyed each rule, a column per guard."""
     guards = [guard["drives"] for guard in document["guards"].values()]
     for name in guards[-1]["rules"]:
         yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
 
 
 def _broken(drives: Record) -> Iterator[str]:
-    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few: first those who could have obeyed."""
+    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few, viable ones first."""
     from stlc.view.words import cause_words
 
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
@@ -116,7 +116,7 @@ def _foreseen(foreseen: Record | None) -> Iterator[str]:
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
-    """What the truth has otherwise than the model, on a line for each kind."""
+    """Errors of the model under the scenario, a line for each kind."""
     for name, what in ERRORS.items():
         if name in errors:
             numbers = errors.get("numbers", []) if name == "parameters" else []
@@ -126,7 +126,7 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
 
 
 def compared(document: Record) -> Iterator[str]:
-    """All scenarios in one table: who obeyed every rule, and of whom that could be had."""
+    """All scenarios in one table: drives that obeyed every rule, overall and among viable ones."""
     from stlc.cli.framework.output import table
 
     guards = list(document["guards"])
@@ -143,14 +143,14 @@ def compared(document: Record) -> Iterator[str]:
 
 
 def _both(guard: Record) -> list[str]:
-    """Plan accuracy, and the drives that obeyed of those that were not lost."""
+    """The cells of a guard: drives that obeyed among those not lost, and plan accuracy."""
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
     return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
 
 
 def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:
-    """Where things are; the last line is the next command, with the system where judging needs it."""
+    """Paths of the results; the last line is the next command, with the system if judging needs it."""
     from stlc.files import find_trace
 
     yield ""
@@ -169,7 +169,7 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 
 
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
-    """Shares of plans and starts; those of safety where any requirement is tagged `@safety`."""
+    """Shares of plans and starts; those of safety if any requirement is tagged `@safety`."""
     from stlc.controller.evaluation.metrics import METRICS
 
     for metric in METRICS.values():
@@ -179,7 +179,7 @@ def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
 
 
 def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
-    """Metrics that the world tells of itself."""
+    """Metrics reported by the world."""
     from stlc.controller.evaluation.metrics import is_progress
 
     first = next(iter(guards.values()))
@@ -199,7 +199,7 @@ def _times(guards: Record) -> Iterator[tuple[str, ...]]:
 
 
 def _number(metric: Record, unit: str, digits: int) -> str:
-    """A mean and half its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
+    """A mean and the half-width of its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
     mean, high = metric["mean"], metric["high"]
     text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
     return f"{text} {unit}".rstrip()
@@ -241,5 +241,5 @@ def _acted(decisions: Mapping[str, float]) -> str:
 
 
 def _part(share: float) -> str:
-    """Of a whole, in per cent; what is something never reads as nothing, nor as all."""
+    """A percentage; only 0 is shown as 0 %, and only 1 as 100 %."""
     return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

@@ -1,4 +1,4 @@
-"""What is told of a deployment while it runs: a progress bar, the live view, and margins as JSON lines."""
+"""Output of a running deployment: a progress bar, the live view, and margins as JSON lines."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Watching:
     """How a deployment is watched.
 
     Attributes:
-        title: what is deployed.
-        live: whether it is shown as it goes on.
-        margins: a file for the lines, or `-` for the standard output; None where nobody wants them.
+        title: name of the deployment.
+        live: whether the live view is shown.
+        margins: file of JSON lines, or `-` for the standard output; None: not written.
     """
 
     title: str
@@ -36,7 +36,7 @@ class Watching:
 
     @contextmanager
     def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
-        """What a deployment is to tell its steps to."""
+        """The callback for the steps of a deployment."""
         if not self.live and self.margins is None:
             with _bar(self.title) as watch:
                 yield watch
@@ -75,14 +75,14 @@ def _present(oversight: LiveMonitor) -> SimulationStep:
 
 
 def require_writable(where: str | None) -> None:
-    """Begin the file that lines will be written to. Raises MissingError (R201) where that cannot be."""
+    """Create the file for JSON lines. Raises MissingError (R201) if that fails."""
     if where is not None and where != STANDARD_OUTPUT:
         _opened(where).close()
 
 
 @contextmanager
 def _lines(where: str) -> Iterator[TextIO]:
-    """A file that lines are written to as they come."""
+    """A line-buffered file."""
     if where == STANDARD_OUTPUT:
         yield sys.stdout
         return
@@ -99,7 +99,7 @@ def _opened(where: str) -> TextIO:
 
 
 def _write(oversight: LiveMonitor, stream: TextIO) -> None:
-    """One object an agent, a line each."""
+    """Write one JSON object per agent, a line each."""
     from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps
 

@@ -1,4 +1,4 @@
-"""Training for several specifications and seeds: a run each, in a process of its own, and a table of all."""
+"""Training for several specifications and seeds: one run and process each, and a summary table."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 HEADER = ("seed", "accuracy", "95 % interval", "known feasible", "share", "worst requirement", "time", "run")
 ENDED = 70
-"""Exit code for a process that a signal ended."""
+"""Exit code of a process killed by a signal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One run of many.
+    """One of several runs.
 
     Attributes:
         spec: the specification's file.
@@ -38,17 +38,17 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Many:
-    """Runs that differ in their specifications and seeds alone.
+    """Runs that differ only in specification and seed.
 
     Attributes:
         specs: the specifications' files.
         system: as given, or None; only of one specification.
-        config: what the runs have in common.
-        launch: where, and under which name.
-        seeds: one a run of each specification; None for that of its system file.
+        config: common configuration.
+        launch: folder and name.
+        seeds: for each specification; None for that of its system file.
         jobs: processes at a time.
-        cluster: address of a cluster that trains instead of this machine.
-        log: of `--log`.
+        cluster: address of a Ray cluster to train on.
+        log: value of `--log`.
         pictures: whether reports are drawn.
     """
 
@@ -68,7 +68,7 @@ class Many:
         return [Part(spec, seed) for spec in self.specs for seed in self.seeds]
 
     def name(self, part: Part) -> str:
-        """By which a run is told from the others."""
+        """Label of a run among the others."""
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
@@ -111,7 +111,7 @@ class Many:
 
 
 def train_many(many: Many, *, json: bool) -> NoReturn:
-    """Train all, and print a table or the JSON document; raises `typer.Exit` with the exit code."""
+    """Train all runs, print a table or the JSON document, and raise `typer.Exit` with the exit code."""
     found: dict[str, JobResult] = {}
     sent = "begins" if many.cluster is None else "is sent"
     try:
@@ -133,7 +133,7 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
 
 
 def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
-    """The runs as they end: of processes here, or of a cluster."""
+    """Results of the runs as they end, from local processes or a cluster."""
     from stlc.controller.parallel import executor
 
     cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
@@ -142,7 +142,7 @@ def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
 
 
 def _table(many: Many, ordered: Mapping[Part, JobResult]) -> str:
-    """A line for every run, and one for the mean of each specification's."""
+    """A line for every run, and one for the mean of each specification."""
     rows: list[tuple[str, ...]] = []
     several = len(many.specs) > 1
     for spec in many.specs:
@@ -153,7 +153,7 @@ def _table(many: Many, ordered: Mapping[Part, JobResult]) -> str:
 
 
 def _line(back: JobResult) -> str:
-    """What is said as a run ends."""
+    """The message at the end of a run."""
     accuracy = back.result.get("accuracy")
     if accuracy is None:
         return f"{back.job.name} broke off with exit code {back.code}\n{back.why}".rstrip()
@@ -178,7 +178,7 @@ def _share(result: Mapping[str, Any]) -> str:
 
 
 def _mean(backs: Sequence[JobResult]) -> list[tuple[str, ...]]:
-    """The last line, where there are several runs that ended well."""
+    """The row of means, if several runs succeeded."""
     results = [back.result for back in backs if back.result.get("accuracy") is not None]
     if len(results) < 2:
         return []

@@ -1,4 +1,4 @@
-"""The live panel of a training run, and the screen that closes it."""
+"""The live panel of a training run, and its final screen."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stlc.cli.framework.output import console as open_console
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
 
-LINE_EVERY = 25.0  # seconds between lines where there is no terminal to redraw
+LINE_EVERY = 25.0  # seconds between lines without a terminal
 BLOCKS = "▁▂▃▄▅▆▇█"
 ASCII_BLOCKS = "_.-:=+*#"
 SPARK_WIDTH = 16
@@ -25,7 +25,7 @@ SPARK_WIDTH = 16
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """What is known before the first step.
+    """Facts known before the first step.
 
     Attributes:
         spec: name of the specification.
@@ -35,7 +35,7 @@ class RunInfo:
         seed: of the run.
         threads: of torch.
         device: on which training runs.
-        steps: planned steps; None while a time budget is still being turned into steps.
+        steps: planned steps; None while a time budget is not yet converted into steps.
     """
 
     spec: str
@@ -50,24 +50,24 @@ class RunInfo:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What the last screen says.
+    """Content of the final screen.
 
     Attributes:
         accuracy: share of held-out starts whose plan satisfies the specification.
         interval: 95 % interval of `accuracy`.
         held_out: number of held-out starts.
         requirements: share per requirement.
-        feasible: share of the held-out starts for which some satisfying plan is known, or None.
+        feasible: share of the held-out starts with a known satisfying plan, or None.
         seconds: of training.
         folder: of the run.
-        learning: the verdict on the training, with what to do next.
-        driven: what the policy does in closed loop, a line each.
+        learning: the verdict on the training, with the next step.
+        driven: closed-loop results, a line each.
         steps: of the optimiser.
-        searched: held-out starts that the policy solves or that were searched; 0 where that is unknown.
-        where: where the worst requirement fails, in words, or "".
-        unsolved: what remains, in words, or "".
-        picture: that shows it, or "".
-        judged: seconds of missions without end on which the policy was judged; None where missions end.
+        searched: held-out starts that the policy solves or that were searched; 0 if unknown.
+        where: failure region of the worst requirement, in words, or "".
+        unsolved: remaining starts, in words, or "".
+        picture: path of a picture of the region, or "".
+        judged: seconds of an unbounded mission on which the policy was validated; None for a bounded one.
         status: how the run ended: `finished`, `interrupted`, …
     """
 
@@ -90,7 +90,7 @@ class Summary:
 
 
 def sparkline(values: list[float], *, width: int = SPARK_WIDTH, blocks: str = BLOCKS) -> str:
-    """The course of `values` in at most `width` blocks, scaled between their least and largest."""
+    """A sparkline of `values` in at most `width` blocks, scaled between minimum and maximum."""
     if not values:
         return ""
     count = min(width, len(values))
@@ -120,8 +120,8 @@ class Progress:
     """Shows a training run: in place on a terminal, one line every 25 s elsewhere.
 
     Rows are those of `train.jsonl`; a row may carry only some of its keys (a bare `step` moves the counter),
-    what it leaves out keeps its last value. In use: `start`, `update`…, `finish`; `stop` alone leaves
-    the terminal in order after an interruption.
+    missing keys keep their last value. In use: `start`, `update`…, `finish`; `stop` alone restores the
+    terminal after an interruption.
     """
 
     def __init__(
@@ -155,13 +155,13 @@ class Progress:
             self._print(self._title())
 
     def chosen(self, engine: Mapping[str, Any]) -> None:
-        """Say what the engine chose by itself."""
+        """Show the configuration that the engine resolved."""
         self._print(f"  engine          {engine_text(engine)}")
         if "by_torch" in engine:
             self._print(f"  computed by     {native_text(engine['by_torch'])}")
 
     def update(self, row: Mapping[str, Any]) -> None:
-        """Take in a row of `train.jsonl`, or a part of one."""
+        """Update from a row of `train.jsonl`, or a part of one."""
         self._row.update({key: value for key, value in row.items() if value is not None})
         if row.get("accuracy") is not None:
             self._accuracies.append(float(row["accuracy"]))
@@ -246,14 +246,14 @@ class Progress:
         return "  " + "   ".join(part for part in parts if part)
 
     def _accuracy_line(self, width: int) -> str:
-        """The accuracy behind its course, which shrinks where the terminal is narrow."""
+        """The accuracy and its sparkline, which shrinks in a narrow terminal."""
         figures = "     ".join(self._accuracy_parts())
         room = min(SPARK_WIDTH, width - len(figures) - 22)
         spark = sparkline(self._accuracies, width=room, blocks=self._blocks) if room >= 4 else ""
         return f"  plan accuracy   {spark}  {figures}" if spark else f"  plan accuracy   {figures}"
 
     def panel(self) -> Group:
-        """What the terminal shows at this moment."""
+        """The present panel."""
         width = self.console.width
         lines = [*_spread(self._title(), f"{self._counter()}   {self._time_left()}".rstrip(), width)]
         lines.append(self._accuracy_line(width))
@@ -287,7 +287,7 @@ def _packed(cells: list[str], width: int) -> list[str]:
 
 
 def engine_text(engine: Mapping[str, Any]) -> str:
-    """What the engine chose, on a line: its method, its network, its states, its rate and its margin."""
+    """The resolved configuration on a line: method, network, batch, learning rate and margin."""
     network = "x".join(map(str, engine["hidden"]))
     count, samples = int(engine["plans"]), int(engine.get("samples") or 0)
     states = f"{engine['batch']} states a step"
@@ -305,7 +305,7 @@ def engine_text(engine: Mapping[str, Any]) -> str:
 
 
 def native_text(by_torch: Mapping[str, str]) -> str:
-    """Which parts of training run as emitted C, and why the others do not."""
+    """The parts of training that run as generated C, and why others do not."""
     native = [part for part, reason in by_torch.items() if not reason]
     reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
     lines = [f"{', '.join(native)}: C"] if native else []
@@ -316,14 +316,14 @@ def native_text(by_torch: Mapping[str, str]) -> str:
 
 
 def _judged(summary: Summary) -> list[str]:
-    """For how long a mission without end was driven."""
+    """The length of validation of an unbounded mission."""
     if summary.judged is None:
         return []
     return [f"judged          on missions of {summary.judged:g} s; what is required has no end"]
 
 
 def final_screen(summary: Summary, spark: str = "") -> list[str]:
-    """The lines that close a training run; the last one is the next command, where there is a verdict."""
+    """The final lines of a training run; with a verdict the last one is the next command."""
     low, high = summary.interval
     lines = [f"{'' if i else 'closed loop':<15} {line}" for i, line in enumerate(summary.driven)]
     lines += [

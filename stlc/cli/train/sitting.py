@@ -1,4 +1,4 @@
-"""One sitting of training as a person sees it: the panel, Ctrl-C, pictures, the closing screen."""
+"""Terminal interface of a training: the panel, Ctrl-C, pictures, the final screen."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 BESIDE = 10.0
-"""Seconds that a command has beside its budget."""
+"""Seconds of a command beyond its budget."""
 AFTER = 1.2
-"""Seconds for pictures and the end of a process, beside those before the training."""
+"""Seconds for pictures and process exit, besides those before the training."""
 FAILURES = "failures.png"
-"""What the report draws of the starts that fail."""
+"""File name of the picture of failing starts."""
 
 
 @dataclass(slots=True)
 class Sitting:
-    """Shows progress while it is open; Ctrl-C or SIGTERM saves and stops.
+    """Progress display of a training as a context manager; Ctrl-C or SIGTERM saves and stops.
 
-    While steps are made it asks for that, and a second one stops at once, as the first does at other times.
+    During training steps the first signal requests the stop and a second one stops at once; at other times
+    the first one does.
 
     Attributes:
         folder: of the run.
-        outcome: what training gave, once it did.
+        outcome: result of the training, once finished.
         progress: the panel.
-        logbook: how a log beside `train.jsonl` is opened, if one is wanted.
-        keeps: whether this process keeps the run's folder; of several ranks the first does.
+        logbook: opener of an additional logger, if any.
+        keeps: whether this process writes the run's folder; the first of several ranks does.
     """
 
     folder: RunDir
@@ -63,12 +64,12 @@ class Sitting:
 
     @property
     def watch(self) -> Watch:
-        """What training reports to."""
+        """The callbacks of the training."""
         stop = lambda: bool(self._asked)  # noqa: E731
         return Watch(self._begun, self._row, stop, self._steps, self._late)
 
     def _late(self, budget: float) -> float:
-        """By how much a slow machine would let the command end too late: imports foretell the pictures."""
+        """Expected delay in seconds at the end on a slow machine, estimated from the time of imports."""
         return (1.0 + AFTER) * self._before_it - BESIDE - 0.1 * budget
 
     @contextmanager
@@ -117,7 +118,7 @@ class Sitting:
         self._forced.close()
 
     def _ended(self, _code: int = INTERRUPTED) -> None:
-        """The remains of a run that was ended on the spot: its last checkpoint."""
+        """Record a killed run as interrupted; its last checkpoint remains."""
         with suppress(StlcError):
             self.folder.finish("interrupted")
         self._say_interrupted()
@@ -135,11 +136,11 @@ class Sitting:
 
     @property
     def _signalled(self) -> int:
-        """The exit code of what asked to stop."""
+        """The exit code of the received signal."""
         return TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED
 
     def conclude(self, *, pictures: bool, json: bool) -> NoReturn:
-        """Pictures, then the closing screen or the JSON document; raises `typer.Exit` with the exit code."""
+        """Draw pictures, print the final screen or the JSON document; raises `typer.Exit` with the code."""
         outcome = self.outcome
         assert outcome is not None
         if not self.keeps:
@@ -170,25 +171,25 @@ class Sitting:
 
 
 def started(ranks: int) -> str:
-    """How so many processes are started that train together."""
+    """The program to start: `stlc`, or `torchrun` for several ranks."""
     return "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
 
 
 def spoken(folder: RunDir) -> str:
-    """What other commands find the run by: its name in the usual place, its path elsewhere."""
+    """Reference to the run for other commands: its name in the default folder, else its path."""
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
     return folder.name if usual else folder.shown
 
 
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
-    """The commands that a closing screen names; the run need not be named while it is the newest."""
+    """The commands of the final screen; the newest run needs no name."""
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     guard = recommended(folder.record())
     return Commands.of(spoken(folder), newest=newest, start=started(ranks), guard=guard)
 
 
 def _learning(outcome: TrainingOutcome) -> Learning | None:
-    """The verdict on the training, as its record has it."""
+    """The verdict on the training in its record."""
     return learning_of_run(outcome.run.dir, _commands(outcome.run.dir, outcome.ranks))
 
 
@@ -240,7 +241,7 @@ def _summary(outcome: TrainingOutcome, *, pictures: bool) -> Summary:
 
 
 def draw_report(folder: RunDir) -> None:
-    """The report, where pictures can be drawn; nothing fails for their lack."""
+    """Draw the report, or print how to install matplotlib if it is missing."""
     from stlc.view import available
 
     if not available():
