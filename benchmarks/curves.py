@@ -19,13 +19,13 @@ COLUMNS = 3
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One training.
+    """Learning curve of one training.
 
     Attributes:
-        method: of it.
+        method: of training.
         seconds: of the points.
         accuracies: of the points, on fresh states.
-        end: seconds and accuracy of the verdict on held-out states.
+        end: seconds and final accuracy on held-out states.
     """
 
     method: str
@@ -40,8 +40,8 @@ class Panel:
 
     Attributes:
         title: of the panel.
-        curves: one a training.
-        feasible: known feasible share, if there is one.
+        curves: one per training.
+        feasible: known feasible share, or None.
     """
 
     title: str
@@ -50,7 +50,7 @@ class Panel:
 
 
 def curve_of(result: Result) -> Curve:
-    """The curve of the result of a training."""
+    """The learning curve in the result of a training."""
     points = result["curve"]
     return Curve(
         result["key"]["method"],
@@ -61,7 +61,7 @@ def curve_of(result: Result) -> Curve:
 
 
 def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
-    """All panels, three in a row; None where there is nothing to draw."""
+    """Draw all panels, three in a row; None without panels."""
     shown = [panel for panel in panels if panel.curves]
     if not shown:
         return None

@@ -1,4 +1,4 @@
-"""Deployments behind tables: policies driven and recorded under guards and scenarios, each kept once."""
+"""Deployments behind tables: simulated under guards and scenarios, each stored once."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NOMINAL = "as it is"
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 USUAL = (*GUARDS, "full+auto")
-"""Guards, and behind a `+` the margin that they ask of safety requirements; see `guard.margin_request`."""
+"""Default guards; after a `+` the safety margin that they request, see `guard.margin_request`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Drives:
     runs_folder: TrainedOption = Path("runs/benchmarks")
 
     def setting(self, run: Run, ceiling: int) -> Setting:
-        """The setting of a run's deployments, at most as large as its system says."""
+        """The setting of a run's deployments, at most as large as its system's default."""
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
@@ -72,7 +72,7 @@ class Drives:
         return Setting(parse_seeds(self.seeds), agents, steps, test.replan, limit, ceiling)
 
     def runs(self, names: Sequence[str] | None) -> list[RunDir]:
-        """The runs that are named, else those of the most accurate policies. Raises UsageError (U101)."""
+        """The named runs, else those of the most accurate policies. Raises UsageError (U101)."""
         if names:
             return [RunDir.open(name) for name in names]
         place = Place(ResultStore("paper", self.out), self.runs_folder)
@@ -87,7 +87,7 @@ class Drives:
 
 
 def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
-    """A deployment under a guard in the world of its system."""
+    """Record a deployment under a guard in the world of its system."""
     recorder = Recorder(setting.agents)
     drive(guard, world_type(guard.task.system.decl), setting, recorder)
     recording = recorder.recording()
@@ -96,10 +96,10 @@ def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
 
 
 def guard_of(name: str) -> tuple[Mode, MarginRequest]:
-    """The guard of a name such as `full`, `full+0.2` or `full+auto`, and the margin that it asks for.
+    """Parse a name such as `full`, `full+0.2` or `full+auto` into a guard and its margin request.
 
     Raises:
-        UsageError: U101, there is none.
+        UsageError: U101, there is no such guard.
     """
     mode, _, margin = name.partition("+")
     for known in GUARDS:
@@ -112,15 +112,15 @@ def guard_of(name: str) -> tuple[Mode, MarginRequest]:
 
 @dataclass(slots=True)
 class Deployments:
-    """Deployments of one table; each is kept as soon as it is over, and never driven twice.
+    """Deployments of one table; each is stored when it ends and is never repeated.
 
     Attributes:
         store: of the results.
         options: seeds and sizes.
-        ceiling: visited states that are searched for a plan.
-        driven: how many were driven now.
-        kept: how many were there.
-        results: all of them, in order.
+        ceiling: number of visited states to search for feasible plans.
+        driven: number of new deployments.
+        kept: number of stored ones.
+        results: of all, in order.
     """
 
     store: ResultStore
@@ -157,7 +157,7 @@ class Deployments:
         say(f"{key.name}  {'kept' if self.driven == driven else format(result['seconds'], '.0f') + ' s'}")
 
     def _deploy(self, run: Run, name: str, setting: Setting) -> Result:
-        """Drive, and measure what was driven."""
+        """Simulate a deployment and compute its metrics."""
         begin = perf_counter()
         mode, asked = guard_of(name)
         margin = asked.of(run.task, run.policy, mode, setting.replan)
@@ -178,7 +178,7 @@ class Deployments:
         }
 
     def viable(self, task: Task, x0: Tensor) -> Tensor:
-        """Starts from which a search finds a safe plan, (rows,); searched once for the same starts."""
+        """Mask of viable starts, for which a search finds a safe plan, (rows,); cached per set of starts."""
         for known, found in self._viable:
             if known.shape == x0.shape and bool((known == x0).all()):
                 return found
@@ -188,7 +188,7 @@ class Deployments:
 
 
 def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
-    """All that a deployment depends on."""
+    """The key of a deployment: all its inputs."""
     folder, decl = run.dir.path, run.task.system.decl
     world, laid = decl.test.world, decl.scenario
     mode, asked = guard_of(guard)
@@ -212,7 +212,7 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
 
 
 def _policy_of(folder: RunDir) -> dict[str, Any]:
-    """How the policy of a run was trained, and how much of the held-out starts it solves."""
+    """Training method and length of a run's policy, and its held-out accuracy."""
     record = folder.record()
     result = record.get("result") or {}
     return {
@@ -224,7 +224,7 @@ def _policy_of(folder: RunDir) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A policy under a scenario, by guard.
+    """Results of a policy under a scenario, by guard.
 
     Attributes:
         spec: name of the specification.
@@ -243,7 +243,7 @@ class Row:
     guards: Mapping[str, Result]
 
     def metric(self, guard: str, name: str) -> Mapping[str, Any] | None:
-        """Mean and interval of a metric under a guard; None where that was not driven, or is undefined."""
+        """Mean and interval of a metric under a guard; None if not simulated or undefined."""
         found: Mapping[str, Any] | None = (self.guards.get(guard) or {}).get("metrics", {}).get(name)
         return found
 
@@ -254,7 +254,7 @@ class Row:
 
 
 def rows_of(results: Iterable[Result]) -> list[Row]:
-    """Specifications in the paper's order, then others; scenarios in that of `SCENARIOS`."""
+    """Rows of results: specifications in the paper's order, then others; scenarios in that of `SCENARIOS`."""
     groups: dict[tuple[str, str, int, int, int], dict[str, Result]] = {}
     for each in results:
         key = each["key"]
@@ -269,7 +269,7 @@ def _place(row: Row) -> tuple[Any, ...]:
 
 
 def policy_lines(rows: Iterable[Row]) -> list[str]:
-    """How the policy of each deployment was trained, as bullets."""
+    """Training method and length of each deployment's policy, as bullets."""
     lines = []
     for result in (each for row in rows for each in row.guards.values()):
         known = result["policy"]
@@ -285,7 +285,7 @@ def policy_lines(rows: Iterable[Row]) -> list[str]:
 
 
 def mean_and_half(metric: Mapping[str, Any] | None) -> str:
-    """A mean and half its interval: `.957 ± .012`; empty where there is none."""
+    """A mean and the half-width of its interval: `.957 ± .012`; empty without one."""
     if metric is None:
         return ""
     mean, high = float(metric["mean"]), metric["high"]

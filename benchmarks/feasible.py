@@ -1,8 +1,7 @@
-"""Known feasible share of a benchmark: a long search for plans of the states where every policy failed.
+"""Known feasible share of a benchmark: a long plan search for the states where every policy failed.
 
-It is the share of the held-out states for which some satisfying plan is known, of a policy or of this search:
-a lower bound of what is feasible. It never falls, and what was searched is kept, so a search goes on where it
-stopped.
+It is the share of the held-out states with a known satisfying plan, of a policy or of this search: a lower
+bound of the feasible share. It never decreases; results are stored, so that a search can be continued.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 PASSES = 10
-"""Searches for every state that is still open."""
+"""Default number of search passes over the open states."""
 TRIES = 20_000
-"""Plans of a search for one state, at most."""
+"""Maximum evaluations of a search for one state."""
 LIBRARY = 4096
-"""Plans of other states that a search may try, at most."""
+"""Maximum size of the plan library."""
 
 _INPUTS = ("spec_sha256", "system_sha256", "held_out", "held_out_seed")
 
@@ -43,12 +42,12 @@ class KnownFeasible:
 
     Attributes:
         benchmark: name.
-        share: of the held-out states that a satisfying plan is known for.
+        share: of the held-out states with a known satisfying plan.
         interval: its 95 % Wilson interval.
         open: states without one.
-        by_search: states that only the search here has solved.
+        by_search: states solved only by this search.
         passes: searches so far.
-        tries: plans that were tried for each open state.
+        tries: evaluated plans for each open state.
     """
 
     benchmark: str
@@ -61,12 +60,12 @@ class KnownFeasible:
 
 
 def key_of(result: Result) -> Key:
-    """The inputs that the states of a result depend on."""
+    """The key of a result's held-out states: all their inputs."""
     return Key(result["key"]["benchmark"], {name: result["key"][name] for name in _INPUTS})
 
 
 def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, KnownFeasible]:
-    """The known feasible shares of the benchmarks of `results`; nothing is searched."""
+    """The stored known feasible shares of the benchmarks of `results`, without a search."""
     groups: dict[str, list[Result]] = {}
     for result in results:
         groups.setdefault(result["key"]["benchmark"], []).append(result)
@@ -79,13 +78,13 @@ def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, K
 def search_on(
     own: Sequence[Result], store: ResultStore, *, passes: int = PASSES, run: RunDir | None = None
 ) -> None:
-    """Search for plans of the states that no policy solves, and keep what is found after every pass.
+    """Search for plans of the states that no policy solves; store the results after every pass.
 
     Args:
         own: results of one benchmark, at least one, all on the same held-out states.
-        store: of what was searched.
-        passes: in all, those of earlier calls included.
-        run: whose policy's plans are where the search begins; without one, from plans that do nothing.
+        store: of search results.
+        passes: total number, earlier calls included.
+        run: its policy gives the initial plans; without one they are constant mid-range controls.
     """
     key = key_of(own[0])
     entry: Mapping[str, Any] = store.find(key) or _blank(own[0])
@@ -103,14 +102,14 @@ def search_on(
 
 @dataclass(slots=True)
 class _Search:
-    """The states that are still open and the best plan of each.
+    """State of a search: the open states and the best plan of each.
 
     Attributes:
         task: of the benchmark.
         states: all of them, (n, dim) float64.
         open: indices of those without a satisfying plan, (k,).
         plans: the best so far of each open one, (k, T, m) float32.
-        rho: of these, (k,).
+        rho: robustness of these, (k,).
         library: plans of solved states, (b, T, m) float32.
     """
 
@@ -123,17 +122,16 @@ class _Search:
 
     @classmethod
     def begin(cls, task: Task, states: Tensor, known: Tensor, run: RunDir | None) -> _Search:
-        """A search in which nothing was tried yet."""
+        """Initialise a search."""
         still = (~known).nonzero()[:, 0]
         plans = _first_plans(task, states, run)
         rho = task.judge(states[still], plans[still].double(), states=False).rho
         return cls(task, states, still, plans[still].float(), rho, plans[known][:LIBRARY].float())
 
     def go_on(self, number: int) -> Tensor:
-        """One pass; returns the indices of the states that it solved.
+        """Run one pass; return the indices of the newly solved states.
 
-        Every other pass starts at plans of other states instead of the best so far: a local search that is
-        stuck stays stuck.
+        Every other pass starts at plans of other states instead of the best so far, to leave local optima.
         """
         if not len(self.open):
             return self.open
@@ -159,7 +157,7 @@ def _first_plans(task: Task, states: Tensor, run: RunDir | None) -> Tensor:
         try:
             return Run.open(run.path).policy.plan(states)
         except StlcError:
-            pass  # the run was removed, or is damaged: the search only takes longer
+            pass  # the run was removed or is damaged: the search only takes longer
     middle = 0.5 * (task.system.control_low + task.system.control_high)
     return middle.expand(len(states), task.horizon, -1)
 
@@ -169,12 +167,12 @@ def _blank(result: Result) -> Result:
 
 
 def _union(digits: Iterable[str], count: int) -> list[bool]:
-    """Where any of the packed sets of `count` truth values holds."""
+    """Element-wise or of packed sets of `count` truth values."""
     return [any(flags) for flags in zip(*(unpack(each, count) for each in digits), strict=True)]
 
 
 def _solved(entry: Mapping[str, Any], own: Sequence[Result]) -> list[bool]:
-    """Where the search or any policy knows a plan."""
+    """Mask of the states with a plan of the search or of any policy."""
     return _union((entry["found"], *(each["solved"] for each in own)), int(own[0]["key"]["held_out"]))
 
 

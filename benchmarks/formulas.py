@@ -1,6 +1,6 @@
 """Formulas whose robustness is timed, each also written by hand in plain torch.
 
-Arrays are `(time, batch)`; windows are cut at the end of the trace.
+Arrays are `(time, batch)`; windows are clipped at the end of the trace.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ Plain: TypeAlias = Callable[[Tensor, Tensor, int], Tensor]
 """Signals x and y `(time, batch)` and the width of a window in steps -> robustness at every sample."""
 
 _FEW = 1 << 12
-"""Up to so many numbers windows are laid side by side."""
+"""Number of array elements up to which windows are unfolded."""
 
 
 def plain_always_to_end(x: Tensor) -> Tensor:
-    """Least value from every sample on."""
+    """Minimum from every sample to the end."""
     return torch.cummin(x.flip(0), dim=0).values.flip(0)
 
 
 def plain_always(x: Tensor, width: int) -> Tensor:
-    """Least value of every sample and the `width` after it."""
+    """Minimum over every sample and the `width` samples after it."""
     if x.numel() * (width + 1) <= _FEW:
         return _beside(x, width, math.inf).amin(-1)
     return -_van_herk(-x, width + 1)
 
 
 def plain_eventually(x: Tensor, width: int) -> Tensor:
-    """Greatest value of every sample and the `width` after it."""
+    """Maximum over every sample and the `width` samples after it."""
     if x.numel() * (width + 1) <= _FEW:
         return _beside(x, width, -math.inf).amax(-1)
     return _van_herk(x, width + 1)
@@ -64,7 +64,7 @@ def _beside(x: Tensor, width: int, fill: float) -> Tensor:
 
 
 def _van_herk(x: Tensor, rows: int) -> Tensor:
-    """Maxima of `rows` samples: running maxima of blocks, forwards and backwards."""
+    """Sliding maxima over `rows` samples by van Herk's algorithm: block maxima forwards and backwards."""
     samples, batch = x.shape
     blocks = -(-(samples + rows - 1) // rows)
     padded = torch.nn.functional.pad(x, (0, 0, 0, blocks * rows - samples), value=-math.inf)
@@ -80,7 +80,7 @@ class Case:
 
     Attributes:
         name: as it is printed; `w` stands for the width of its windows.
-        formula: for windows of so many steps.
+        formula: as a function of the window width in steps.
         plain: the same in plain torch.
     """
 
@@ -131,4 +131,4 @@ CASES = (
         lambda x, _, __: plain_conjunction(x, _TEN),
     ),
 )
-"""The formulas."""
+"""All timed formulas."""

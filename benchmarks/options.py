@@ -33,7 +33,7 @@ PageOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Where a table is written."""
+    """Output options of a table."""
 
     page: PageOption = None
     as_json: JsonOption = False
@@ -41,7 +41,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """Trainings behind a table."""
+    """Options of the trainings behind a table."""
 
     budget: Annotated[
         list[str] | None,
@@ -85,10 +85,10 @@ class Training:
     runs: TrainedOption = Path("runs/benchmarks")
 
     def seeds_and_lengths(self, usual: Sequence[float]) -> list[tuple[int, Length]]:
-        """Seed and length of each training, short ones first, then early seeds: a table fills evenly.
+        """Seed and length of each training, ordered by length, then seed, so that a table fills evenly.
 
         Raises:
-            UsageError: U101, for budgets and steps at once.
+            UsageError: U101, budgets and steps are both given.
         """
         from benchmarks.training import Length
 
@@ -102,7 +102,7 @@ class Training:
         return [(seed, length) for length in lengths for seed in parse_seeds(self.seeds)]
 
     def place(self, table: str) -> Place:
-        """Where the results of a table and their runs lie, and how they are made."""
+        """Store, run folder and parallelism of a table's trainings."""
         from benchmarks.store import ResultStore
         from benchmarks.training import Place
 
@@ -111,7 +111,7 @@ class Training:
 
 
 def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]:
-    """Names in a comma-separated list, all of them without one. Raises UsageError (U101) for others."""
+    """Names in a comma-separated list (default: all). Raises UsageError (U101) for unknown ones."""
     if text is None:
         return tuple(known)
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
@@ -126,7 +126,7 @@ def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]
 
 
 def opened(names: Sequence[str] | None) -> list[RunDir]:
-    """The runs that are named, else the newest one."""
+    """The named runs, else the newest one."""
     from stlc.rundir import RunDir
 
     return [RunDir.open(name) for name in names or ["latest"]]

@@ -1,4 +1,4 @@
-"""Results that are kept: JSON files of a table each, every result under what it depends on."""
+"""Stored results: a JSON file per table, each result under a key of its inputs."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ Result = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """The inputs of a result; a result of other inputs is computed again.
+    """The inputs of a result; if they change, the result is computed again.
 
     Attributes:
-        name: of the result, one of its kind in its file.
+        name: of the result, unique in its file.
         values: plain data: specification, system, method and its version, version of the guard, seeds, sizes.
     """
 
@@ -43,7 +43,7 @@ class Key:
 
     @property
     def digest(self) -> str:
-        """All values in ten hexadecimal digits."""
+        """Hash of all values, ten hexadecimal digits."""
         return sha256(dumps(plain(self.values)))[:10]
 
 
@@ -56,21 +56,21 @@ class ResultStore:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the file."""
         return self.folder / f"{self.table}.json"
 
     def get(self, key: Key, compute: Callable[[], Result]) -> Result:
-        """The result of `key`: the one that is kept, else what `compute` gives, which is kept from now on."""
+        """The stored result of `key`, else that of `compute`, which is then stored."""
         found = self.find(key)
         return found if found is not None else self.put(key, compute())
 
     def find(self, key: Key) -> Result | None:
-        """The result that is kept of these inputs."""
+        """The stored result of these inputs, or None."""
         kept = self.all().get(key.name)
         return kept if kept is not None and kept.get("key") == plain(key.values) else None
 
     def put(self, key: Key, result: Result) -> Result:
-        """Keep a result in place of what there is of that name; it says on which machine it was made."""
+        """Store a result under its name, replacing an older one, with its provenance."""
         document = {"name": key.name, "key": key.values, "made": made_here(), **result}
         kept = {**self.all(), key.name: plain(document)}
         lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
@@ -78,7 +78,7 @@ class ResultStore:
         return self.all()[key.name]
 
     def all(self) -> dict[str, dict[str, Any]]:
-        """All results by name, also those of other inputs than today's."""
+        """All results by name, outdated ones included."""
         with suppress(OSError, ValueError):
             document = json.loads(self.path.read_text(encoding="utf-8"))
             if isinstance(document, dict) and document.get("format") == FORMAT:

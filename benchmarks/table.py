@@ -1,4 +1,4 @@
-"""Tables as they are shown: in a terminal, in Markdown, as JSON; and the pages that take them."""
+"""Tables for terminal, Markdown and JSON, and the pages that contain them."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ float64.
 
 @dataclass(frozen=True)
 class Table(Generic[Cell, Row]):
-    """A table: cells are measured one after the other, each gives a row.
+    """A table: each cell is measured in turn and gives a row.
 
     Attributes:
         name: of the table.
         cells: to measure.
-        measure: cell -> row, a dataclass; its fields and properties are what JSON shows.
+        measure: cell -> row, a dataclass; its fields and properties are the JSON values.
         columns: header -> text of a row, for a terminal and for Markdown.
-        told: what is said of a row as soon as it is measured.
+        told: message printed when a row is measured.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Table(Generic[Cell, Row]):
 
     @cached_property
     def rows(self) -> list[Row]:
-        """All rows; measured when they are first asked for."""
+        """All rows, measured on first access."""
         rows = []
         for cell in self.cells:
             rows.append(self.measure(cell))
@@ -76,7 +76,7 @@ class Table(Generic[Cell, Row]):
 
 
 def values(row: Any) -> dict[str, Any]:
-    """Fields and public properties of a dataclass, and of those in it."""
+    """Fields and public properties of a dataclass, recursively."""
     if not hasattr(row, "__dataclass_fields__"):
         return row  # type: ignore[no-any-return]
     names = [each.name for each in fields(row)]
@@ -109,7 +109,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def write_section(page: Path, marker: str, lines: Iterable[str]) -> None:
-    """Put lines where `page` has `<!-- marker -->`, at its end if it has none yet."""
+    """Write lines at `<!-- marker -->` in `page`, or at its end if it has no marker."""
     text = page.read_text(encoding="utf-8") if page.is_file() else HEAD
     start, end = f"<!-- {marker} -->\n", f"<!-- /{marker} -->\n"
     head, found, rest = text.partition(start)
@@ -120,11 +120,11 @@ def write_section(page: Path, marker: str, lines: Iterable[str]) -> None:
 
 
 def provenance(results: Iterable[Result], what: str) -> list[str]:
-    """Bullets for every machine and version that made results, with commits and dates.
+    """Provenance bullets: a line for every machine and version, with commits and dates.
 
     Args:
-        results: that are shown.
-        what: they are, in the plural.
+        results: shown ones.
+        what: noun for them, in the plural.
     """
     groups: dict[str, list[Result]] = {}
     for each in results:
@@ -144,7 +144,7 @@ def provenance(results: Iterable[Result], what: str) -> list[str]:
 
 
 def measured_here() -> str:
-    """The machine, the software and the commit of what has just been measured, as a bullet."""
+    """Machine, software and commit of the present measurement, as a bullet."""
     made = made_here()
     return f"- {_machine(made)}; {made['date'][:10]}; commit `{_commit(made)}`"
 
@@ -156,11 +156,11 @@ def _machine(made: Result) -> str:
 
 
 def _commit(made: Result) -> str:
-    """Of the source tree that made a result, with `+` where that had changes."""
+    """Commit of the source tree that made a result, with `+` for uncommitted changes."""
     git = made.get("git") or {}
     return str(git.get("commit") or "unknown")[:10] + ("+" if git.get("dirty") else "")
 
 
 def _counted(count: int, what: str) -> str:
-    """Such as `1 core`."""
+    """A count with its noun, such as `1 core`."""
     return f"{count} {what if count != 1 else what.removesuffix('s')}"

@@ -1,4 +1,4 @@
-"""Times of functions, measured in turn so that a busy machine slows all of them alike."""
+"""Timing of functions, interleaved so that other load affects all of them alike."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import torch
 from stlc.dynamics.model.memory import keep_freed_memory
 
 _SLICE = 0.01
-"""Seconds that one measurement takes at least."""
+"""Minimum duration of one measurement in seconds."""
 WARM = 5
-"""Measurements that are repeated, because the first ones warm the caches."""
+"""Number of first measurements that are repeated, as they warm the caches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Times:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Times | None:
-        """None of nothing."""
+        """Statistics of times in seconds; None for an empty list."""
         if not seconds:
             return None
         median, p99 = np.quantile(1e3 * np.asarray(seconds), (0.5, 0.99))
@@ -43,11 +43,11 @@ class Times:
 
 
 def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> list[list[float]]:
-    """Processor times of each function in seconds, over rounds in which every one has its turn.
+    """Processor times of each function in seconds, one per round.
 
     Args:
-        functions: what to time.
-        seconds: how long to go on; at least three rounds are made.
+        functions: to time.
+        seconds: total duration; at least three rounds are made.
     """
     often = [_repeats(function) for function in functions]
     samples: list[list[float]] = [[] for _ in functions]
@@ -59,12 +59,12 @@ def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> li
 
 
 def ratio(some: Sequence[float], others: Sequence[float]) -> float:
-    """How many times longer some took than others: the median over rounds."""
+    """Median over rounds of the ratio of two functions' times."""
     return median(a / b for a, b in zip(some, others, strict=True))
 
 
 def _repeats(function: Callable[[], object]) -> int:
-    """How often a function is called in one measurement; the first calls are not counted."""
+    """Number of calls of a function per measurement, after warm-up calls."""
     function()
     once = _timed(function, 1)
     return max(int(_SLICE / max(once, 1e-9)), 1)
@@ -79,7 +79,7 @@ def _timed(function: Callable[[], object], repeats: int) -> float:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch computes in one thread, and freed memory stays: what is timed is arithmetic, not fresh pages."""
+    """Use one thread of torch and keep freed memory, so that page faults are not timed."""
     keep_freed_memory()
     before = torch.get_num_threads()
     torch.set_num_threads(1)

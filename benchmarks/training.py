@@ -1,4 +1,4 @@
-"""Trainings behind tables: those that are kept, those that were cut short, and the others, side by side."""
+"""Trainings behind tables: stored results, resumed and new trainings, in parallel."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Length:
 
     @property
     def text(self) -> str:
-        """The same for people."""
+        """Readable form, such as `60 s`."""
         if self.steps is not None:
             return f"{self.steps:,} steps"
         return f"{self.seconds:g} s" + (" of processor time" if self.clock == "processor" else "")
@@ -60,7 +60,7 @@ class Length:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A benchmark trained once.
+    """One training of a benchmark.
 
     Attributes:
         benchmark: name of the specification.
@@ -90,7 +90,7 @@ class Cell:
 
     @property
     def key(self) -> Key:
-        """Its inputs. Raises UsageError, SpecError, SystemFileError where a file is missing or invalid."""
+        """The key of its result. Raises UsageError, SpecError, SystemFileError for a bad file."""
         return Key(
             self.name,
             {
@@ -127,14 +127,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where results and runs lie, and how many processes make them.
+    """Store, run folder and parallelism of trainings.
 
     Attributes:
         store: of the results.
         runs: folder of the runs behind them.
         jobs: processes at a time.
         threads: of torch in each.
-        cluster: address of a cluster that trains instead of this machine.
+        cluster: address of a Ray cluster to train on.
     """
 
     store: ResultStore
@@ -144,7 +144,7 @@ class Place:
     cluster: str | None = None
 
     def runs_of(self, key: Key) -> Path:
-        """The folder of the runs of one cell; other inputs have another one."""
+        """The folder of the runs of one cell, distinct for other inputs."""
         return self.runs / f"{key.name}-{key.digest}"
 
     def newest_run(self, key: Key) -> RunDir | None:
@@ -158,12 +158,12 @@ class Place:
             return None
 
     def best_run(self, results: Sequence[Result]) -> RunDir | None:
-        """The run of the most accurate of some results, where it is still there."""
+        """The run of the most accurate result, if it still exists."""
         best = max(results, key=lambda result: float(result["accuracy"]))
         return self.newest_run(Cell.of(best).key)
 
     def valid(self) -> list[Result]:
-        """The results whose specification, system and method are those of today."""
+        """The results whose specification, system and method are unchanged."""
         return [each for each in self.store.all().values() if each["key"] == Cell.of(each).key.values]
 
 
@@ -173,9 +173,9 @@ class Filling:
 
     Attributes:
         results: in the order of the cells.
-        trained: how many were trained now.
-        kept: how many were there.
-        failed: name and reason of those that broke off.
+        trained: number of new trainings.
+        kept: number of stored results.
+        failed: name and reason of failed trainings.
     """
 
     results: tuple[Result, ...]
@@ -185,12 +185,12 @@ class Filling:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """For the JSON document."""
+        """The facts for the JSON document."""
         return {"trained": self.trained, "kept": self.kept, "failed": list(self.failed)}
 
 
 def filled(cells: Sequence[Cell], place: Place) -> Filling:
-    """Results of cells: those that are kept, and the others as they are trained; says how it goes."""
+    """Results of cells, stored or newly trained; prints progress."""
     found: dict[str, Result] = {}
     failed: list[dict[str, str]] = []
     kept = 0
@@ -210,7 +210,7 @@ def filled(cells: Sequence[Cell], place: Place) -> Filling:
 
 
 def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
-    """About how long the other trainings take, by their budgets; "" where these are steps."""
+    """Estimated remaining time of the other trainings, by their budgets; "" for step counts."""
     lengths = [cell.length.seconds for cell in cells if cell.name not in done]
     if not lengths or None in lengths:
         return ""
@@ -219,7 +219,7 @@ def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
 
 
 def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | None, str]]:
-    """(cell, result, "kept" or ""), or (cell, None, why it broke off)."""
+    """(cell, result, "kept" or ""), or (cell, None, reason of the failure), as they end."""
     wanted: dict[str, Cell] = {}
     for cell in cells:
         kept = place.store.find(cell.key)
@@ -244,13 +244,13 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
 
 
 def _sent(jobs: Sequence[Job], place: Place, begun: Callable[[Job], None]) -> Iterator[JobResult]:
-    """Jobs run on this machine or on the cluster."""
+    """Run jobs on this machine or on the cluster."""
     cluster = place.cluster if jobs else None
     return executor(place.jobs, cluster, cores=place.threads).run(jobs, begun)
 
 
 def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
-    """A training as a command of `stlc train`, new or resumed, with what another machine needs for it."""
+    """A training as a job: a new or resumed `stlc train`, with its input files for another machine."""
     runs = place.runs_of(cell.key)
     if run is not None:
         arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
@@ -269,7 +269,7 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
 
 
 def collect(run: RunDir, *, cores: int | None = None) -> Result:
-    """Everything that is known about the run of a training."""
+    """Collect the result of a training from its run."""
     record = run.record()
     held = load_held_out(run.path / "eval" / "held_out.npz")
     solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
@@ -286,9 +286,9 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
 
 
 def training_accuracy(folder: RunDir) -> float | None:
-    """Share of its training states that a run's policy satisfies the specification on.
+    """Training accuracy: share of the training states on which a run's policy satisfies the specification.
 
-    None where training drew fresh states in every step.
+    None if training drew fresh states in every step.
     """
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
     states = saved.tensors.get("training.states")
@@ -309,7 +309,7 @@ def _curve(run: RunDir) -> list[dict[str, float | None]]:
 def grouped(
     results: Sequence[Result], key: Callable[[Cell], tuple[Any, ...]]
 ) -> dict[tuple[Any, ...], list[Result]]:
-    """Results of the trainings that have a key in common, by seed."""
+    """Results grouped by a key, each group sorted by seed."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in sorted(results, key=lambda each: int(each["key"]["seed"])):
         groups.setdefault(key(Cell.of(result)), []).append(result)
@@ -322,7 +322,7 @@ def benchmark_order(name: str) -> tuple[int, str]:
 
 
 def pack(flags: Sequence[bool]) -> str:
-    """Truth values as hexadecimal digits, the first one in the highest place."""
+    """Pack truth values into hexadecimal digits, the first one in the highest bit."""
     bits = "".join("1" if flag else "0" for flag in flags)
     return f"{int(bits or '0', 2):0{-(-len(flags) // 4)}x}"
 

@@ -1,1 +1,1 @@
-"""Tables, a module each: what is measured, its options, its columns and its text."""
+"""Tables, a module each: measurement, options, columns and text."""

@@ -29,7 +29,7 @@ k = 500, a network of 256x3 and 50,000 samples. Beside ours: the table of the pa
 _TRAINING, _OUTPUT = Training(), Output(Path("docs/results.md"))
 
 Reported = Mapping[str, tuple[float, float]]
-"""Value -> accuracy on training and on validation states, as the paper has them."""
+"""Value -> training and validation accuracy in the paper."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Axis:
         name: for options and files.
         title: for people.
         key: of the system file.
-        default: where it stands while another one is varied.
+        default: value while another one is varied.
         reported: values and what the paper reports for them.
     """
 
@@ -115,7 +115,7 @@ class Row:
         seeds: how many.
         training: accuracy on the training states, mean over seeds.
         accuracies: on the held-out states, one a seed.
-        reported: training and validation accuracy in the paper; None where it has no such row.
+        reported: training and validation accuracy in the paper; None if it has no such row.
     """
 
     axis: str
@@ -133,7 +133,7 @@ class Row:
 
     @property
     def spread(self) -> str:
-        """Mean, and least and greatest of several seeds."""
+        """Mean, and with several seeds minimum and maximum."""
         spread = f" ({min(self.accuracies):.3f} to {max(self.accuracies):.3f})" if self.seeds > 1 else ""
         return f"{self.accuracy:.3f}{spread}"
 
@@ -150,7 +150,7 @@ COLUMNS: dict[str, Callable[[Row], str]] = {
 
 
 def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_out: int) -> list[Cell]:
-    """The trainings of the tables; what several tables have in common is one of them."""
+    """The trainings of the tables, shared ones once."""
     settings = [("base", "")]
     settings += [
         (axis.name, value)
@@ -170,7 +170,7 @@ def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_
 
 
 def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, Row]:
-    """The rows of axis after axis, each with the defaults in their place."""
+    """The rows, axis by axis, each with the row of the defaults."""
     groups = grouped(results, lambda cell: (cell.axis, cell.value, cell.length.text))
     lengths = dict.fromkeys(length for _, _, length in groups)
     cells = []
@@ -200,7 +200,7 @@ def _row(axis: Axis, value: str, length: str, own: Sequence[Result]) -> Row:
 
 
 def section(results: Sequence[Result]) -> list[str]:
-    """The section of the page; an axis of which only the default is known is left out."""
+    """The section of the page, without axes for which only the default is known."""
     lines = ["## Ablation", "", TEXT.rstrip()]
     for axis in AXES:
         made = table(results, [axis.name])
@@ -215,8 +215,8 @@ def section(results: Sequence[Result]) -> list[str]:
 def ablation(only: OnlyOption = None, training: Training = _TRAINING, output: Output = _OUTPUT) -> None:
     """Repeat the paper's tables for gamma, k, network size and number of samples on traffic.
 
-    60 s if no budget is given. Results of the same inputs are kept; a training that was cut short goes on
-    where it stopped. Exit code 1 if a training broke off.
+    60 s if no budget is given. Stored results with the same inputs are reused; interrupted trainings are
+    resumed. Exit code 1 if a training failed.
     """
     axes = chosen(only, [axis.name for axis in AXES], "table")
     place = training.place("ablation")

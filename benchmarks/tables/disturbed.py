@@ -1,4 +1,4 @@
-"""Policies in worlds that are not as their model says, without a guard and with one."""
+"""Policies under model mismatch, disturbances and noise, without a guard and with one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Where agents are driven unsafely though the model is right and the full guard ac
 plan accounts for. Of the starts through whose window there was no exogenous event:
 """
 MOST = 0.95
-"""Share of safe starts below which a world is to blame where the model is right."""
+"""Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""
 METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
 """Columns of each guard."""
 TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
@@ -102,7 +102,7 @@ def section(results: Sequence[Result]) -> list[str]:
 
 
 def _lost_to_the_world(row: Row) -> bool:
-    """Whether the world makes what was driven unsafe: the model is right, and the full guard acts."""
+    """Whether unsafe drives are due to the world: the model is exact, and the full guard is active."""
     every, quiet = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
     return every is not None and quiet is not None and float(every["mean"]) < min(float(quiet["mean"]), MOST)
 
@@ -132,9 +132,9 @@ def disturbed(
     drives: Drives = _DRIVES,
     output: Output = _OUTPUT,
 ) -> None:
-    """Deploy policies in worlds that are not as their model says, without a guard and with one.
+    """Deploy policies under model mismatch, disturbances and noise, without a guard and with one.
 
-    Deployments that are there are kept if run, world, guard and size are still the same.
+    Stored deployments are reused if run, world, guard and size are unchanged.
     """
     modes = [name for name in map(str.strip, guards.split(",")) if guard_of(name)]
     laid = tuple(name.strip() for name in scenarios.split(",")) if scenarios else SCENARIOS

@@ -1,4 +1,4 @@
-"""One policy for all values of a parameter, judged at single values inside and outside of its range.
+"""One policy for all values of a parameter, validated at values inside and outside its range.
 
 A family is a specification in `specs/families/`: that of a benchmark with one constant made a `param`. A
 policy is trained once, on values drawn from the declared range.
@@ -37,14 +37,14 @@ _OUTPUT = Output(Path("docs/results.md"))
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """A specification with one parameter, and the values at which its policy is judged.
+    """A specification with one parameter, and the values at which its policy is validated.
 
     Attributes:
         name: of the specification in `specs/families/`.
         parameter: its name.
         unit: of the parameter and of `values`.
-        title: what is varied, for people.
-        values: in order, some inside of the range that is trained on and some outside.
+        title: description of the parameter.
+        values: in order, some inside and some outside the training range.
     """
 
     name: str
@@ -86,12 +86,12 @@ class Row:
     Attributes:
         family: name.
         value: of the parameter, in the family's unit.
-        inside: whether training drew such values.
+        inside: whether the value is in the training range.
         length: of training, such as `60 s`.
         seeds: of training.
         accuracy: mean over seeds.
         interval: its 95 % Wilson interval, over the states of all seeds.
-        feasible: share of the states for which some satisfying plan is known, mean over seeds.
+        feasible: share of the states with a known satisfying plan, mean over seeds.
     """
 
     family: str
@@ -105,7 +105,7 @@ class Row:
 
     @property
     def share(self) -> float | None:
-        """Of the known feasible states."""
+        """Accuracy over the known feasible states."""
         return self.accuracy / self.feasible if self.feasible else None
 
 
@@ -128,13 +128,13 @@ def _named(name: str) -> Family:
 
 
 def key_of(training: Result, value: float) -> Key:
-    """The inputs of the verdict on a trained policy at one value."""
+    """The key of the verdict on a trained policy at one value: its inputs."""
     values = {"training": training["key"], "trained": training["made"]["date"], "value": value}
     return Key(f"{training['name']} at {value:g}", values)
 
 
 def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) -> list[dict[str, str]]:
-    """Judge policies at the values where they were not judged yet; name and reason of those that cannot."""
+    """Validate policies at values without a stored verdict; return name and reason of failures."""
     failed = []
     for training in trainings:
         cell = Cell.of(training)
@@ -153,13 +153,13 @@ def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) 
 
 
 def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[str, Any]:
-    """Held-out accuracy of a policy where the parameter has one value."""
+    """Held-out accuracy of a policy at one value of the parameter."""
     opened = Run.open(run, overrides={family.parameter: f"{value}{family.unit}"})
     return score(opened.task, opened.policy, n=held_out).summary()
 
 
 def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
-    """Families, then lengths, then values."""
+    """The rows, ordered by family, length and value."""
     cells = [
         (family, length, value, found)
         for (benchmark, length), own in grouped(
@@ -205,10 +205,10 @@ def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
     "python -m benchmarks family --only stop_time --budget 60s --seeds 0..2 --jobs 2",
 )
 def family(only: OnlyOption = None, training: Training = _TRAINING, output: Output = _OUTPUT) -> None:
-    """Train one policy for all values of a parameter, and judge it inside and outside of its range.
+    """Train one policy for all values of a parameter, and validate it inside and outside its range.
 
-    60 s if no budget is given. Results of the same inputs are kept, verdicts at single values too; a training
-    that was cut short goes on where it stopped. Exit code 1 if a training broke off.
+    60 s if no budget is given. Stored results and verdicts with the same inputs are reused; interrupted
+    trainings are resumed. Exit code 1 if a training failed.
     """
     names = chosen(only, [each.name for each in FAMILIES], "family")
     cells = [

@@ -1,7 +1,7 @@
-"""Time that a decision for one agent takes on one thread, without a guard and with each.
+"""Latency of a decision for one agent on one thread, without a guard and with each.
 
-States are those of deployments under the paper's guard. Half of them are spread evenly over what was
-visited; the others are states in which a guard had to act, because those are rare where a policy is good.
+States are taken from deployments under the paper's guard: half evenly from all visited states, half from
+states with an intervention, which are rare for a good policy.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class Row:
     Attributes:
         benchmark: name of the specification.
         run: of the policy.
-        guard: which; `policy` for its plan, rollout and verdict alone.
-        every: times in states that are spread evenly over what was visited.
-        acting: times of decisions in which the guard replaced the policy's plan; None where it never did.
+        guard: name; `policy` for the policy's plan, rollout and verdict alone.
+        every: times in evenly chosen visited states.
+        acting: times of decisions with an intervention of the guard; None without any.
     """
 
     benchmark: str
@@ -90,7 +90,7 @@ def latency(
 ) -> None:
     """Time decisions for one agent, without a guard and with each.
 
-    Milliseconds on one thread, in states of deployments. The full guard has its usual limit of 100 ms a
+    Milliseconds on one thread, in states of deployments. The full guard has its default limit of 100 ms per
     decision.
     """
     rows = (
@@ -106,7 +106,7 @@ def latency(
 
 
 def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
-    """A row for the policy alone and one for every guard."""
+    """The rows: the policy alone, then every guard."""
     task, test = run.task, run.task.system.decl.test
     guards = {mode: Guard(task, run.policy, mode, limits=Limits()) for mode in GUARDS}
     setting = Setting(seeds, min(AGENTS, test.agents), test.steps, test.replan)
@@ -121,7 +121,7 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
 
 
 def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places (row, step), half of them spread evenly, (k, 2), and half where the guard acted, (l, 2)."""
+    """Indices (row, step) of states: evenly chosen ones, (k, 2), and ones with an intervention, (l, 2)."""
     half = max(samples // 2, 1)
     every = np.argwhere(np.ones_like(recording.source, dtype=bool))
     return _spread(every, half), _spread(np.argwhere(recording.source > 0), half)
@@ -146,7 +146,7 @@ def _alone(run: Run, recording: DeploymentRecording, places: NDArray[np.int64]) 
 def _timed(
     guard: Guard, recording: DeploymentRecording, places: NDArray[np.int64]
 ) -> list[tuple[float, int]]:
-    """Seconds of each decision, and who took it. The first few are taken twice: they warm the caches."""
+    """Seconds and source of each decision. The first few are repeated, as they warm the caches."""
     found = []
     for row, step in (*places[:WARM], *places):
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]

@@ -41,9 +41,9 @@ class Row:
         method: of training.
         length: such as `60 s`.
         seeds: in order.
-        accuracies: one a seed, on the same held-out states.
+        accuracies: one per seed, on the same held-out states.
         interval: 95 % Wilson interval of the mean, over the states of all seeds.
-        known_feasible: share of those states for which a satisfying plan is known; None before a search.
+        known_feasible: share of those states with a known satisfying plan; None before a search.
         requirements: share per requirement, mean over seeds.
         seconds: of training, mean over seeds.
         steps: mean over seeds.
@@ -67,12 +67,12 @@ class Row:
 
     @property
     def share(self) -> float | None:
-        """Of the known feasible states."""
+        """Accuracy over the known feasible states."""
         return self.accuracy / self.known_feasible if self.known_feasible else None
 
     @property
     def worst_share(self) -> float | None:
-        """Of the known feasible states, by the worst seed."""
+        """Accuracy of the worst seed over the known feasible states."""
         return min(self.accuracies) / self.known_feasible if self.known_feasible else None
 
 
@@ -122,7 +122,7 @@ FEASIBLE: dict[str, Callable[[KnownFeasible], str]] = {
 
 
 def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dict[str, Table[Any, Any]]:
-    """The rows of benchmarks, methods and lengths; and the known feasible shares of these benchmarks."""
+    """The table of benchmarks, methods and lengths, and that of the known feasible shares."""
     groups = grouped(results, lambda cell: (cell.benchmark, cell.method, cell.length.text))
     ordered = sorted(
         groups.values(),
@@ -154,7 +154,7 @@ def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], *, pi
 
 
 def draw(results: Sequence[Result], known: Mapping[str, KnownFeasible], folder: Path) -> bool:
-    """Draw accuracy over time of the longest trainings into the page's folder, where that can be done."""
+    """Draw accuracy over time of the longest trainings into the page's folder; False without matplotlib."""
     longest: dict[str, dict[tuple[str, int], Result]] = {}
     for each in sorted(results, key=lambda each: float(each["seconds"])):
         key = each["key"]
@@ -189,10 +189,10 @@ def paper(
     training: Training = _TRAINING,
     output: Output = _OUTPUT,
 ) -> None:
-    """Train and judge the six benchmarks of the paper, and write the tables and curves.
+    """Train and validate the six benchmarks of the paper, and write the tables and curves.
 
-    60 s and 300 s if no budget is given. Results of the same inputs are kept; a training that was cut short
-    goes on where it stopped. Exit code 1 if a training broke off.
+    60 s and 300 s if no budget is given. Stored results with the same inputs are reused; interrupted
+    trainings are resumed. Exit code 1 if a training failed.
     """
     names = chosen(only, BENCHMARKS, "benchmark")
     which = [method for method in METHODS.names if method in chosen(methods, METHODS.names, "method")]

@@ -1,7 +1,7 @@
-"""Repair of plans that the monitor rejects: how often each way succeeds, and how long it takes.
+"""Repair of rejected plans: success rate and run time of each method.
 
-Each way is tried on the same states of a deployment under the paper's guard, one agent at a time: gradient
-steps, local searches of two lengths, gradient steps and then a local search as plan repair does it, and the
+Each method runs on the same states of a deployment under the paper's guard, one agent at a time: gradient
+refinement, local search of two lengths, gradient refinement then local search as in plan repair, and the
 whole guard.
 """
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 SHORT, LONG = 2000, 32_000
-"""Plans that a local search tries for each of its two initial guesses."""
+"""Evaluations of a local search for each of its two initial guesses."""
 
 TEXT = """## Repair of a plan
 
@@ -52,23 +52,23 @@ each of the two, a long one 32,000.
 _OUTPUT = Output()
 
 Way = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""A state (1, n), the plan of the policy and what is left of the one before, (1, T, m) -> plans (k, T, m)."""
+"""A state (1, n), the policy's plan and the previous plan, (1, T, m) each -> plans (k, T, m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mended:
-    """Success of one way in the rejected states of one deployment.
+    """Success of one repair method in the rejected states of one deployment.
 
     Attributes:
         benchmark: name of the specification.
-        scenario: of the system, empty for the system as it is.
-        way: name of it.
-        states: that were tried.
-        solvable: how many of them have a plan for phi, as any of the ways or a search finds one.
-        mended: how many of these this way found one for.
-        savable: how many have a plan for phi_safe.
-        saved: how many of these this way found one for.
-        times: of one state, of the processor.
+        scenario: of the system; empty for the nominal system.
+        way: name of the method.
+        states: number of states.
+        solvable: states with a plan for phi, found by any of the methods or a search.
+        mended: those of them solved by this method.
+        savable: viable states, with a plan for phi_safe.
+        saved: those of them for which this method finds one.
+        times: processor time per state.
     """
 
     benchmark: str
@@ -108,9 +108,9 @@ def repair(
     seeds: SeedsOption = "100,101",
     output: Output = _OUTPUT,
 ) -> None:
-    """Count the rejected plans that each way repairs, and time it.
+    """Count the rejected plans that each repair method repairs, and time it.
 
-    Gradient steps, local searches, both, and the whole guard, on the same states of a deployment.
+    Gradient refinement, local search, both, and the whole guard, on the same states of a deployment.
     """
     cells = product(opened(runs), ("", *(scenario or ())))
     rows = (
@@ -129,7 +129,7 @@ def repair(
 
 
 def ways_of(task: Task, backup: StagedSearch) -> dict[str, Way]:
-    """The ways by name."""
+    """The repair methods by name."""
     enough = TO_SPARE * task.system.decl.objective.gamma
     ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), enough=enough)
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), enough=enough)
@@ -153,7 +153,7 @@ def ways_of(task: Task, backup: StagedSearch) -> dict[str, Way]:
 
 
 def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """States in which the guard acted and both plans are rejected: the policy's, and what was left of one."""
+    """States with an intervention, and two rejected plans: the policy's and the previous one."""
     task, test = run.task, run.task.system.decl.test
     guard = Guard(task, run.policy, "paper")
     recording = recorded(guard, Setting(seeds, min(AGENTS, test.agents), test.steps, test.replan))
@@ -184,7 +184,7 @@ def _rows(run: Run, states: list[tuple[Tensor, Tensor, Tensor]], scenario: str) 
 def _tried(
     task: Task, way: Way, states: list[tuple[Tensor, Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor, Times | None]:
-    """Where a way finds a plan for phi, where one for phi_safe, and how long it takes."""
+    """Masks of the states for which a method finds a plan for phi, and for phi_safe; and its times."""
     met, safe, seconds = [], [], []
     for state in (*states[:WARM], *states):
         begin = process_time()

@@ -1,7 +1,7 @@
 """Time of the robustness of whole traces, against one pass over memory and against plain torch.
 
 A pass is `x.clone()`, and with gradients its backward too, over one signal of the same size. Traces are
-float32 on one thread; values are those at every sample, windows cut at the end.
+float32 on one thread; robustness is computed at every sample, with windows clipped at the end.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SAMPLES = (20, 100, 1000, 10_000)
 TRACES = (1, 1000)
 
 _MOST_PLAIN = 1 << 21
-"""From so many numbers on plain torch is left out: it takes minutes, or all of the memory."""
+"""Number of elements from which on plain torch is omitted: it takes minutes, or exhausts the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +37,12 @@ class Timing:
     Attributes:
         formula: name.
         samples: of a trace.
-        traces: how many.
+        traces: their number.
         width: of its windows, in steps.
         gradient: with the backward pass.
         seconds: processor time.
-        passes: the same as a multiple of one pass over memory.
-        plain: time of plain torch as a multiple of ours; None where it was left out.
+        passes: time as a multiple of one pass over memory.
+        plain: time of plain torch as a multiple of ours; None if omitted.
     """
 
     formula: str
@@ -104,7 +104,7 @@ def timings(
     Args:
         samples: lengths of traces.
         traces: numbers of traces.
-        seconds: of measurement for each row, about.
+        seconds: approximate measurement time per row.
     """
     lengths = tuple(samples)
     cells = [

@@ -1,8 +1,8 @@
 """Time of the parts of a training step, and of rollouts with verdicts and gradients.
 
-Processor time on one thread. The parts of a step are run again one by one, in turn, on a trainer that has
-taken some steps: forward and backward through the network, the verdict on all of its plans, rollout and
-robustness of the chosen ones with their gradient, the optimiser.
+Processor time on one thread. The parts of a step are repeated in turn on a warmed-up trainer: forward and
+backward through the network, the verdict on all of its plans, rollout and robustness of the chosen ones with
+their gradient, the optimiser.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 WARM = 120
-"""Steps before the measurement: by then the search has found plans to learn from."""
+"""Steps before the measurement, so that the search has found plans to learn from."""
 MOST_STEPS = 100_000
 ROLLOUTS, VERDICTS = 2_000, 16_384
 REPORTED = dict(zip(BENCHMARKS, (59.0, 79.0, 83.0, 81.0, 115.0, 181.0), strict=True))
@@ -57,7 +57,7 @@ _OUTPUT = Output()
 
 @dataclass(frozen=True, slots=True)
 class StepTiming:
-    """Milliseconds of processor time of one training step, and of what it is made of.
+    """Milliseconds of processor time of one training step and of its parts.
 
     Attributes:
         benchmark: name of the specification.
@@ -68,8 +68,8 @@ class StepTiming:
         gradient: rollout and robustness of the chosen plans, with gradients.
         backward: of the network.
         optimiser: clipping, Adam, and the average of the weights.
-        whole: the step, what is not listed above included.
-        search: beside it, in a thread of its own: a round of search by the steps between two.
+        whole: the step, with parts not listed above.
+        search: a search round, in its own thread, divided by the steps between two rounds.
     """
 
     benchmark: str
@@ -91,9 +91,9 @@ class Speed:
     Attributes:
         benchmark: name of the specification.
         steps: of a rollout.
-        native: milliseconds of 2,000 rollouts with robustness and gradient as C; None where torch does it.
+        native: milliseconds of 2,000 rollouts with robustness and gradient in C; None without a kernel.
         torch: the same in torch.
-        reported: of a step of the authors' code with as many states.
+        reported: of a step of the authors' code with the same number of states.
         verdicts: rollouts with verdict a second, without gradient.
     """
 
@@ -106,7 +106,7 @@ class Speed:
 
     @property
     def share(self) -> float | None:
-        """Of the authors' time."""
+        """Share of the authors' time."""
         ours = self.torch if self.native is None else self.native
         return None if self.reported is None else ours / self.reported
 
@@ -149,7 +149,7 @@ def step(
 ) -> None:
     """Time the parts of a training step, and rollouts with verdicts and gradients.
 
-    Milliseconds of processor time on one thread; the search beside it runs on another core.
+    Milliseconds of processor time on one thread; the concurrent search runs on another core.
     """
     names = chosen(only, BENCHMARKS, "benchmark")
     steps = Table(
@@ -175,7 +175,7 @@ def step(
 
 
 def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTiming:
-    """The parts of a training step of the engine."""
+    """Time the parts of a training step."""
     engine = resolve_config(task, TrainConfig(seed=0, threads=1))
     trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
     for _ in range(warm):
@@ -198,7 +198,7 @@ def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTimi
 
 
 def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
-    """Forward; verdict; gradient; forward and backward; optimiser."""
+    """The parts as functions: forward; verdict; gradient; forward and backward; optimiser."""
     task, network, count = trainer.task, trainer.network, trainer.config.plans
     plans = network(x0).detach()
     direction = torch.ones_like(plans)
@@ -241,7 +241,7 @@ def _searched(trainer: Trainer) -> float:
 
 
 def speed(name: str, task: Task, *, seconds: float) -> Speed:
-    """Rollouts with verdicts, and with gradients."""
+    """Time rollouts with verdicts, and with gradients."""
     x0 = task.sample(VERDICTS, seed=1)
     generator = torch.Generator().manual_seed(2)
     low, high = task.system.control_low, task.system.control_high

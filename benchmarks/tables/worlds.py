@@ -44,7 +44,7 @@ def _named(line: Line) -> str:
 
 
 def _progress(line: Line) -> str:
-    """What the world tells, means alone: `mean speed 4.28, junctions passed 76`."""
+    """Metrics reported by the world, only means: `mean speed 4.28, junctions passed 76`."""
     told = line[0].guards[line[1]]["progress"].items()
     return ", ".join(f"{name.replace('_', ' ')} {float(metric['mean']):.3g}" for name, metric in told)
 
@@ -76,7 +76,7 @@ def section(results: Sequence[Result]) -> list[str]:
 
 
 def wholly_viable(row: Row) -> Iterator[str]:
-    """The figures of the seeds in which every start is viable, where there are others."""
+    """Metrics over the seeds in which every start is viable, if there are others."""
     first = next(iter(row.guards.values()))["metrics"].get("savable") or {"values": ()}
     whole = [index for index, share in enumerate(first["values"]) if share == 1.0]
     if not whole or len(whole) == len(first["values"]):
@@ -104,15 +104,15 @@ def worlds(
     ] = "none,paper,full",
     ceiling: Annotated[
         int,
-        typer.Option("--ceiling", metavar="N", min=0, help="Visited states that are searched for a plan."),
+        typer.Option("--ceiling", metavar="N", min=0, help="Visited states to check for a feasible plan."),
     ] = 1000,
     drives: Drives = _DRIVES,
     output: Output = _OUTPUT,
 ) -> None:
     """Deploy policies in their worlds, without a guard and with each, and write the table.
 
-    What was driven with the same policy, system and setting is kept. A system's scenarios that have worlds of
-    their own are driven, too.
+    Stored deployments with the same policy, system and setting are reused. Scenarios with a world of their
+    own are simulated, too.
     """
     from stlc.controller.training.run import Run
 
@@ -133,7 +133,7 @@ def conclude(
     *,
     as_json: bool,
 ) -> None:
-    """Write the page from all results in the store, and show those that were asked for."""
+    """Write the page from all stored results, and show the requested ones."""
     assert page is not None
     write_section(page, what, section(list(deployments.store.all().values())))
     rows = rows_of(deployments.results)
