@@ -1,12 +1,12 @@
-"""The table of Meng & Fan (2023): an arm that reaches for one goal after the other, around a post.
+"""The table of Meng & Fan (2023): an arm that reaches a sequence of goals around a post.
 
-The truth beside the model of `panda.yaml`. Each arm has a list of goals of its own and moves as the model's
-own step says. Metres, seconds.
+The true world for the model of `panda.yaml`. Each arm has its own sequence of goals and moves by the model's
+step function. Metres, seconds.
 
-* An arm starts at random, as in training; its goals are drawn as in training, too.
+* Starts and goals of arms are drawn as in training.
 * A goal is reached when the flange is within 10 cm of it. One step later the next goal takes its place, so a
   recorded trace has the sample in which the goal was reached.
-* An arm whose flange is inside of the post stands still from then on.
+* An arm whose flange is inside the post stops for good.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ ORIGINS = np.array(  # from one joint to the next, then the flange
     ]
 )
 ROLLS = np.radians([0, -90, 90, 90, -90, 90, 90])  # about x, joint by joint
-REACH, PITCH = 0.95, 2.0  # m that a picture shows around an arm, and from one to the next
-ABOVE = -1.35  # m from the floor of the views from the side to the middle of those from above
-TAIL = 10  # frames of a way that are seen
-MESHES = {  # of the links, among those that come with PyBullet
+REACH, PITCH = 0.95, 2.0  # m shown around an arm in a picture, and distance between arms
+ABOVE = -1.35  # m from the floor of the side views to the middle of the top views
+TAIL = 10  # frames of a visible trail
+MESHES = {  # meshes of the links, among those of PyBullet
     f"panda_link{link}": f"franka_panda/meshes/{'visual' if 0 < link < 7 else 'collision'}/link{link}.obj"
     for link in range(8)
 }
 
 
 def links(q: np.ndarray) -> np.ndarray:
-    """Where joints and flange are, from the base on: angles (arms, 7) -> (arms, 9, 3)."""
+    """Positions of joints and flange, from the base on: angles (arms, 7) -> (arms, 9, 3)."""
     turn, place = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
     found = [place]
     for joint, (origin, roll) in enumerate(zip(ORIGINS, ROLLS, strict=False)):
@@ -84,7 +84,7 @@ class Goals:
         self.r_post, self.r_goal = (float(constants[name][0]) for name in ("r_o", "r_g"))
 
     def reset(self) -> torch.Tensor:
-        """Every arm at a start of its own, with its first goal."""
+        """Draw the start of every arm and its first goal."""
         drawn = Streams.of(self.generator, self.agents).states(self.system, GOALS)
         self.goals, self.number = drawn[..., self.goal], torch.zeros(self.agents, dtype=torch.int64)
         self.struck, self.travelled = np.zeros(self.agents, dtype=bool), np.zeros(self.agents)
@@ -93,7 +93,7 @@ class Goals:
         return self.state
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Move every arm as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        """Advance every arm by one model step; (agents, n), (agents, m) -> (agents, n)."""
         before = self._flange(x)
         self.struck |= self._inside(before)
         still = torch.from_numpy(self.struck)
@@ -109,7 +109,7 @@ class Goals:
         return moved
 
     def progress(self) -> Mapping[str, float]:
-        """Mean goals reached and path of the flange, and how many arms have struck the post."""
+        """Mean goals reached and path length of the flange, and number of arms that have struck the post."""
         return {
             "goals_reached": float(self.number.double().mean()),
             "path": float(self.travelled.mean()),
@@ -117,7 +117,7 @@ class Goals:
         }
 
     def units(self) -> Mapping[str, str]:
-        """Of entries of `progress`."""
+        """Units of the entries of `progress`."""
         return {"path": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
@@ -130,7 +130,7 @@ class Goals:
         }
 
     def charted(self, states: torch.Tensor) -> np.ndarray:
-        """Where the flanges of planned states (agents, k, n) are, (agents, k, 3)."""
+        """Flange positions of planned states (agents, k, n), (agents, k, 3)."""
         agents, count = states.shape[:2]
         return self._flange(states.flatten(0, 1)).reshape(agents, count, 3)
 
@@ -138,7 +138,7 @@ class Goals:
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: arms side by side, from the side and from above, coloured by who decided."""
+        """One frame: arms side by side, from the side and from above, coloured by decision source."""
         from matplotlib.patches import Circle
 
         arms, goals, post = scene["arms"], scene["goals"][index], scene["post"][index]
@@ -173,16 +173,16 @@ class Goals:
 
     @staticmethod
     def stage(scene: Mapping[str, np.ndarray]) -> Stage:
-        """The arms in space, as `panda.urdf` has them."""
+        """The 3D stage of the arms, with the bodies of `panda.urdf`."""
         goals, post = scene["goals"], scene["post"]
         centre = np.broadcast_to(post[:, None, :3], goals.shape)
         balls = (Ball(goals, float(post[0, 4]), GOAL), Ball(centre, float(post[0, 3]), STONE))
         return Stage(Path(__file__).with_name("panda.urdf"), scene["joints"], balls, 0.95, MESHES)
 
     def _flange(self, states: torch.Tensor) -> np.ndarray:
-        """Where flanges are, (agents, 3)."""
+        """Flange positions, (agents, 3)."""
         return links(states[:, self.joints].numpy())[:, -1]
 
     def _inside(self, flange: np.ndarray) -> np.ndarray:
-        """Whether flanges (agents, 3) are inside of the post."""
+        """Mask of flanges (agents, 3) inside the post."""
         return np.asarray(np.linalg.norm(flange - self.post, axis=1) < self.r_post)

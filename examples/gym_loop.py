@@ -1,10 +1,10 @@
-"""Drive the environment of a specification with an exported controller.
+"""Run an exported controller in the environment of a specification.
 
     stlc export latest --to onnx -o controller
     python examples/gym_loop.py controller specs/traffic.stl --episodes 3 --guard paper
 
-The environment (`stlc.gym`, which needs torch) stands for the world; the controller (`stlc.runtime`, which
-does not) sees nothing of it but the state.
+The environment (`stlc.gym`, which needs torch) is the world; the controller (`stlc.runtime`, which does not)
+receives only the state.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from stlc.runtime import Controller
 
 @dataclass(frozen=True)
 class Episode:
-    """How an episode went: robustness of its last horizon, what it earned, and who decided how often."""
+    """Result of an episode: robustness of its last horizon, return, and counts of decision sources."""
 
     satisfied: bool
     robustness: float
@@ -29,7 +29,7 @@ class Episode:
 
 
 def drive(controller: Controller, env: SpecEnv, *, seed: int) -> Episode:
-    """One episode, a decision every step."""
+    """Run one episode, with a decision in every step."""
     controller.reset()
     _, info = env.reset(seed=seed)
     over, earned, rules = False, 0.0, Counter[str]()
@@ -43,7 +43,7 @@ def drive(controller: Controller, env: SpecEnv, *, seed: int) -> Episode:
 
 
 def main() -> None:
-    """Episodes with seeds 0, 1, 2, …, a line each."""
+    """Run episodes with seeds 0, 1, 2, …, and print a line each."""
     parser = argparse.ArgumentParser(description="Drive an environment with an exported controller.")
     parser.add_argument("controller", help="folder of `stlc export RUN --to onnx`")
     parser.add_argument("spec", help="file of the specification")

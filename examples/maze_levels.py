@@ -1,14 +1,14 @@
 """The shaft of Meng & Fan (2023): a ball that rises through 200 levels of obstacles and goals.
 
-The truth beside the model of `maze.yaml`. Each ball has a shaft of its own and moves as the model's own step
-says: it rises at a constant speed and steers sideways. A level is an obstacle with a gap on each side and
+The true world for the model of `maze.yaml`. Each ball has its own shaft and moves by the model's step
+function: it rises at a constant speed and steers sideways. A level is an obstacle with a gap on each side and
 perhaps a goal in one of the gaps; level i has its upper edge at height 2.5 i. Metres, seconds.
 
 * Levels are drawn as the next one in training is: width 2 to 4 m, anywhere in the shaft of 5 m, slivers of
   less than .1 m closed; a goal in the left gap, in the right one, or none, where it fits.
 * The obstacle of the first level begins .1 m outside of the left wall, so its goal can only be on the right.
-* A ball starts at the left wall, at rest, 2.5 m below the first level. It knows the next level and the one
-  after; when it is above the upper edge of a level the next one takes its place.
+* A ball starts at the left wall, at rest, 2.5 m below the first level. It observes the next two levels; above
+  the upper edge of a level it moves on to the next one.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ LEVELS = 200
 EDGE = -0.1  # left edge of the first obstacle
 NONE = -1.0  # this level has no goal
 ROUNDING = 1e-9  # heights are sums of steps
-BELOW, ABOVE = 3.0, 6.0  # m of the shaft that a picture shows around the ball
+BELOW, ABOVE = 3.0, 6.0  # m of the shaft shown around the ball in a picture
 ASIDE = 2.3  # m beside each shaft, for the numbers of its levels
-TAIL = 20  # frames of a way that are seen
+TAIL = 20  # frames of a visible trail
 
 
 class MazeLevels:
@@ -52,7 +52,7 @@ class MazeLevels:
         self.width, self.h, self.d, self.r = (float(system.decl.constants[name][0]) for name in constants)
 
     def reset(self) -> torch.Tensor:
-        """Fresh shafts, and a ball at the beginning of each."""
+        """Draw new shafts, with a ball at the start of each."""
         self.streams = Streams.of(self.generator, self.agents)
         columns = [self.at[name] for name in ("x1", "l1", "g1")]
         self.levels = self.streams.states(self.system, LEVELS)[..., columns]  # (agents, levels, 3)
@@ -68,7 +68,7 @@ class MazeLevels:
         return self.state
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Move every ball as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        """Advance every ball by one model step; (agents, n), (agents, m) -> (agents, n)."""
         moved, dy = self.system.step(x, action), self.at["dy"]
         self._look(moved)
         above = moved[:, dy] > ROUNDING
@@ -93,7 +93,7 @@ class MazeLevels:
         return {}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
-        """Balls (agents, 2) as x and height; levels (agents, levels, 3); what all levels are like (4,)."""
+        """Balls (agents, 2) as x and height; levels (agents, levels, 3); their common dimensions (4,)."""
         height = self.state[:, self.at["dy"]] + self.d * (self.passed + 1)
         return {
             "balls": torch.stack((self.state[:, self.at["x"]], height), 1).numpy(),
@@ -110,7 +110,7 @@ class MazeLevels:
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: the shafts side by side around their balls, coloured by who decided."""
+        """One frame: the shafts side by side around their balls, coloured by decision source."""
         from matplotlib.patches import Circle
 
         balls, (width, high, apart, radius) = scene["balls"], scene["shape"][index]
@@ -135,7 +135,7 @@ class MazeLevels:
         axes.set_axis_off()
 
     def _first(self, level: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """The first level: its obstacle leaves a gap on the right alone, with a goal or none."""
+        """Draw the first level: its obstacle leaves a gap only on the right, with or without a goal."""
         edge, length = EDGE, float(level[1])
         coin, share = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
         end = edge + length
@@ -144,7 +144,7 @@ class MazeLevels:
         return torch.tensor([edge, length, goal if fits else NONE], dtype=torch.float64)
 
     def _facing(self, states: torch.Tensor) -> torch.Tensor:
-        """States that see the next two levels."""
+        """States with the observation of the next two levels."""
         rows, states = torch.arange(self.agents), states.clone()
         for offset in (0, 1):
             level = self.levels[rows, self.passed + offset]
@@ -153,7 +153,7 @@ class MazeLevels:
         return states
 
     def _look(self, states: torch.Tensor) -> None:
-        """Who is inside of the next obstacle, or at its goal, before levels are counted on."""
+        """Update which balls are inside the next obstacle or at its goal, before levels are counted."""
         x, dy = states[:, self.at["x"]], states[:, self.at["dy"]]
         edge, length, goal = self.levels[torch.arange(self.agents), self.passed].unbind(1)
         beside = (x - edge) * (x - edge - length) > 0
@@ -161,7 +161,7 @@ class MazeLevels:
         self.near |= (goal > 0) & ((x - goal) ** 2 + (dy + self.h / 2) ** 2 < self.r**2)
 
     def _count(self, above: torch.Tensor) -> None:
-        """Enter what happened on the levels that were passed."""
+        """Update the counters for the passed levels."""
         goal = self.levels[torch.arange(self.agents), self.passed, 2]
         self.hits += above & self.inside
         self.met += above & (goal > 0)
@@ -172,7 +172,7 @@ class MazeLevels:
 def draw_shaft(
     axes: Any, left: float, levels: np.ndarray, height: float, shape: tuple[float, float, float, float]
 ) -> None:
-    """A shaft around this height, its levels (k, 3) of this shape: width, height, distance, radius."""
+    """Draw a shaft around a height with its levels (k, 3) of a shape: width, height, distance, radius."""
     from matplotlib.patches import Circle, Rectangle
 
     width, high, apart, radius = shape

@@ -1,18 +1,18 @@
 """The rivers of Meng & Fan (2023): ships that pass one obstacle after the other on a river 4 m wide.
 
-The truth beside the models of `ship_safe.yaml` and `ship_track.yaml`. All ships of a seed share the river
-and do not meet each other; each moves as the model's own step says. What a ship knows is the next obstacle,
-or the next two; metres, seconds.
+The true world for the models of `ship_safe.yaml` and `ship_track.yaml`. All ships of a seed share the river
+without interaction; each moves by the model's step function. A ship observes the next obstacle, or the next
+two. Metres, seconds.
 
 * `SafeRiver`: an obstacle of radius 1 every 7.5 m. A ship has passed one when it is beside its centre.
 * `TrackRiver`: obstacles on the centreline, 15 to 25 m apart. A ship has passed one when it is 1 m ahead of
-  its centre. A ship knows of an obstacle when it is in view (8 m); that renews the allowance: 15 steps of
-  it if its radius is less than .8, 20 if less than 1, else 25.
-* `ShiftedRiver`: what the paper tests the backup policy with. Obstacles every 12 m, the first 4 m ahead and
-  .25 m off the centreline, the others .2 m, the second half as large again, and an allowance of 20 or 25
-  steps. Ships start .3 to 1.8 m off the line, straight ahead at 5 m/s; their allowance ran out 5 steps ago.
+  its centre. A ship observes an obstacle within 8 m; that renews the allowance: 15 steps if its radius is
+  less than .8, 20 if less than 1, else 25.
+* `ShiftedRiver`: the paper's test of the backup policy. Obstacles every 12 m, the first 4 m ahead and .25 m
+  off the centreline, the others .2 m, the second half as large again, and an allowance of 20 or 25 steps.
+  Ships start .3 to 1.8 m off the line, straight ahead at 5 m/s; their allowance ran out 5 steps ago.
 
-Ships start where the system file lets them, also with the river's first obstacle in the place of their own.
+Starts satisfy the system file's constraints, also with the river's first obstacle instead of the drawn one.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from stlc.controller.sketch import (
 from stlc.controller.streams import Streams
 
 OBSTACLES = 100
-PROPOSED = 64  # starts that are drawn for a ship, of which the first that the system file allows is taken
+PROPOSED = 64  # starts drawn for a ship, of which the first admissible one is taken
 SPACING = 7.5  # of SafeRiver
 BEHIND = 1.0  # m that a ship of TrackRiver must be ahead of an obstacle
 NEAREST, FARTHEST = 15.0, 25.0  # from one obstacle of TrackRiver to the next
 ALLOWANCES = ((0.8, 15), (1.0, 20), (math.inf, 25))  # radius less than -> steps
 SHIFTED = 20  # obstacles of ShiftedRiver
 FOLD = 40.0  # m of river in one row of the picture
-WAKE = 14  # frames of it that are seen
+WAKE = 14  # frames of a visible trail
 HULL = np.array([(0.8, 0.0), (0.35, 0.3), (-0.55, 0.3), (-0.4, 0.0), (-0.55, -0.3), (0.35, -0.3)])  # m
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The obstacles of a river in order: where, how large, and what allowance (s) they give; (M,) each."""
+    """The obstacles of a river in order: positions, radii, and allowances (s); (M,) each."""
 
     x: torch.Tensor
     y: torch.Tensor
@@ -64,7 +64,7 @@ class Chain:
 
 
 class River(ABC):
-    """What the three rivers share. Implements `stlc.controller.world.World`."""
+    """Base class of the three rivers. Implements `stlc.controller.world.World`."""
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
         self.system, self.agents, self.generator = system, agents, generator
@@ -73,7 +73,7 @@ class River(ABC):
         self.half = float(system.decl.constants["D"][0]) / 2
 
     def reset(self) -> torch.Tensor:
-        """A new river and its ships, all at x = 0."""
+        """Draw a new river and its ships, all at x = 0."""
         self.streams = Streams.of(self.generator, self.agents)
         proposed = self._calmed(self.streams.states(self.system, PROPOSED))
         self.first = proposed[0, self._allowed(proposed[0])]
@@ -82,14 +82,14 @@ class River(ABC):
         return self._begun(torch.stack([self._start(own) for own in proposed]))
 
     def redraw(self, rows: torch.Tensor) -> torch.Tensor:
-        """Other starts on the same river for ships `rows` (k,); all states, (agents, n)."""
+        """Redraw the starts of ships `rows` (k,) on the same river; return all states, (agents, n)."""
         proposed = self._calmed(self.streams.states(self.system, PROPOSED))[rows]
         return self._begun(
             self.state.index_copy(0, rows, torch.stack([self._start(own) for own in proposed]))
         )
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Move every ship as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        """Advance every ship by one model step; (agents, n), (agents, m) -> (agents, n)."""
         self.hit |= self._touching(x)
         moved = self.system.step(x, action)
         self.switched = self._passed(moved[:, self.at["x"]], self.chain.x[self.next])
@@ -99,7 +99,7 @@ class River(ABC):
         return self.state
 
     def progress(self) -> Mapping[str, float]:
-        """Mean distance and obstacles passed, and how many ships ever touched an obstacle or a bank."""
+        """Mean distance and obstacles passed, and number of ships that ever touched an obstacle or a bank."""
         travelled = self.state[:, self.at["x"]] - self.begin
         return {
             "distance": float(travelled.mean()),
@@ -108,7 +108,7 @@ class River(ABC):
         }
 
     def units(self) -> Mapping[str, str]:
-        """Of entries of `progress`."""
+        """Units of the entries of `progress`."""
         return {"distance": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
@@ -128,14 +128,14 @@ class River(ABC):
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: the river in rows of 40 m from the top, ships and wakes coloured by who decided."""
+        """One frame: the river in rows of 40 m from the top, ships and wakes coloured by decision source."""
         ships, half = scene["ships"], float(scene["half"][index])
         rows, pitch = max(int(ships[..., 0].max() // FOLD) + 1, 2), 2 * half + 1.8
         for row in range(rows):
             draw_row(axes, row, scene["obstacles"][index], half, pitch)
 
         def folded(places: np.ndarray, axis: int) -> np.ndarray:
-            """Places (..., 2) in their rows; a line along `axis` breaks where it goes on to the next one."""
+            """Positions (..., 2) folded into rows; a line along `axis` is broken between rows."""
             row = np.clip(places[..., 0] // FOLD, 0, rows - 1)
             placed = np.stack((places[..., 0] - row * FOLD, places[..., 1] - row * pitch), -1)
             begin = np.take(row, [0], axis)
@@ -152,29 +152,29 @@ class River(ABC):
         axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(bottom - 0.4, pitch / 2 - 0.5), aspect="equal")
         axes.set_axis_off()
 
-    # ------------------------------------------------------------- what rivers differ in
+    # ------------------------------------------------------------- differences between rivers
 
     @abstractmethod
     def _calmed(self, states: torch.Tensor) -> torch.Tensor:
-        """Proposed starts (…, n), drawn as in training, as this river has them."""
+        """Starts (…, n) drawn as in training, adapted to this river."""
 
     @abstractmethod
     def _chain(self) -> Chain:
-        """The obstacles; `self.first` holds starts (k, n) that the first ship could have."""
+        """Draw the obstacles; `self.first` holds possible starts (k, n) of the first ship."""
 
     @abstractmethod
     def _passed(self, x: torch.Tensor, obstacle: torch.Tensor) -> torch.Tensor:
-        """Whether ships at `x` have passed obstacles at `obstacle`, (agents,) each."""
+        """Mask of ships at `x` that have passed obstacles at `obstacle`, (agents,) each."""
 
     # ------------------------------------------------------------------------------ parts
 
     def _begun(self, x: torch.Tensor) -> torch.Tensor:
-        """The states (agents, n), with which all begins."""
+        """Initialise the world with the states (agents, n)."""
         self.begin, self.state, self.hit = x[:, self.at["x"]], x, self._touching(x)
         return x
 
     def _start(self, proposed: torch.Tensor) -> torch.Tensor:
-        """The first of the proposed starts (k, n) that is allowed on this river."""
+        """The first admissible one of the proposed starts (k, n) on this river."""
         placed = self._facing(proposed, torch.zeros(len(proposed), dtype=torch.int64))
         allowed = placed[self._allowed(placed)]
         if not len(allowed):
@@ -185,7 +185,7 @@ class River(ABC):
         return self.system.initial.holds(states)
 
     def _facing(self, states: torch.Tensor, front: torch.Tensor | None = None) -> torch.Tensor:
-        """States (k, n) whose obstacles are those of the river, from index `front` (k,) on."""
+        """States (k, n) with the observed obstacles of the river, from index `front` (k,) on."""
         front, states = self.next if front is None else front, states.clone()
         for offset in range(self.seen):
             for name, column in (("x", self.chain.x), ("y", self.chain.y), ("r", self.chain.r)):
@@ -193,13 +193,13 @@ class River(ABC):
         return states
 
     def _touching(self, states: torch.Tensor) -> torch.Tensor:
-        """Whether ships are inside any obstacle of the river, or on a bank, (agents,)."""
+        """Mask of ships inside any obstacle, or on a bank, (agents,)."""
         x, y = states[:, self.at["x"], None], states[:, self.at["y"], None]
         inside = torch.hypot(x - self.chain.x, y - self.chain.y) < self.chain.r
         return inside.any(1) | (y[:, 0].abs() > self.half)
 
     def _uniform(self, low: float, high: float, count: int) -> torch.Tensor:
-        """Numbers of the river itself, (count,)."""
+        """Uniform random numbers of the river's generator, (count,)."""
         drawn = torch.rand(count, generator=self.streams.shared, dtype=torch.float64)
         return low + (high - low) * drawn
 
@@ -228,7 +228,7 @@ class TrackRiver(River):
         return super().reset()
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """The same; an obstacle that comes into view renews the allowance."""
+        """Advance as the base class; an obstacle that comes into view renews the allowance."""
         saw, now, tau = self._in_view(x, self.next), super().advance(x, action), self.at["tau"]
         comes = self._in_view(now, self.next) & (self.switched | ~saw)
         now[:, tau] = torch.where(comes, self.chain.allowance[self.next], now[:, tau])
@@ -237,7 +237,7 @@ class TrackRiver(River):
         return now
 
     def progress(self) -> Mapping[str, float]:
-        """Also how many ships overran an allowance that they had been given."""
+        """Metrics of the base class, and the number of ships that exceeded an allowance."""
         return {**super().progress(), "ships_late": float(self.late.sum())}
 
     def _calmed(self, states: torch.Tensor) -> torch.Tensor:
@@ -266,7 +266,7 @@ class TrackRiver(River):
         return obstacle - x < -BEHIND
 
     def _facing(self, states: torch.Tensor, front: torch.Tensor | None = None) -> torch.Tensor:
-        """The same; what is not in view yet is not known: then no obstacle is, as in training."""
+        """As the base class, but an obstacle out of view is replaced by none, as in training."""
         front = self.next if front is None else front
         facing, x1 = super()._facing(states, front), self.at["x1"]
         none = states[:, self.at["x"]] + self.no_obs
@@ -274,12 +274,12 @@ class TrackRiver(River):
         return facing
 
     def _in_view(self, states: torch.Tensor, front: torch.Tensor) -> torch.Tensor:
-        """Whether ships (k, n) see the obstacle that is their next, index `front` (k,)."""
+        """Mask of ships (k, n) with their next obstacle, index `front` (k,), in view."""
         return self.chain.x[front] - states[:, self.at["x"]] <= self.view
 
 
 class ShiftedRiver(TrackRiver):
-    """The river that `ship_track.yaml` was not made for (the paper's out-of-distribution experiment)."""
+    """A river outside the training distribution of `ship_track.yaml` (an experiment of the paper)."""
 
     def _calmed(self, states: torch.Tensor) -> torch.Tensor:
         calm = states.clone()
@@ -300,12 +300,12 @@ class ShiftedRiver(TrackRiver):
         return Chain(x, y, r, self.system.dt * steps)
 
     def _allowed(self, states: torch.Tensor) -> torch.Tensor:
-        """Every start: it is not one that the system file draws."""
+        """Mask of all starts: they are outside the system file's initial set."""
         return torch.ones(len(states), dtype=torch.bool)
 
 
 def draw_row(axes: Any, row: int, obstacles: np.ndarray, half: float, pitch: float) -> None:
-    """One stretch of a river that is `2 * half` wide, with its obstacles (M, 3); rows are `pitch` apart."""
+    """Draw one row of a river of width `2 * half`, with its obstacles (M, 3); rows are `pitch` apart."""
     from matplotlib.patches import Circle, Rectangle
 
     middle = -row * pitch

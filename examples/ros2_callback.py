@@ -4,9 +4,9 @@
     stlc export latest --to onnx -o controller
     python examples/ros2_callback.py controller --seconds 25
 
-Where ROS 2 is sourced the node is a real one: /odom in, /cmd_vel and /verdict out, until it is interrupted.
-Elsewhere `ros2_standins.py` stands in for ROS, and the node drives a simulated vehicle in simulated time. The
-node is the same; it needs numpy and onnxruntime.
+With a sourced ROS 2 this is a real node: /odom in, /cmd_vel and /verdict out, until it is interrupted.
+Otherwise `ros2_standins.py` replaces ROS, and the same node drives a simulated vehicle in simulated time. It
+needs numpy and onnxruntime.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ except ImportError:
 
 
 class ControllerNode(Node):
-    """Takes the last odometry to a command every `dt`; what gives no decision stops the vehicle."""
+    """Computes a command from the last odometry every `dt`; without a decision it stops the vehicle."""
 
     def __init__(self, controller: Controller) -> None:
         super().__init__("stlc_controller")
@@ -46,11 +46,11 @@ class ControllerNode(Node):
         self.create_timer(self.dt, self.on_timer)
 
     def on_odometry(self, message: Odometry) -> None:
-        """A measurement: the last one counts."""
+        """Store the last measurement."""
         self.seen = message
 
     def on_timer(self) -> None:
-        """A decision."""
+        """Decide and publish command and verdict."""
         if self.seen is None:
             return
         state = state_of(self.seen)
@@ -78,7 +78,7 @@ def state_of(message: Odometry) -> dict[str, float]:
 
 
 class Vehicle(Node):
-    """A simulated vehicle that does what it is told, one Euler step at a time."""
+    """A simulated vehicle, one Euler step at a time."""
 
     def __init__(self, dt: float) -> None:
         super().__init__("vehicle")
@@ -89,11 +89,11 @@ class Vehicle(Node):
         self.create_timer(dt, self.on_timer)
 
     def on_command(self, message: Twist) -> None:
-        """What holds for the next step."""
+        """Store the command for the next step."""
         self.told = message
 
     def on_timer(self) -> None:
-        """Move, and say where it is."""
+        """Move one step and publish the odometry."""
         self.x += self.dt * self.v * math.cos(self.psi)
         self.y += self.dt * self.v * math.sin(self.psi)
         self.psi += self.dt * self.told.angular.z
@@ -115,7 +115,7 @@ class Listener(Node):
 
 
 def main() -> None:
-    """The node, on a robot or in simulation."""
+    """Run the node, on a robot or in simulation."""
     parser = argparse.ArgumentParser(description="An exported controller as a ROS 2 node.")
     parser.add_argument("controller", help="folder of `stlc export RUN --to onnx`")
     parser.add_argument("--guard", choices=("none", "paper"), default="none")

@@ -1,6 +1,6 @@
-"""What `ros2_callback.py` uses of ROS 2, for where there is none: messages, nodes, and simulated time.
+"""Substitutes for ROS 2 in `ros2_callback.py`: messages, nodes, and simulated time.
 
-Messages have the fields of those of ROS that are read or written; nodes have the calls of `rclpy.node.Node`.
+Messages have the used fields of ROS messages; nodes have the used methods of `rclpy.node.Node`.
 """
 
 from __future__ import annotations
@@ -86,11 +86,11 @@ class Bus:
         self._order = count()
 
     def every(self, period: float, call: Callable[[], None], at: float = 0.0) -> None:
-        """A timer; of several that are due the one that was made first goes first."""
+        """Add a timer; of several that are due, the oldest is called first."""
         heapq.heappush(self._due, (round(at, 9), next(self._order), period, call))
 
     def spin(self, seconds: float) -> None:
-        """Let so much time pass."""
+        """Advance simulated time by `seconds`."""
         while self._due and self._due[0][0] < seconds - 1e-9:
             now, _, period, call = heapq.heappop(self._due)
             call()
@@ -104,13 +104,13 @@ class Publisher:
         self.listeners = listeners
 
     def publish(self, message: object) -> None:
-        """To everybody who subscribed."""
+        """Call all subscribers."""
         for listener in self.listeners:
             listener(message)
 
 
 class Node:
-    """What this file uses of `rclpy.node.Node`."""
+    """Substitute for `rclpy.node.Node`."""
 
     bus = Bus()
 
@@ -118,11 +118,11 @@ class Node:
         self.name = name
 
     def create_subscription(self, kind: type, topic: str, call: Callable[[Any], None], depth: int) -> None:  # noqa: ARG002
-        """Hear of a topic."""
+        """Subscribe to a topic."""
         self.bus.topics[topic].append(call)
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> Publisher:  # noqa: ARG002
-        """Speak on a topic."""
+        """Create a publisher of a topic."""
         return Publisher(self.bus.topics[topic])
 
     def create_timer(self, period: float, call: Callable[[], None]) -> None:

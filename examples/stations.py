@@ -1,16 +1,16 @@
 """The map of Meng & Fan (2023): rovers between destinations and five charging stations.
 
-The truth beside the model of `rover.yaml`. All rovers of a seed share the stations and do not meet each
-other; each has a list of destinations of its own and moves as the model's own step says. Metres, seconds.
+The true world for the model of `rover.yaml`. All rovers of a seed share the stations without interaction;
+each has its own sequence of destinations and moves by the model's step function. Metres, seconds.
 
-* The stations are those five of 100 that training draws which lie farthest apart, of 1000 sets.
-* A rover that is not at its station chooses among the five whenever it plans. It charges at the one it chose.
+* Of 100 stations drawn as in training, the most distant five (of 1000 random sets of five) are used.
+* A rover away from its station chooses among the five whenever it plans, and charges only at the chosen one.
 * A destination is reached within .8 m of it. One step later the next one takes its place, so a recorded trace
   has the sample in which it was reached.
 * The time to stay at a station is renewed as soon as the rover is away from it.
-* A rover whose battery is empty goes on; the share of time with charge is reported.
+* A rover with an empty battery continues; the share of time with charge is reported.
 
-A rover starts where training lets it, and so that its battery would last to a station on a straight way.
+A rover's start is in the training set, with enough charge for a straight path to a station.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from stlc.controller.sketch import (
 )
 from stlc.controller.streams import Streams
 
-STATES = 100  # of the stations and of each rover that are drawn as in training
+STATES = 100  # candidates for the stations and for each rover, drawn as in training
 SETS, STATIONS = 1000, 5
-POINTS = 101  # of a way that are looked at
+POINTS = 101  # checked points of a path
 ROUNDING = 1e-6
-TAIL = 25  # frames of a way that are seen
+TAIL = 25  # frames of a visible trail
 
 
 class Stations:
@@ -68,7 +68,7 @@ class Stations:
         )
 
     def reset(self) -> torch.Tensor:
-        """New stations, and every rover at a start of its own."""
+        """Draw new stations and the start of every rover."""
         streams = Streams.of(self.generator, self.agents)
         shared = self.system.sample(STATES, generator=streams.shared, dtype=torch.float64)
         self.places = farthest(shared[:, [self.at["xc"], self.at["yc"]]], streams.shared)
@@ -85,9 +85,9 @@ class Stations:
         return self.state
 
     def options(self) -> torch.Tensor:
-        """The states with every station in the place of the chosen one, (agents, 5, n); that one first.
+        """The states with each station as the chosen one, (agents, 5, n); the present choice first.
 
-        A rover at its station stays with it.
+        A rover at its station keeps it.
         """
         order = torch.stack([(self.mine + turn) % STATIONS for turn in range(STATIONS)], 1)
         order = torch.where(self._at_station(self.state)[:, None], self.mine[:, None], order)
@@ -96,14 +96,14 @@ class Stations:
         return options
 
     def choose(self, pick: torch.Tensor) -> torch.Tensor:
-        """Every rover takes an option, (agents,); returns the states (agents, n)."""
+        """Apply the option picked by each rover, (agents,); return the states (agents, n)."""
         free = ~self._at_station(self.state)
         self.mine = torch.where(free, (self.mine + pick) % STATIONS, self.mine)
         self.state = self._told(self.state)
         return self.state
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Move every rover as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        """Advance every rover by one model step; (agents, n), (agents, m) -> (agents, n)."""
         self.state = x
         there = torch.linalg.norm(self._place(x) - self._destination(), dim=1) <= self.near
         moved = self.system.step(x, action)
@@ -118,7 +118,7 @@ class Stations:
         return moved
 
     def progress(self) -> Mapping[str, float]:
-        """Means of destinations reached and of the way; share of time with charge; rovers that crashed."""
+        """Mean destinations reached and path length; share of time with charge; number of crashed rovers."""
         return {
             "destinations_reached": float(self.arrived.double().mean()),
             "distance": self.way / self.agents,
@@ -127,7 +127,7 @@ class Stations:
         }
 
     def units(self) -> Mapping[str, str]:
-        """Of entries of `progress`."""
+        """Units of the entries of `progress`."""
         return {"distance": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
@@ -149,7 +149,7 @@ class Stations:
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: the map; rovers with path, charge and destination, coloured by who decided."""
+        """One frame: the map; rovers with path, charge and destination, coloured by decision source."""
         from matplotlib.patches import Arc, Circle, Rectangle
 
         size, near = scene["shape"][index]
@@ -178,13 +178,13 @@ class Stations:
         axes.set_axis_off()
 
     def _first(self, states: torch.Tensor) -> int:
-        """The first of the drawn states (k, n) whose battery lasts to a station on a straight way."""
+        """Index of the first drawn state (k, n) with enough charge for a straight path to a station."""
         apart = torch.cdist(self._place(states), self.places).amin(1) - self.near
         lasts = torch.nonzero(apart <= self.fastest * states[:, self.at["tau_b"]])
         return int(lasts[0]) if len(lasts) else int(states[:, self.at["tau_b"]].argmax())
 
     def _told(self, states: torch.Tensor) -> torch.Tensor:
-        """States that see their destination and their station."""
+        """States with the observation of destination and station."""
         states = states.clone()
         states[:, [self.at["xd"], self.at["yd"]]] = self._destination()
         states[:, [self.at["xc"], self.at["yc"]]] = self.places[self.mine]
@@ -197,11 +197,11 @@ class Stations:
         return states[..., [self.at["x"], self.at["y"]]]
 
     def _at_station(self, states: torch.Tensor) -> torch.Tensor:
-        """Whether rovers are at the station that they chose, (agents,); on the circle is at it."""
+        """Mask of rovers at their chosen station, boundary included, (agents,)."""
         return torch.linalg.norm(self._place(states) - self.places[self.mine], dim=1) <= self.near + ROUNDING
 
     def _note(self, start: torch.Tensor, moved: torch.Tensor) -> None:
-        """Enter a step from `start` (agents, 2): its way, what it ran into, and the charge that is left."""
+        """Update the metrics for a step from `start` (agents, 2): path length, collisions and charge."""
         end, self.steps = self._place(moved), self.steps + 1
         self.way += float(torch.linalg.norm(end - start, dim=1).sum())
         self.charged += float((moved[:, self.at["tau_b"]] >= -ROUNDING).sum())
@@ -213,7 +213,7 @@ class Stations:
 
 
 def farthest(places: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Of `SETS` random fives of places (k, 2) the one with the largest mean distance between two: (5, 2)."""
+    """The set of five places, of `SETS` random ones from (k, 2), with the largest mean distance: (5, 2)."""
     picks = torch.randint(len(places), (SETS, STATIONS), generator=generator)
     apart = torch.cdist(places[picks], places[picks]).sum((1, 2))
     return places[picks[apart.argmax()]]

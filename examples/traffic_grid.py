@@ -1,17 +1,17 @@
 """The traffic of Meng & Fan (2023): cars on a 4 x 5 grid of junctions with lights, stop signs and queues.
 
-The truth beside the model of `car.yaml`. Each car drives on its own path, by arc length, as the model's own
-step says; what it meets is decided here. Right-hand traffic, metres, seconds.
+The true world for the model of `car.yaml`. Each car moves along its own path by the model's step function;
+leaders, lights and signs are simulated here. Right-hand traffic, metres, seconds.
 
 * A leader is the nearest car ahead on the own path, through the junction and into the lane behind it, with
-  the speed to be counted on if it brakes. A car in the junction ahead on a crossing or merging path (or that
-  cannot stop before it any more) stands for a leader at rest where the paths begin to conflict.
-* At a stop sign one car has the grant, the nearest of those that are first in their lanes, until it has left
-  the junction; everybody else yields. So `yielding` only goes from 1 to 0 while a car approaches.
+  the constant speed that is safe to assume if it brakes. A car in the junction ahead on a crossing or merging
+  path (or that cannot stop before it any more) stands for a leader at rest where the paths begin to conflict.
+* At a stop sign one car has the right of way, the nearest of the first cars of all lanes, until it has left
+  the junction; all others yield. So `yielding` only goes from 1 to 0 while a car approaches.
 * The full cycle of a light is T_total + 2 c. The timer that cars see is held at 0 for 2 c when red begins,
   then runs on; the crossing direction is half a cycle later. So c seconds of red for all lie between greens:
-  c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start of red to the
-  next green, so none counts on green too early.
+  c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan reaches from the start of red to
+  the next green, so none relies on green too early.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ COLUMN_SPACING = (13.0, 15.0, 18.0, 21.0)
 ROW_SPACING = (15.0, 16.0, 18.0, 23.0)
 WIDTH = 6.0  # of a road, both directions
 LENGTH_CAR, WIDTH_CAR = 1.0, 0.6
-SIGHT = 10.0  # m: further than this a car sees neither the line nor a leader
+SIGHT = 10.0  # m: viewing distance for the stop line and leaders
 BRAKE = 10.0  # m/s^2
 ALL_RED = 1.5  # s, the c above
 START_SPEED = 5.0  # m/s
@@ -55,9 +55,9 @@ SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * 
 STEP, BEFORE = 0.1, 2.0  # m: resolution of the conflict tables, and how long before the box they begin
 LANES = {"color": ROAD, "lw": 0}
 SHOWN = {-1: NOTE, 0: STOP_LIGHT, 1: GOAL}  # stop sign, red, green
-SEEN = np.array([(0.0, -1.0), (1.0, 0.0)])  # a point of the map in the picture: a quarter turn to the right
+SEEN = np.array([(0.0, -1.0), (1.0, 0.0)])  # map to picture: a quarter turn to the right
 CAR = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (0.9 * LENGTH_CAR, 0.9 * WIDTH_CAR)
-TAIL = 12  # frames of a way that are seen
+TAIL = 12  # frames of a visible trail
 
 
 def right_of(direction: int) -> np.ndarray:
@@ -66,7 +66,7 @@ def right_of(direction: int) -> np.ndarray:
 
 
 def turn_pose(direction: int, turn: int, s: float) -> tuple[float, float, float]:
-    """Place and heading from the junction's centre, after `s` metres of a turn that began in `direction`."""
+    """Position from the junction's centre, and heading, after `s` metres of a turn from `direction`."""
     forward, right = DIRECTIONS[direction], right_of(direction)
     entry = -WIDTH / 2 * forward + WIDTH / 4 * right
     heading = direction * math.pi / 2
@@ -96,17 +96,17 @@ def overlap(a: np.ndarray, b: np.ndarray, grow: float = 0.0) -> np.ndarray:
 
 
 def counted_on(v: float, v_lead: float, dt: float) -> float:
-    """The constant speed of a leader that asks for as much room as one that brakes as hard as it can."""
+    """Constant speed of a leader that requires the same gap as one with maximum braking."""
     slower = max(v_lead - BRAKE * dt, 0.0)
     return slower if v <= slower else v - math.sqrt(v**2 - slower**2)
 
 
 @cache
 def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Where my turn meets that of a car which entered `relative` quarter turns to the left of my direction.
+    """Conflict tables with the turn of a car that entered `relative` quarter turns to the left of mine.
 
-    Two tables over the other's position (from 0, every `STEP`): my first position at which I would touch what
-    it has still to sweep, and the first at which I would touch its body where it is now; infinity for none.
+    Both are over the other's position (from 0, every `STEP`): my first position that intersects its remaining
+    swept area, and my first position that intersects its present body; infinity for none.
     """
     own = np.arange(-BEFORE, SPAN[mine] + LENGTH_CAR, STEP)
     theirs = np.arange(0.0, SPAN[other] + LENGTH_CAR, STEP)
@@ -121,7 +121,7 @@ def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], 
 
 
 def draw_roads(axes: Any, places: np.ndarray, shows: np.ndarray) -> None:
-    """Roads between junctions (20, 2) of the picture, and the stop lines with what they show (20, 2)."""
+    """Draw roads between junctions (20, 2) of the picture, and stop lines with their signals (20, 2)."""
     from matplotlib.collections import PolyCollection
 
     low, high = places.min(0), places.max(0)
@@ -155,12 +155,12 @@ class Car:
     s: float = 0.0  # metres along the lane or the turn
     v: float = START_SPEED
     tau: float = 0.0
-    order: float = math.inf  # when it came into the junction, in steps
+    order: float = math.inf  # step at which it entered the junction
     passed: int = 0
 
     @property
     def way(self) -> tuple[int, int, int]:
-        """Through which junction, from where to where."""
+        """The route through a junction: the junction, from, to."""
         return self.past, self.here, self.onward
 
 
@@ -171,7 +171,7 @@ Inside = dict[int, list[Car]]  # in a junction, or about to be
 
 @dataclass(slots=True)
 class Grid:
-    """Where the junctions are, which have lights, and at what phase."""
+    """Positions of the junctions, which have lights, and their phases."""
 
     places: np.ndarray  # (20, 2)
     light: np.ndarray  # (20,) bool
@@ -205,14 +205,14 @@ class Grid:
         return (self.heading[here, onward] - self.heading[past, here] + 1) % 4 - 1
 
     def choose(self, past: int, here: int, rng: np.random.Generator) -> int:
-        """A random way on: no U-turn, and no left turn at a light."""
+        """A random next junction: no U-turn, and no left turn at a light."""
         ways = [j for j in self.neighbours[here].values() if j != past]
         if self.light[here]:
             ways = [j for j in ways if self.turn(past, here, j) != LEFT]
         return int(ways[rng.integers(len(ways))])
 
     def pose(self, car: Car) -> tuple[float, float, float]:
-        """Place and heading of a car."""
+        """Position and heading of a car."""
         s = car.s - (0.0 if car.inside else self.length[car.past, car.here])
         x, y, angle = turn_pose(self.heading[car.past, car.here], self.turn(*car.way), s)
         return x + float(self.places[car.here][0]), y + float(self.places[car.here][1]), angle
@@ -232,7 +232,7 @@ class TrafficGrid:
             raise ValueError(f"{agents} cars do not fit on {len(self.grid.length)} lanes")
 
     def reset(self) -> torch.Tensor:
-        """Every car at 5 m/s at the beginning of a lane, the first 20 coming from different junctions."""
+        """Place every car at 5 m/s at the start of a lane, the first 20 from different junctions."""
         starts: list[tuple[int, int]] = []
         while len(starts) < self.agents:
             for junction in self.rng.permutation(len(self.grid.neighbours)).tolist():
@@ -248,7 +248,7 @@ class TrafficGrid:
         return self._observe()
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Move every car as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        """Advance every car by one model step; (agents, n), (agents, m) -> (agents, n)."""
         moved = self.system.step(x, action)
         travel = (moved[:, self.at["x"]] - x[:, self.at["x"]]).tolist()
         speed, tau = moved[:, self.at["v"]].tolist(), moved[:, self.at["tau"]].tolist()
@@ -261,7 +261,7 @@ class TrafficGrid:
         return self._observe()
 
     def progress(self) -> Mapping[str, float]:
-        """Mean speed, junctions passed, pairs of cars that ever overlapped, smallest gap within sight."""
+        """Mean speed, junctions passed, pairs of cars that ever overlapped, smallest gap in view."""
         return {
             "mean_speed": self.speeds / max(self.clock * self.agents, 1),
             "junctions_passed": float(sum(car.passed for car in self.cars)),
@@ -270,11 +270,11 @@ class TrafficGrid:
         }
 
     def units(self) -> Mapping[str, str]:
-        """Of entries of `progress`."""
+        """Units of the entries of `progress`."""
         return {"mean_speed": "m/s", "min_gap": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
-        """Poses (agents, 3), junctions (20, 2), and what they show (20, 2) to east-west and north-south cars.
+        """Poses (agents, 3), junctions (20, 2), and their signals (20, 2) for east-west and north-south cars.
 
         `shows` is -1 for a stop sign, 0 for red, 1 for green.
         """
@@ -283,7 +283,7 @@ class TrafficGrid:
         return {"pose": self._poses(), "junctions": self.grid.places, "shows": shows}
 
     def charted(self, states: torch.Tensor) -> np.ndarray:
-        """Planned states (agents, k, n) as places on the way of each car, (agents, k, 2)."""
+        """Planned states (agents, k, n) as positions on the path of each car, (agents, k, 2)."""
         x = states[..., self.at["x"]].numpy()
         places = np.full((*x.shape, 2), np.nan)
         for car, own, row in zip(self.cars, x, places, strict=True):
@@ -295,7 +295,7 @@ class TrafficGrid:
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame, north to the right: roads, signs, and cars coloured by who decided."""
+        """One frame, north to the right: roads, signs, and cars coloured by decision source."""
         poses = np.concatenate((scene["pose"][..., :2] @ SEEN, scene["pose"][..., 2:] - math.pi / 2), -1)
         draw_roads(axes, scene["junctions"][index] @ SEEN, scene["shows"][index])
         tails(axes, poses[..., :2], scene, index, frames=TAIL)
@@ -334,21 +334,21 @@ class TrafficGrid:
         return self.grid.length[car.past, car.here] - car.s
 
     def _committed(self, car: Car) -> bool:
-        """Inside a junction, or too fast to stop before it."""
+        """True if a car is inside a junction, or too fast to stop before it."""
         return car.inside or car.v**2 / (2 * BRAKE) + car.v * self.system.dt / 2 > self._to_line(car)
 
     def _rank(self, car: Car) -> tuple[float, float]:
-        """Who goes first: by the time of coming in, then those that cannot stop, the nearest first."""
+        """Priority key: by time of entry, then cars that cannot stop, the nearest first."""
         return car.order, self._to_line(car) if self._committed(car) else math.inf
 
     def _timer(self, junction: int, direction: int) -> float:
-        """What the light of `junction` shows to cars that go in `direction`."""
+        """Timer of the light of `junction` for cars that travel in `direction`."""
         shift = self.cycle / 2 if direction % 2 == 0 else 0.0
         now = (self.grid.phase[junction] + self.clock * self.system.dt + shift) % self.cycle
         return max(float(now) - 2 * ALL_RED, 0.0)
 
     def _grant(self, lanes: Lanes, inside: Inside) -> None:
-        """Let the nearest first-in-lane car into each free stop junction."""
+        """Give each free stop junction to the nearest first-in-lane car."""
         for junction in np.flatnonzero(~self.grid.light).tolist():
             holder = self.holder.get(junction)
             if holder is not None and holder.here == junction:
@@ -376,7 +376,7 @@ class TrafficGrid:
         return torch.from_numpy(rows)
 
     def _fill(self, row: np.ndarray, car: Car, lead: Lead) -> None:
-        """The state of the model as this car sees it."""
+        """Fill in the model state as observed by this car."""
         past, ahead = (car.here, car.onward) if car.inside else (car.past, car.here)
         light = bool(self.grid.light[ahead])
         gap, speed = lead
@@ -390,8 +390,8 @@ class TrafficGrid:
         row[self.at["yielding"]] = not light and self.holder.get(ahead) is not car
 
     def _leader(self, car: Car, lanes: Lanes, inside: Inside) -> Lead:
-        """The nearest car on the path of `car`, or one in the junction ahead that it must let pass."""
-        found, start = list[Lead](), -car.s  # and where the piece of road that is looked at begins
+        """The nearest car on the path of `car`, or one in the junction ahead with right of way."""
+        found, start = list[Lead](), -car.s  # and where the considered road segment begins
         ways = car.way, (car.here, car.onward, car.beyond)
         route = (ways[0][:2], ways[0], ways[1][:2], ways[1], ways[1][1:])
         for piece in route[car.inside :]:

@@ -1,4 +1,4 @@
-"""`make demo`: from nothing to a trained, checked and reported controller, with the seconds of each stage."""
+"""`make demo`: train, check, simulate and report a controller, with the run time of each stage."""
 
 import json
 import platform
@@ -20,7 +20,7 @@ STAGES = (
 
 
 def stage(name, arguments, answers):
-    """Run `stlc NAME ARGUMENTS`; returns exit code and seconds. Exits if the code is none of `answers`."""
+    """Run `stlc NAME ARGUMENTS`; returns exit code and seconds. Exits if the code is not in `answers`."""
     command = [str(environment.BIN / "stlc"), name, *arguments]
     print(f"\n$ stlc {name} {' '.join(arguments)}", flush=True)
     started = time.monotonic()
@@ -37,7 +37,7 @@ def newest():
 
 
 def drives(run):
-    """What became of the drives of a run, in a sentence."""
+    """Results of the closed-loop runs of a run folder, in a sentence."""
     guards = json.loads((run / "eval" / "simulate.json").read_text())["guards"]
     with_guard, without = guards["paper"]["drives"], guards["none"]["drives"]
     sentence = f"{with_guard['obeyed']} of {with_guard['count']} drives obeyed every rule"

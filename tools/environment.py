@@ -1,7 +1,7 @@
-"""Make `.venv` with stlc and its tools in it; does nothing when it is already up to date.
+"""Make `.venv` with stlc and its tools, unless it is up to date.
 
-Runs under the system's Python and uses the standard library alone. The syntax is kept old on purpose:
-an old Python must get as far as the message that it is too old.
+Runs under the system's Python with the standard library only. The syntax is old on purpose, so that an old
+Python can still print the message that it is too old.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ INPUTS = ("pyproject.toml", "constraints.txt")
 
 
 def fingerprint():
-    """What the environment depends on: the declared packages, the Python, and where the tree lies."""
+    """Hash of the environment's inputs: declared packages, Python version, path of the tree."""
     digest = hashlib.sha256()
     for name in INPUTS:
         digest.update((ROOT / name).read_bytes())
@@ -35,7 +35,7 @@ def is_current():
 
 
 def ensure():
-    """Make or update the environment if need be; returns the seconds that took. Exits with a message."""
+    """Make or update the environment if necessary; return the seconds taken. Exits on failure."""
     if sys.version_info < NEEDED:
         found = f"{sys.version_info[0]}.{sys.version_info[1]} at {sys.executable}"
         sys.exit(f"stlc needs Python 3.11 or newer, and this is {found}; try: make PYTHON=python3.11 demo")

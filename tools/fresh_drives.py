@@ -1,7 +1,7 @@
-"""Closed-loop shares as a training reports them, against 200 fresh drives under the guard that it recommends.
+"""Comparison of a training's closed-loop shares with 200 fresh drives under its recommended guard.
 
-`python tools/fresh_drives.py RUN... --seconds 15` drives each trained run for so many seconds of processor
-time, as `stlc train` does at its end, then over the first seeds of `stlc simulate`, and prints both shares.
+`python tools/fresh_drives.py RUN... --seconds 15` simulates each trained run for 15 s of processor time, as
+`stlc train` does at its end, then over the first seeds of `stlc simulate`, and prints both shares.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stlc.controller.training.run import Run
 
 
 def main() -> None:
-    """Drive the runs."""
+    """Simulate the runs and print both shares."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -28,7 +28,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for path in options.runs:
         run = Run.open(path)
-        _ = run.task.native  # not in the time of the drives
+        _ = run.task.native  # excluded from the time of the drives
         end = time.process_time() + options.seconds
         found = closed_loop(run, lambda end=end: end - time.process_time())
         for share in found.shares:

@@ -1,13 +1,13 @@
-"""Nothing that a user gives may end in a traceback, a hang, or a machine without memory.
+"""Fuzzing of `stlc`: no input may cause a traceback, a hang, or memory exhaustion.
 
     python tools/fuzz.py --count 40000 --seed 0 --jobs 16 --seconds 10 --memory 2048 --log fuzz.jsonl
 
-Runs `stlc` in process on random, mutated and malicious inputs (`tests/fuzzing/inputs.py`) and prints what
-came out. An input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process),
+Runs `stlc` in process on random, mutated and malicious inputs (`tests/fuzzing/inputs.py`) and prints the
+outcomes. An input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process),
 needs more than `--seconds` of processor time, or asks for more than `--memory` MB beyond what the program
-needs. What failed is kept in `--keep`, with a README that says how to run it again. With `--log` a run that
-was stopped goes on where it was; with `--kind csv --kind run` only such inputs are drawn. Formats whose
-library is not installed are left out, and that is said. Exit code: 1 if anything failed.
+needs. Failing inputs are stored in `--keep`, with a README on how to run them again. With `--log` an
+interrupted run is resumed; `--kind csv --kind run` restricts the kinds of inputs. Formats whose library is
+not installed are skipped with a message. Exit code: 1 if anything failed.
 """
 
 import argparse
@@ -42,20 +42,20 @@ from fuzzing.valid import FORMATS  # noqa: E402
 
 BATCH = 250
 EVERY = 5000
-"""Inputs after which the table so far is printed."""
+"""Number of inputs between intermediate tables."""
 PATIENCE = 180
-"""Seconds of the clock without a sign of life, after which a worker is taken for hung in foreign code."""
+"""Wall-clock seconds without an outcome after which a worker counts as hung in foreign code."""
 
 ANSWERS = frozenset(range(6))
 SKIPPED = -2
-"""Instead of an exit code, where a package is missing."""
+"""Exit code of an input that is skipped for a missing package."""
 MISSING = 5
-"""Exit code of what the machine does not have: memory, for instance."""
+"""Exit code for a missing resource of the machine, such as memory."""
 
 
 @dataclass
 class Outcome:
-    """What one input did."""
+    """Outcome of one input."""
 
     index: int
     kind: str
@@ -67,7 +67,7 @@ class Outcome:
 
 @dataclass
 class Limits:
-    """What an input may need."""
+    """Resource limits of an input."""
 
     seconds: float
     memory: int
@@ -75,11 +75,11 @@ class Limits:
 
 @dataclass
 class Plan:
-    """Which inputs are drawn.
+    """Selection of random inputs.
 
     Attributes:
         seed: of all.
-        kinds: of these only; of all if there are none.
+        kinds: restriction to these; all if empty.
     """
 
     seed: int
@@ -123,7 +123,7 @@ def _call(arguments, limits, typed=b""):
         sys.stdin = io.TextIOWrapper(io.BytesIO(typed), encoding="utf-8")
         with _captured(out, noise), stage("the command", limits.seconds):
             code = main(arguments)
-    except BaseException:  # the boundary let something through
+    except BaseException:  # an exception passed the error boundary
         code, text = -1, traceback.format_exc()
         return code, text, noise
     finally:
@@ -134,7 +134,7 @@ def _call(arguments, limits, typed=b""):
 
 @contextlib.contextmanager
 def _captured(out, noise):
-    """Gather what is written, and Python's warnings."""
+    """Capture output and Python's warnings."""
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = lambda message, *place, **_: noise.append(f"{message} {place[1:]}")
@@ -142,7 +142,7 @@ def _captured(out, noise):
 
 
 def _read(limits):
-    """The same of the library on `a.stl`."""
+    """Exit code, output and warnings of the library on `a.stl`."""
     from stlc.diagnostics import StlcError
     from stlc.files import read_source
 
@@ -191,20 +191,20 @@ def worker(plan, indices, limits, results):
 
 
 def peak():
-    """The most memory that this process has had, in kB."""
+    """Peak memory of this process, in kB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def limit_address_space(megabytes):
-    """Let this process ask for so much more than it has: libraries reserve more than they use."""
+    """Limit the address space of this process to its present size plus `megabytes`."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (megabytes << 20),) * 2)
 
 
 def import_everything(kinds=()):
-    """Import what commands do, so that it is not the time of an input: workers are forked with all of it.
+    """Import all modules before workers are forked, so that imports do not count as run time of an input.
 
-    Gives the formats that are left out since a package is missing.
+    Returns the formats that are skipped because a package is missing.
     """
     limits = Limits(60.0, 0)
     missing = [*fuzz_foreign.prepare(), *fuzz_valid.prepare(tuple(set(FORMATS) & set(kinds or FORMATS)))]
@@ -225,7 +225,7 @@ def import_everything(kinds=()):
 def batch(plan, indices, limits):
     """The outcomes of a batch, and the peak memory of the process that ran it in kB.
 
-    A worker that dies or falls silent costs the input it was at; another one goes on after it.
+    If a worker dies or hangs, its present input fails, and a new worker continues with the next one.
     """
     outcomes, most = [], 0
     left = list(indices)
@@ -273,7 +273,7 @@ def keep(folder, plan, failed):
 
 
 def fuzz(count, seed, limits, *, first=0, jobs=1, kinds=(), done=(), tell=lambda *_: None):
-    """All outcomes but those that are `done`, and the peak memory in kB."""
+    """All outcomes not yet `done`, and the peak memory in kB."""
     plan = Plan(seed, tuple(kinds))
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for missing in import_everything(plan.kinds):
@@ -293,7 +293,7 @@ def fuzz(count, seed, limits, *, first=0, jobs=1, kinds=(), done=(), tell=lambda
 
 
 def table(outcomes, most):
-    """What came out, as text."""
+    """The outcomes as a text table."""
     lines = [f"{'kind':<8} {'inputs':>7} {'faults':>7} {'worst s':>8} {'mean ms':>8}  exit codes"]
     for kind in sorted({outcome.kind for outcome in outcomes}):
         ours = [outcome for outcome in outcomes if outcome.kind == kind]
@@ -313,7 +313,7 @@ def _packages(outcomes):
 
 
 def logged(path, asked):
-    """The outcomes of a run that was stopped; the first line says what it was."""
+    """The outcomes of an interrupted run; the first line of its log holds the options."""
     told = {"seed": asked.seed, "kinds": asked.kind, "seconds": asked.seconds, "memory": asked.memory}
     if path is None:
         return []
@@ -344,7 +344,7 @@ def main():
     started = time.monotonic()
 
     def tell(outcomes, most, new):
-        """The table so far, now and then, and every fault at once: a run that is stopped is evidence, too."""
+        """Print faults at once and intermediate tables, so that an interrupted run has results too."""
         faults = [
             f"  {outcome.index} ({outcome.kind}): {outcome.fault}"
             for outcome in outcomes[-new:]

@@ -1,10 +1,9 @@
-"""Commands that are interrupted, or run out of budget, at random moments.
+"""Robustness test: commands that are interrupted, or run out of budget, at random moments.
 
 `python tools/interrupt.py --count 200 --seed 0` starts so many commands of every kind that works for a while:
 training (with a warm and a cold cache of kernels, without a C compiler, of missions, several runs side by
 side, resumed), simulation, checks, explanations, exports, tables, pictures. Most get SIGINT or SIGTERM after
-a random time, themselves or with their process group; the others have a budget that they are to keep. Of each
-is checked:
+a random time, themselves or with their process group; the others have a budget. For each it is checked:
 
 - it ends within 2 s of the signal, or has used no more processor time, on one core, than its budget plus 20 %
   and 10 s (so that what else goes on does not matter; a compiler that it has started counts);
@@ -13,8 +12,8 @@ is checked:
 - no process is left that it has started, and no file that is half written;
 - run folders open, and `stlc train --resume` goes on with what was interrupted.
 
-A line of JSON a command goes to the standard output, the summary to the standard error. Exit code 1 where
-anything was not so.
+A line of JSON per command goes to the standard output, the summary to the standard error. Exit code 1 if any
+check failed.
 """
 
 from __future__ import annotations
@@ -40,9 +39,9 @@ ROOT = Path(__file__).resolve().parents[1]
 ANSWER = 2.0
 """Seconds from the signal to the end of the process."""
 MEMORY = 2048
-"""MB of a command, or of a process that it has started."""
+"""Memory limit in MB of a command, or of a child process."""
 _FOREIGN = re.compile(r"matplotlib|torchinductor|\.ses$")
-"""Folders that libraries make for themselves."""
+"""Temporary folders of libraries."""
 MARK = "STLC_INTERRUPTED_COMMAND"
 STLC = (sys.executable, "-m", "stlc")
 CAR, SHIP, PATROL = (str(ROOT / "specs" / f"{name}.stl") for name in ("traffic", "ship_track", "patrol"))
@@ -50,14 +49,14 @@ CAR, SHIP, PATROL = (str(ROOT / "specs" / f"{name}.stl") for name in ("traffic",
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A command that works for a while.
+    """A kind of long-running command.
 
     Attributes:
         name: of the kind.
         words: after `stlc`; `{runs}`, `{run}`, `{trace}` and `{stones}` are replaced.
-        seconds: about how long it takes: it is interrupted before.
-        weight: how often it is drawn.
-        budget: seconds that it has; it is not interrupted then.
+        seconds: approximate run time; it is interrupted before.
+        weight: relative frequency.
+        budget: in seconds; then it is not interrupted.
         compiler: whether it finds a C compiler.
         cold: whether its cache of kernels is empty.
         trains: whether it makes a run.
@@ -121,7 +120,7 @@ KINDS = (
 
 @dataclass(slots=True)
 class Result:
-    """What became of one command.
+    """Outcome of one command.
 
     Attributes:
         kind: of the command.
@@ -131,8 +130,8 @@ class Result:
         allowed: seconds that it may take.
         memory: MB at most, of the command or of a process that it has waited for.
         code: its exit code.
-        wrong: what was not as it should be.
-        said: the end of what it said, where something was wrong.
+        wrong: failed checks.
+        said: end of its output if a check failed.
     """
 
     kind: str
@@ -148,12 +147,12 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What commands work on: a run, a long trace with a specification, a specification of many boxes."""
+    """Inputs of commands: a run, a long trace with a specification, a specification of many boxes."""
 
     home: Path
 
     def values(self, folder: Path) -> dict[str, str]:
-        """For the placeholders of one command that works in `folder`."""
+        """Values of the placeholders of a command that runs in `folder`."""
         found = {name: str(self.home / name) for name in ("trace.npz", "long.stl", "stones.stl", "run")}
         copy = folder / "copy"
         shutil.copytree(self.home / "run", copy, symlinks=True)
@@ -208,7 +207,7 @@ init:
 
 
 def one(stage: Stage, number: int, slow: float, kinds: tuple[Kind, ...]) -> Result:
-    """Start a command, stop it or let it run out of its budget, and look at what it leaves."""
+    """Start a command, stop it or let it use up its budget, and check what it leaves."""
     draw = random.Random(number)
     kind = draw.choices(kinds, [each.weight for each in kinds])[0]
     result = Result(kind.name, number)
@@ -259,7 +258,7 @@ def _watched(
 
 
 def _wait(process: subprocess.Popen[bytes], most: float, since: float, kind: Kind, result: Result) -> None:
-    """Wait for the end: seconds since then, or the processor time of a command with a budget; memory."""
+    """Wait for the end; record seconds since the signal, or processor time with a budget, and memory."""
     deadline = time.monotonic() + most
     while time.monotonic() < deadline and process.returncode is None:
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
@@ -292,10 +291,10 @@ def _signal(
 
 
 def _look(kind: Kind, folder: Path, values: dict[str, str], result: Result, *, signalled: bool) -> None:
-    """What a command has said and left, and whether its runs go on."""
+    """Check output, files and processes of a command, and whether its runs can be resumed."""
     said = (folder / "said").read_text(errors="replace")
     good = {128 + signal.SIGINT, 128 + signal.SIGTERM} if signalled else set()
-    before = result.code in (-signal.SIGINT, -signal.SIGTERM) and not said  # Python itself had not begun
+    before = result.code in (-signal.SIGINT, -signal.SIGTERM) and not said  # Python itself had not started
     if result.code not in good | {0, 1, 4} and not before:
         result.wrong.append(f"exit code {result.code}")
     if "Traceback" in said or "B001" in said:
@@ -318,7 +317,7 @@ def _look(kind: Kind, folder: Path, values: dict[str, str], result: Result, *, s
 
 
 def _broken_files(folder: Path) -> list[str]:
-    """Files that were meant to be renamed or removed, and half a document."""
+    """Leftover temporary files, and incomplete JSON documents."""
     wrong = []
     files = [path for path in folder.rglob(".*") if path.suffix not in ("", ".lock") or len(path.stem) > 20]
     temporary = [path for path in (folder / "tmp").rglob("*") if not _FOREIGN.search(str(path))]
@@ -334,7 +333,7 @@ def _broken_files(folder: Path) -> list[str]:
 
 
 def _processes(number: int) -> list[int]:
-    """Processes that are still there of a command."""
+    """Surviving processes of a command."""
     mark = f"{MARK}={number}".encode()
     found = []
     for path in Path("/proc").glob("[0-9]*"):
@@ -365,7 +364,7 @@ def _goes_on(run: Path, result: Result) -> None:
 
 
 def main() -> int:
-    """Run the commands, and say what was wrong."""
+    """Run the commands and report failed checks."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -391,7 +390,7 @@ def main() -> int:
 
 
 def summary(results: list[Result]) -> str:
-    """How many commands ended in time, the slowest answer of each kind, and what was wrong."""
+    """Number of commands that ended in time, the slowest response of each kind, and failed checks."""
     stopped = [result for result in results if result.sent]
     lines = [
         f"{len(results)} commands, {len(stopped)} interrupted, "

@@ -1,7 +1,7 @@
 """The README as a package index shows it: a hook of the build.
 
-An index has neither the pictures of the tree nor its pages, and the project has no address yet that they
-could be taken from: pictures are left out, and links into the tree become their words.
+A package index has no access to pictures and pages of the tree, and the project has no URL yet: pictures are
+removed, and links into the tree become plain text.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def long_description(readme: str) -> str:
 
 
 class Hook(MetadataHookInterface):
-    """Gives the project its long description."""
+    """Build hook that sets the long description."""
 
     PLUGIN_NAME = "custom"
 

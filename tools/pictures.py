@@ -2,11 +2,10 @@
 
     python tools/pictures.py --runs runs
 
-deploys the newest run of every specification (seed 0, with the paper's backup policy, and without it to
-compare) and takes the instant in which most agents were guarded. The film shows the ships of `ship_track.stl`
-under its scenario `shifted`: four ships of each of the seeds 0 to 9 are driven, and the first is shown in
-which a ship leaves the safety requirements without the guard and every ship can be saved, as far as a search
-for plans can tell.
+deploys the newest run of every specification (seed 0, with the paper's backup policy, and without it for
+comparison) and takes the instant with most interventions. The film shows the ships of `ship_track.stl` under
+its scenario `shifted`: four ships of each of the seeds 0 to 9 are simulated, and the first seed is shown in
+which a ship violates safety without the guard while all starts are viable (a plan search succeeds).
 """
 
 from __future__ import annotations
@@ -61,12 +60,12 @@ MAX_BYTES = 700_000
 SHIPS, SEEDS = 4, range(10)
 SECONDS = 12.0
 BEHIND, AHEAD = 5.0, 17.0  # m of the river around the ships
-LARGE, BOLD, SMALL = 17, 14.5, 13  # points: half as large on a telephone
+LARGE, BOLD, SMALL = 17, 14.5, 13  # font size in points: half as large on a telephone
 LEAD_BYTES = 950_000
 
 
 def draw(spec: str, scenario: str | None, runs: Path, folder: Path) -> Iterator[Path]:
-    """Deploy the newest run of `spec` and draw it; yields what was written."""
+    """Deploy the newest run of `spec` and draw it; yields the written files."""
     run = RunDir.open(spec, runs)
     _simulate(run, scenario, "--seeds", "0")
     film = film_of(run, title=" · ".join(part for part in (spec, scenario) if part))
@@ -91,7 +90,7 @@ def _simulate(run: RunDir, scenario: str | None, *more: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Unsafe:
-    """Ships of a seed that left the safety requirements, without and with the guard; who is lost anyway."""
+    """Numbers of unsafe ships of a seed, without and with the guard, and of non-viable ones."""
 
     without: set[int]
     guarded: set[int]
@@ -99,7 +98,7 @@ class Unsafe:
 
 
 def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
-    """The film at the head of the README; its seed is chosen unless one is given. Yields what was written."""
+    """The film at the head of the README; its seed is chosen unless given. Yields the written files."""
     run = RunDir.open("ship_track", runs)
     size = ("--agents", str(SHIPS), "--steps", str(round(SECONDS / 0.15)))
     seed = _chosen(run, size) if seed is None else seed
@@ -128,7 +127,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
 
 
 def _chosen(run: RunDir, size: tuple[str, ...]) -> int:
-    """The first seed in which a ship is unsafe without the guard, and none is lost from its start."""
+    """The first seed in which a ship is unsafe without the guard, and every start is viable."""
     _simulate(run, "shifted", "--seeds", f"{SEEDS[0]}..{SEEDS[-1]}", *size)
     unsafe = unsafe_in(run)
     told = ", ".join(f"{sum(len(getattr(u, name)) for u in unsafe)} {word}" for name, word in _TOLD.items())
@@ -142,7 +141,7 @@ _TOLD = {"without": "unsafe without the guard", "guarded": "with it", "lost": "c
 
 
 def unsafe_in(run: RunDir) -> list[Unsafe]:
-    """What the newest deployment says of each seed."""
+    """Unsafe ships of each seed in the newest deployment."""
     document = json.loads((run.path / RESULT).read_text(encoding="utf-8"))
     found = []
     for seed in document["seeds"]:
@@ -157,7 +156,7 @@ def unsafe_in(run: RunDir) -> list[Unsafe]:
 
 
 def lead_film(without: Seen, guarded: Seen) -> Film:
-    """Both drives, one above the other; the picture follows the ships of both."""
+    """Film of both runs, one above the other; the view follows the ships of both."""
     middle = np.mean([seen.scene["ships"][..., 0].mean(1) for seen in (without, guarded)], 0)
     hits = [first_hits(seen) for seen in (without, guarded)]
     counts = [sum(np.isfinite(hit)) for hit in hits]
@@ -197,7 +196,7 @@ def _sentence(without: int, guarded: int) -> str:
 
 
 def first_hits(seen: Seen) -> NDArray[np.float64]:
-    """When each ship first leaves the safety requirements, (ships,) frames; infinity for never."""
+    """First frame in which each ship violates safety, (ships,); infinity for never."""
     assert seen.judged is not None
     hits = np.full(seen.scene["ships"].shape[1], np.inf)
     for event in seen.events:
@@ -207,7 +206,7 @@ def first_hits(seen: Seen) -> NDArray[np.float64]:
 
 
 def _river(axes: Any, seen: Seen, index: int, middle: float, aground: NDArray[np.bool_]) -> None:
-    """The stretch around `middle`, in metres."""
+    """Draw the river around `middle`, in metres."""
     left, right, half = middle - BEHIND, middle + AHEAD, float(seen.scene["half"][index])
     axes.add_patch(Rectangle((left, -half - 1), right - left, 2 * half + 2, color=BANK, lw=0))
     axes.add_patch(Rectangle((left, -half), right - left, 2 * half, color=WATER, lw=0))
@@ -257,7 +256,7 @@ def _legend(figure: Any) -> None:
 
 
 def main() -> int:
-    """Draw them all, or those that are named."""
+    """Draw all pictures, or the named ones."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--output", type=Path, default=ROOT / "docs/img")

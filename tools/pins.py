@@ -1,14 +1,13 @@
-"""Pins of behaviour: what the program decides, says and writes today, kept to be compared with tomorrow's.
+"""Golden results of the program's behaviour, for comparison before and after a change.
 
     python tools/pins.py write before
     python tools/pins.py check before
     python tools/pins.py check before --only guards --only verdicts --tolerance 1e-9
 
-`write` keeps the golden results of every part in plain files below a folder: JSON with full-precision floats,
-and text. `check` makes all of them anew and prints each difference: which pin, the old value, the new one.
-Use it on one machine before and after a change that should change no behaviour; between machines the last
-digits of floats differ (`tests/test_pins.py` pins what does not). Exit code: 0 no difference, 1 differences,
-2 a wrong call.
+`write` stores the golden results (pins) of every part below a folder: JSON with full-precision floats, and
+text. `check` computes them again and prints each difference: the pin, the old and the new value. Use it on
+one machine before and after a refactoring; between machines the last digits of floats differ
+(`tests/test_pins.py` pins portable results). Exit code: 0 no difference, 1 differences, 2 a usage error.
 
 The parts:
 
@@ -21,8 +20,8 @@ The parts:
 - `guards`: decisions of every guard on fixed states, without a time limit.
 - `runs`: simulations, exports, reports and lists of runs.
 
-`plans`, `guards` and `runs` use the policies that `write` has left below DIR/trained, so that a change in
-training does not change them too; with `--anew`, those that `check` trains. About four minutes of one core.
+`plans`, `guards` and `runs` use the policies stored by `write` below DIR/trained, so that they do not depend
+on changes of training; with `--anew`, those that `check` trains. About four minutes of one core.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ import numpy as np
 import torch
 import typer
 
-# ------------------------------------------------ everything of the project that the pins use from Python
+# ------------------------------------------------ imports from the project
 from proof.cases import Case
 from proof.draw import DT, HORIZON, Taste
 
@@ -72,23 +71,23 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.native import motion_of
 
 NO_LIMIT = Limits(seconds=None, paper=None)
-"""Of a guard's decision: time plays no part."""
+"""Limits of a guard's decision without time limits, for reproducible results."""
 SMALL = Limits(seconds=None, tries=200, prefixes=50, drawn=16, places=2, again=200)
-"""The same for a decision that costs little."""
+"""The same for a cheap decision."""
 
 
 def with_margin(task: Task) -> Limits:
-    """Limits of a guard that asks for 0.05 to spare of the first safety requirement."""
+    """Limits of a guard that requests a margin of 0.05 for the first safety requirement."""
     return Limits(seconds=None, paper=None, margin={task.compiled.safety[0].name: 0.05})
 
 
 def kernels(task: Task) -> Mapping[str, str]:
-    """The C texts of a task: verdicts of plans with the search for better ones, and the gradient."""
+    """The C texts of a task: robustness of plans with local search, and the gradient."""
     motion, formulas = motion_of(task.system), [rule.formula for rule in task.rules]
     return {"kernel": emit(motion, formulas), "adjoint": emit_adjoint(motion, formulas)}
 
 
-# ------------------------------------------------------------------------------------------- what is masked
+# ------------------------------------------------------------------------------------------- masked values
 
 VOLATILE: Mapping[str, str] = {
     "*.stlc": "the version of the program",
@@ -106,7 +105,7 @@ VOLATILE: Mapping[str, str] = {
     "runs*.hardware.*": "of the machine",
     "runs*.git*": "of the checkout",
 }
-"""Patterns of places that differ from run to run, each with the reason.
+"""Patterns of places that differ between runs, each with the reason.
 
 A place is the document's schema (or file) and the keys below it, joined by dots.
 """
@@ -122,13 +121,13 @@ SYSTEMS = (
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("examples/tasks/*.yaml")),
 )
 MORE = {"manipulation": " --system panda", "manipulation_rules": " --system panda"}
-"""What `check` needs to be told beside specification and trace."""
+"""Further arguments of `check` besides specification and trace."""
 PARAMETERS = {"ship_radius": ("radius", 0.9), "stop_time": ("stop_time", 1.0)}
-"""Columns of the specifications that have a parameter."""
+"""Trace columns of the parameters of specifications."""
 SEMANTICS = ("exact", "smooth", "agm", "dgmsr")
 FORMULAS = 300
 STATES = 6
-"""Starts of each system that guards decide for; as many again from each of the later `LEGS`."""
+"""Starts of each system for guards' decisions; as many states from each of the later `LEGS`."""
 LEGS = 2
 
 
@@ -155,11 +154,11 @@ GUARDED = tuple(training.name for training in TRAININGS if training.method == "g
 
 
 class Place:
-    """The working folder of one making: a copy of specifications and systems, and the runs.
+    """The working folder of one set of pins: a copy of specifications and systems, and the runs.
 
     Args:
         work: an empty folder.
-        kept: runs of an earlier making, by training's name, or None to train.
+        kept: folder of stored runs, by the training's name, or None to train.
     """
 
     def __init__(self, work: Path, kept: Path | None) -> None:
@@ -169,7 +168,7 @@ class Place:
             shutil.copytree(ROOT / name, work / name, ignore=shutil.ignore_patterns("__pycache__", "runs"))
 
     def train(self, training: Training) -> dict[str, Any]:
-        """Train once, in a process of its own; the outcome of the command."""
+        """Train once, in a separate process; return the outcome of the command."""
         if training.name not in self.trained:
             folder = f"trained/{training.name}"
             words = (
@@ -180,7 +179,7 @@ class Place:
         return self.trained[training.name]
 
     def fresh(self, training: Training) -> Path:
-        """The folder of a run that was trained here."""
+        """The folder of a run trained here."""
         outcome = self.train(training)
         folders = sorted((self.work / "trained" / training.name).glob("*/0001-*"))
         if not folders:
@@ -188,7 +187,7 @@ class Place:
         return folders[0]
 
     def run(self, name: str) -> Path:
-        """The folder, relative to `work`, of a run to use: a copy of the kept one, else one trained here."""
+        """The folder, relative to `work`, of a run to use: a stored one's copy, else one trained here."""
         target = Path("runs") / name / "0001-pinned"
         if not (self.work / target).is_dir():
             kept = None if self.kept is None else self.kept / name
@@ -200,7 +199,7 @@ class Place:
     # ---------------------------------------------------------------------- commands
 
     def apart(self, words: str) -> dict[str, Any]:
-        """The outcome of `stlc …` in a process of its own."""
+        """The outcome of `stlc …` in a separate process."""
         found = subprocess.run(
             [sys.executable, "-m", "stlc", *words.split()],
             cwd=self.work,
@@ -239,7 +238,7 @@ class Place:
 
 
 def masked(value: Any, place: str) -> Any:
-    """The same JSON with volatile places replaced by their reasons."""
+    """The JSON value with volatile places replaced by their reasons."""
     for pattern, reason in VOLATILE.items():
         if value is not None and fnmatch.fnmatchcase(place, pattern):
             return f"<{reason}>"
@@ -251,7 +250,7 @@ def masked(value: Any, place: str) -> Any:
 
 
 Pins = Iterator[tuple[str, Any]]
-"""Names, such as `traffic/compile`, with what is pinned: JSON, or a text."""
+"""Pairs of a pin's name, such as `traffic/compile`, and its value: JSON or text."""
 
 
 def stem(path: str) -> str:
@@ -263,7 +262,7 @@ def stem(path: str) -> str:
 
 
 def documents(place: Place) -> Pins:
-    """What is said about specifications, systems, codes and schemas."""
+    """Pins of documents about specifications, systems, codes and schemas."""
     for spec in SPECS:
         for name, words in {
             "compile": "compile {} --json",
@@ -304,13 +303,13 @@ WRONG = tuple(
     train specs/traffic.stl --method none --json
     """.strip().splitlines()
 )
-"""Calls that are refused."""
+"""Command lines that are rejected."""
 
 # ----------------------------------------------------------------------------------------------- verdicts
 
 
 def table(columns: Mapping[str, Sequence[float]], dt: float, keep: Callable[[int], bool] = bool) -> str:
-    """A csv with a clock `t` of the samples that are kept; sample 0 always is."""
+    """A CSV table with a clock `t` of the selected samples; sample 0 is always included."""
     clock = [round(k * dt, 9) for k in range(len(next(iter(columns.values()))))]
     rows = zip(clock, *columns.values(), strict=True)
     lines = [",".join(("t", *columns))]
@@ -319,7 +318,7 @@ def table(columns: Mapping[str, Sequence[float]], dt: float, keep: Callable[[int
 
 
 def wander(system: System, seed: int, legs: int = 3) -> tuple[dict[str, list[float]], float]:
-    """Columns of the plain system under random controls held for some steps, and the time step."""
+    """Columns of a nominal rollout under piecewise constant random controls, and the time step."""
     generator = torch.Generator().manual_seed(seed)
     x = system.sample(1, generator=generator, dtype=torch.float64)
     parts = []
@@ -341,7 +340,7 @@ def controls(system: System, count: int, generator: torch.Generator) -> torch.Te
 
 
 def transmission() -> dict[str, list[float]]:
-    """A recorded drive of the one specification that has no system."""
+    """A recorded trace of the one specification without a system."""
     rng = random.Random(5)
     speed, rpm, throttle, gear = [0.0], [900.0], [40.0], [1.0]
     for k in range(1, 400):
@@ -353,7 +352,7 @@ def transmission() -> dict[str, list[float]]:
 
 
 def verdicts(place: Place) -> Pins:
-    """Traces of every shipped specification judged in every way; traces of runs are judged in `runs`."""
+    """Pins of verdicts on traces of every shipped specification, with all options."""
     for number, spec in enumerate(SPECS):
         name = stem(spec)
         if name == "transmission":
@@ -379,7 +378,7 @@ def system_of(place: Place, spec: str) -> System:
 
 
 def judged(place: Place, spec: str, dt: float) -> Pins:
-    """What `check` and `explain` say of the traces of one specification."""
+    """Output of `check` and `explain` on the traces of one specification."""
     name = stem(spec)
     start, more = f"check {spec} {name}", MORE.get(name, "")
     for semantics in SEMANTICS:
@@ -413,7 +412,7 @@ def judged(place: Place, spec: str, dt: float) -> Pins:
 
 
 def arrays(path: Path) -> Any:
-    """Numbers of an npz by name, in full; None where there is no file."""
+    """Arrays of an npz by name, in full precision; None if there is no file."""
     if not path.is_file():
         return None
     with np.load(path, allow_pickle=False) as found:
@@ -425,20 +424,20 @@ def arrays(path: Path) -> Any:
 
 
 def formulas(place: Place) -> Pins:
-    """Random formulas on random traces, 50 to a file."""
+    """Pins of random formulas on random traces, 50 per file."""
     del place
     for block in range(0, FORMULAS, 50):
         yield f"{block:04d}", {f"{seed:04d}": formula(*drawn(seed)) for seed in range(block, block + 50)}
 
 
 def drawn(seed: int) -> tuple[str, dict[str, Any]]:
-    """Text of a specification and its signals."""
+    """A random specification and its signals."""
     case = Case(seed, Taste(bools=seed % 3 == 0))
     return case.text, case.signals
 
 
 def formula(text: str, signals: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything that a monitor says of one formula on one trace."""
+    """All results of a monitor for one formula on one trace."""
     monitor = Monitor(text, dt=DT, horizon=HORIZON * DT)
     low, high = monitor.bounds(signals)
     return {
@@ -465,7 +464,7 @@ def statuses(monitor: Monitor, signals: Mapping[str, Any]) -> Any:
 
 
 def online(monitor: Monitor, signals: Mapping[str, Any]) -> list[list[Any]]:
-    """Decisions of the monitor that takes samples one by one, with the sample that decided each."""
+    """Decisions of the online monitor, with the deciding sample of each."""
     stream, found = monitor.online(), []
     for k in range(len(signals["x"])):
         decisions = stream.push({name: values[k] for name, values in signals.items()})
@@ -477,13 +476,13 @@ def online(monitor: Monitor, signals: Mapping[str, Any]) -> list[list[Any]]:
 
 
 def emitted(place: Place) -> Pins:
-    """The C texts of every specification with a system, with their sha256."""
+    """Pins of the C texts of every specification with a system, with their sha256."""
     for spec in SPECS:
         if stem(spec) == "transmission":
             continue
         try:
             texts = kernels(Task.of(load(place.work / spec), system_of(place, spec)))
-        except Exception as error:  # what no kernel fits is pinned as well
+        except Exception as error:  # tasks without a kernel are pinned too
             yield f"{stem(spec)}/none", {"error": type(error).__name__, "says": str(error)}
             continue
         yield f"{stem(spec)}/sha256", {name: sha256(text.encode()) for name, text in texts.items()}
@@ -497,7 +496,7 @@ def sha256(content: bytes) -> str:
 
 
 def training(place: Place) -> Pins:
-    """Checkpoints tensor by tensor, the file itself, and what the training said on its way."""
+    """Pins of trainings: checkpoints by tensor and by file, and the training log."""
     from safetensors.numpy import load_file
 
     for each in TRAININGS:
@@ -520,7 +519,7 @@ def training(place: Place) -> Pins:
 
 
 def plans(place: Place) -> Pins:
-    """Verdicts, costs and gradients of random plans from fixed states."""
+    """Pins of verdicts, costs and gradients of random plans from fixed states."""
     for name in GUARDED:
         task = Run.open(place.work / place.run(name)).task
         generator = torch.Generator().manual_seed(3)
@@ -546,7 +545,7 @@ def plans(place: Place) -> Pins:
 
 
 def guards(place: Place) -> Pins:
-    """Decisions of all guards for starts, and for states on the way from there, with and without memory."""
+    """Pins of decisions of all guards for starts and later states, with and without a previous plan."""
     for name in GUARDED:
         run = Run.open(place.work / place.run(name))
         modes = [("none", "none", NO_LIMIT), ("paper", "paper", NO_LIMIT), ("full", "full", NO_LIMIT)]
@@ -558,7 +557,7 @@ def guards(place: Place) -> Pins:
 
 
 def on_the_way(task: Task, policy: Any, count: int, legs: int) -> torch.Tensor:
-    """Starts, and the states where the policy's plans lead in a third of a horizon, once and again."""
+    """Starts, and states reached by the policy's plans after each third of a horizon."""
     x = task.sample(count, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
     found = [x]
     for _ in range(legs):
@@ -568,7 +567,7 @@ def on_the_way(task: Task, policy: Any, count: int, legs: int) -> torch.Tensor:
 
 
 def decided(guard: Guard, x: torch.Tensor) -> dict[str, Any]:
-    """A decision for states, and one for where its action leads, with what is left of its plan."""
+    """A decision for states, and one for the next states with the previous plan."""
     first = guard.decide(x)
     later = guard.task.rollout(x, first.plan)[:, 1]
     rest = first.later()
@@ -583,13 +582,13 @@ def decided(guard: Guard, x: torch.Tensor) -> dict[str, Any]:
 
 
 def said(decision: Any) -> dict[str, Any]:
-    """A decision, agent by agent."""
+    """A decision as JSON values, agent by agent."""
     names = ("action", "source", "t0", "rho", "safe", "policy_rho", "plan")
     return {name: getattr(decision, name).tolist() for name in names}
 
 
 def runs(place: Place) -> Pins:
-    """What is done with finished runs."""
+    """Pins of simulations, exports, reports and lists of finished runs."""
     for name in GUARDED:
         run = place.run(name).as_posix()
         world = f"simulate {run} --seeds 0..1 --steps 12 --agents 2 --no-pictures --json"
@@ -617,7 +616,7 @@ def runs(place: Place) -> Pins:
 
 
 TRAINED = "trained"
-"""Folder of the policies that a making has trained, beside those of the parts."""
+"""Folder of the trained policies, beside those of the parts."""
 
 PARTS: Mapping[str, Callable[[Place], Pins]] = {
     "documents": documents,
@@ -635,7 +634,7 @@ PARTS: Mapping[str, Callable[[Place], Pins]] = {
 
 @dataclass(frozen=True)
 class Difference:
-    """One value that is not as it was: its pin and the place within, the old and the new value."""
+    """A changed value: its pin and the place within, the old and the new value."""
 
     where: str
     old: Any
@@ -654,7 +653,7 @@ def _short(value: Any) -> str:
 
 
 def differences(where: str, old: Any, new: Any, tolerance: float = 0.0) -> Iterator[Difference]:
-    """Where two values are not the same; floats within `tolerance`, relative to the larger and to 1e-3."""
+    """Differences of two values; floats may differ by `tolerance`, relative to the larger one or 1e-3."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys((*old, *new)):
             yield from differences(f"{where}.{key}", old.get(key, ABSENT), new.get(key, ABSENT), tolerance)
@@ -699,7 +698,7 @@ def read(path: Path) -> Any:
 
 
 def compared(folder: Path, pins: Pins, tolerance: float) -> Iterator[Difference]:
-    """Differences of a part: pins that are there, are not there any more, or are new."""
+    """Differences of a part: changed, missing and new pins."""
     before = {
         path.relative_to(folder).with_suffix("").as_posix(): path for path in sorted(folder.rglob("*.*"))
     }
@@ -732,7 +731,7 @@ def _chosen(only: Sequence[str] | None) -> list[str]:
 
 @contextlib.contextmanager
 def working(kept: Path | None) -> Iterator[Place]:
-    """A place in a temporary folder, which is the present one meanwhile."""
+    """A place in a temporary folder, which is the working directory within the block."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory(prefix="pins-") as folder, contextlib.chdir(folder):
         yield Place(Path(folder).resolve(), kept)
@@ -740,7 +739,7 @@ def working(kept: Path | None) -> Iterator[Place]:
 
 @app.command()
 def write(where: Annotated[Path, typer.Argument(metavar="DIR")], only: Only = None) -> None:
-    """Write the pins below DIR; parts that are there are replaced."""
+    """Write the pins below DIR; existing parts are replaced."""
     where = where.resolve()
     for part in _chosen(only):
         began = time.process_time()
@@ -770,7 +769,7 @@ def check(
     anew: Annotated[bool, typer.Option("--anew", help="Use policies that are trained now.")] = False,
     most: Annotated[int, typer.Option(help="Differences of a part that are printed.")] = 40,
 ) -> None:
-    """Make the pins anew and print every difference from those below DIR."""
+    """Compute the pins again and print every difference from those below DIR."""
     where, total = where.resolve(), 0
     with working(None if anew else where / TRAINED) as place:
         for part in _chosen(only):

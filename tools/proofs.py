@@ -1,14 +1,13 @@
-"""The proofs of the compiler and the monitor at any size: random formulas and traces against the definitions.
+"""Proofs of the compiler and the monitor at any size: random formulas and traces against the definitions.
 
     python tools/proofs.py --count 100000 --jobs 16 --seed 1 --log proofs.jsonl
     python tools/proofs.py values online --count 500
 
-Runs the checks of `tests/proof/` and `tests/helpers/laws.py` on cases that nobody has seen, or on those of
-`--seed`, in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of
-that file; the same command again goes on behind the last one. A mismatch is printed with its case. In the
-end a table says, for each proof, how many cases there were, how many disagreed, the greatest difference of
-two finite values that should be equal, and the seconds of processor time.
-Exit code: 1 if one disagreed.
+Runs the checks of `tests/proof/` and `tests/helpers/laws.py` on fresh random cases, or on those of `--seed`,
+in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of that file;
+the same command resumes after the last one. A mismatch is printed with its case. A final table shows for each
+proof the number of cases and mismatches, the greatest difference of two finite values that should be equal,
+and processor time. Exit code: 1 after a mismatch.
 """
 
 from __future__ import annotations
@@ -45,10 +44,10 @@ from proof.cases import Case
 from stlc.native import compiler
 
 BLOCK = 100
-"""Cases that one process runs before it tells what came out."""
+"""Number of cases in a block, after which a process reports its outcome."""
 
 MOST = 10
-"""Mismatches of one proof that are printed in full."""
+"""Maximum number of mismatches per proof that are printed in full."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of a block.
+    """Outcome of a block.
 
     Attributes:
         block: the cases.
-        cases: how many of them were judged; some drawn formulas are refused.
-        mismatches: what was found, with the case.
+        cases: number of judged ones; some drawn formulas are rejected.
+        mismatches: descriptions with the case.
         worst: the greatest difference of two finite values that should be equal.
         seconds: of processor time.
     """
@@ -82,11 +81,11 @@ class Outcome:
 # ---------------------------------------------------------------------- the proofs
 
 Check = Callable[[int], Any]
-"""Judges the case of a number: raises where it disagrees, False where there was nothing to judge."""
+"""Check of the case with a number: raises on a mismatch; False if there was nothing to judge."""
 
 
 def one_by_one(check: Check, block: Block) -> tuple[int, list[str]]:
-    """Cases drawn from their numbers."""
+    """Run cases seeded by their numbers; return their count and mismatches."""
     cases, mismatches = 0, []
     for number in range(block.first, block.first + block.count):
         try:
@@ -100,7 +99,7 @@ def one_by_one(check: Check, block: Block) -> tuple[int, list[str]]:
 def by_hypothesis(
     check: Callable[..., None], given: Mapping[str, Any], block: Block
 ) -> tuple[int, list[str]]:
-    """Cases drawn by hypothesis, the whole block from its first number; a mismatch is shrunk."""
+    """Run cases drawn by hypothesis, seeded by the block's first number; a mismatch is shrunk."""
     cases = 0
 
     def judged(**values: Any) -> None:
@@ -127,7 +126,7 @@ def by_hypothesis(
 
 
 def drawn_choices(block: Block) -> tuple[int, list[str]]:
-    """Choices between numbers, at switches and near them, in C and in torch; nothing without a C compiler."""
+    """Compare conditional expressions in C and torch, at and near switches; none without a compiler."""
     if compiler() is None:
         return 0, []
     nums = choosing(block.count, block.first)
@@ -191,7 +190,7 @@ PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
     "rtamt": partial(one_by_one, _rtamt),
 }
 EXTRA = frozenset({"rtamt"})
-"""What is only run when it is named: it needs another package."""
+"""Proofs that run only if named, as they need another package."""
 
 
 def run(block: Block) -> Outcome:
@@ -220,13 +219,13 @@ def run(block: Block) -> Outcome:
 
 
 def blocks_of(names: list[str], count: int, seed: int) -> list[Block]:
-    """All of them, those of the proofs by turns: what is wrong anywhere shows early."""
+    """All blocks, alternating between proofs, so that mismatches show early."""
     firsts = range(seed, seed + count, BLOCK)
     return [Block(name, first, min(BLOCK, seed + count - first)) for first in firsts for name in names]
 
 
 def finished(log: Path | None) -> list[Outcome]:
-    """The blocks of a log; a line that was being written when all ended does not count."""
+    """The finished blocks of a log; an incomplete last line is ignored."""
     found = []
     for line in log.read_text(encoding="utf-8").splitlines() if log is not None and log.exists() else ():
         try:
@@ -238,7 +237,7 @@ def finished(log: Path | None) -> list[Outcome]:
 
 
 def outcomes(blocks: list[Block], jobs: int) -> Iterator[Outcome]:
-    """What comes out of each block, in the order in which they end."""
+    """The outcome of each block, in the order of completion."""
     torch.set_num_threads(1)
     if jobs == 1:
         yield from map(run, blocks)
@@ -248,14 +247,14 @@ def outcomes(blocks: list[Block], jobs: int) -> Iterator[Outcome]:
 
 
 class Tally:
-    """Counts of every proof, and the mismatches as they come."""
+    """Counts of every proof, and mismatches."""
 
     def __init__(self, names: list[str], every: int) -> None:
         self.totals = {name: Outcome(Block(name, 0, 0), 0) for name in names}
         self._every, self._told = every, 0
 
     def add(self, new: Outcome) -> None:
-        """One more block, printed where there are mismatches and now and then."""
+        """Add a block; print mismatches, and intermediate counts."""
         name = new.block.proof
         old = self.totals[name]
         for text in new.mismatches[: max(MOST - len(old.mismatches), 0)]:
@@ -278,7 +277,7 @@ class Tally:
         return sum(len(total.mismatches) for total in self.totals.values())
 
     def table(self) -> None:
-        """A line a proof, and their sum."""
+        """Print a line per proof, and the total."""
         print(f"{'proof':18}{'cases':>10}{'mismatches':>12}{'difference':>12}{'seconds':>9}")
         for name, total in self.totals.items():
             wrong = len(total.mismatches)
@@ -298,7 +297,7 @@ def main(
     log: Annotated[Path | None, typer.Option(help="File of finished blocks, to go on from.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Cases between two lines of counts.")] = 5_000,
 ) -> None:
-    """Run proofs and print what came out."""
+    """Run proofs and print the outcomes."""
     chosen = list(names) if names else [name for name in PROOFS if name not in EXTRA]
     if unknown := set(chosen) - PROOFS.keys():
         raise typer.BadParameter(f"{', '.join(sorted(unknown))}: the proofs are {', '.join(PROOFS)}")

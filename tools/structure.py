@@ -1,6 +1,6 @@
-"""Measures of the code's structure: what a newcomer has to carry, counted.
+"""Metrics of the code's structure.
 
-`python tools/structure.py` prints the counts and where each finding is; `--folder` measures another tree.
+`python tools/structure.py` prints counts and the place of each finding; `--folder` measures another tree.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from functools import cached_property
 from pathlib import Path
 
 CRUMB = 100
-"""Lines below which a module with one importer should be part of it."""
+"""Lines below which a module with one importer should be merged into it."""
 NODES = 6
-"""Classes of tree nodes that a function tells apart from which on it walks over all of them."""
+"""Number of distinguished node classes from which on a function counts as a tree traversal."""
 TREES = ("stlc.grammar.ast", "stlc.compile.ir.nodes", "stlc.compile.ir.typed")
-"""Modules of the classes of the trees."""
+"""Modules that define the tree classes."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ class House:
         return [(package, files[package], lines[package]) for package in sorted(files)]
 
     def crumbs(self) -> list[str]:
-        """Modules with one importer and under `CRUMB` lines; packages' own files are not meant."""
+        """Modules with one importer and under `CRUMB` lines, without `__init__.py` files."""
         importers: dict[str, set[str]] = defaultdict(set)
         for name, targets in self.imports.items():
             for target in targets:
@@ -95,7 +95,7 @@ class House:
         ]
 
     def circles(self) -> list[str]:
-        """Groups of modules that import each other, imports for type checkers counted."""
+        """Import cycles, imports for type checkers included."""
         index: dict[str, int] = {}
         low: dict[str, int] = {}
         stack: list[str] = []
@@ -122,7 +122,7 @@ class House:
         return found
 
     def packed(self) -> list[str]:
-        """Parameters that pack a tuple of unlike things."""
+        """Parameters that are tuples of different types."""
         return [
             f"{name}:{argument.lineno} {function.name}({argument.arg}: {ast.unparse(argument.annotation)})"
             for name, function in self._functions()
@@ -131,7 +131,7 @@ class House:
         ]
 
     def homonyms(self) -> list[str]:
-        """Public classes of one name in more than one module; the trees' own namesakes are one idea."""
+        """Public class names in more than one module, except those of the trees."""
         homes: dict[str, list[str]] = defaultdict(list)
         for name, tree in self.trees.items():
             for node in tree.body:
@@ -140,7 +140,7 @@ class House:
         return [f"{name}: {', '.join(where)}" for name, where in sorted(homes.items()) if len(set(where)) > 1]
 
     def walks(self) -> list[str]:
-        """Functions that tell most classes of tree nodes apart."""
+        """Functions that distinguish at least `NODES` node classes."""
         nodes = {
             node.name
             for module in TREES
@@ -176,7 +176,7 @@ def _unlike(annotation: ast.expr) -> bool:
 
 
 def main() -> None:
-    """Print the measures."""
+    """Print the metrics."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

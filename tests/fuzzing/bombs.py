@@ -1,4 +1,4 @@
-"""Every construct that nests, chains or multiplies, as often as one likes: specifications and systems."""
+"""Size bombs: specifications and systems with `n`-fold nesting, chaining or multiplication of constructs."""
 
 from collections.abc import Iterator
 
@@ -53,7 +53,7 @@ def _chains(n: int) -> Iterator[tuple[str, str]]:
 
 
 def _lists(n: int) -> Iterator[tuple[str, str]]:
-    """What is written side by side."""
+    """Long lists and chains."""
     members = ", ".join(f"e{i}" for i in range(n))
     yield f"{n} members", f"enum E {{ {members} }}\nsignal e : E\nrequire r: e == e{n - 1}"
     points = ", ".join(f"[{i}, {i * i}]" for i in range(n))
@@ -84,7 +84,7 @@ def _letters(n: int) -> Iterator[tuple[str, str]]:
 
 
 def _multiplied(few: int) -> Iterator[tuple[str, str]]:
-    """What doubles at every step when it is written out."""
+    """Constructs that grow exponentially when expanded."""
     for word in ("and", "or", "<->", "->", "xor", "until", "since", "unless[0, 1 s]", "+", "*", "^"):
         start = "x" if word in "+*^" else "x > 0"
         doubled = "\n".join(f"def d{i} = (d{i - 1}) {word} (d{i - 1})" for i in range(1, few))
@@ -175,7 +175,7 @@ _PLACES_OF_NUMBERS = (
 
 
 def _huge() -> Iterator[tuple[str, str]]:
-    """Numbers without measure wherever a number may stand."""
+    """Huge numbers wherever a number may stand."""
     for place in _PLACES_OF_NUMBERS:
         for value in _NUMBERS:
             blanks = place.replace("{{", "").replace("{0}", "{}").count("{}")
@@ -210,7 +210,7 @@ def systems(n: int, base: str) -> Iterator[tuple[str, str]]:
 
 
 def _values(n: int, base: str) -> Iterator[tuple[str, str]]:
-    """Values where they do not belong."""
+    """Values of wrong types."""
     expressions = (
         *(
             "(" * n + "x" + ")" * n,

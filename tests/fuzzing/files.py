@@ -1,4 +1,4 @@
-"""Files that lead to others: imports and `extends` in circles, in diamonds, and to what is no file."""
+"""Files that refer to others: imports and `extends` in cycles, in diamonds, and to missing files."""
 
 import random
 
@@ -9,7 +9,7 @@ _FAR = ("", ".", "..", "/dev/null", "/dev/zero", "a.stl/b", "none.stl", "x" * 30
 
 
 def imports(rng: random.Random) -> dict[str, bytes]:
-    """`a.stl` and what it imports."""
+    """`a.stl` and its imported files."""
     several = rng.choice([2, 3, 3, 5, 12, 30])
     names = ["a.stl", *(f"m{i}.stl" for i in range(1, several))]
     texts = {name: _module(rng, i, names) for i, name in enumerate(names)}
@@ -20,7 +20,7 @@ def imports(rng: random.Random) -> dict[str, bytes]:
 
 
 def _module(rng: random.Random, at: int, names: list[str]) -> str:
-    """A ring, a diamond of diamonds, all to all, or anything."""
+    """A module with imports in a ring, in nested diamonds, of all others, or at random."""
     following = names[(at + 1) % len(names)]
     down = names[at + 1 :]
     shape = rng.random()
@@ -41,7 +41,7 @@ def _module(rng: random.Random, at: int, names: list[str]) -> str:
 
 
 def extended(rng: random.Random) -> dict[str, bytes]:
-    """`b.yaml` and what it extends."""
+    """`b.yaml` and the files that it extends."""
     several = rng.choice([1, 2, 3, 9, 40])
     names = ["b.yaml", *(f"c{i}.yaml" for i in range(1, several))]
     files = {}

@@ -1,4 +1,4 @@
-"""Traces in the formats of others: sound ones, damaged ones, and archives that unpack without end."""
+"""Traces in foreign formats: valid ones, damaged ones, and decompression bombs."""
 
 import contextlib
 import importlib
@@ -19,7 +19,7 @@ _MESSAGE = "\n".join(["float64 x", "float64 y", "float64[3] q", "bool flag", "st
 
 
 def foreign(rng: random.Random) -> tuple[str, bytes]:
-    """A suffix and what is in the file."""
+    """A suffix and the content of the file."""
     roll = rng.random()
     if roll < 0.15:
         return rng.choice([".mat", ".mcap", ".parquet", ".npz", ".txt", ""]), _noise(rng)
@@ -48,7 +48,7 @@ def _columns() -> dict[str, np.ndarray]:
 
 @cache
 def mat5() -> bytes:
-    """MATLAB up to version 7."""
+    """A MATLAB file up to version 7."""
     from scipy.io import savemat
 
     file = io.BytesIO()
@@ -62,7 +62,7 @@ def mat5() -> bytes:
 
 @cache
 def mat5_plain() -> bytes:
-    """The same, not compressed."""
+    """A MATLAB file up to version 7, not compressed."""
     from scipy.io import savemat
 
     file = io.BytesIO()
@@ -72,7 +72,7 @@ def mat5_plain() -> bytes:
 
 @cache
 def mat73() -> bytes:
-    """MATLAB 7.3, which is HDF5; with links that lead out of the file, in circles, and nowhere."""
+    """A MATLAB 7.3 (HDF5) file with external, cyclic and dangling links."""
     import h5py
 
     file = io.BytesIO()
@@ -89,7 +89,7 @@ def mat73() -> bytes:
 
 @cache
 def parquet() -> bytes:
-    """A table of Arrow."""
+    """A Parquet file, by Arrow."""
     import pyarrow as pa
     from pyarrow.parquet import write_table
 
@@ -128,7 +128,7 @@ _SOUND: tuple[tuple[str, Callable[[], bytes]], ...] = (
 
 @cache
 def _zip_bomb() -> bytes:
-    """A sound header, and zeros that a thousandth as many bytes stand for."""
+    """A valid header, and zeros compressed to a thousandth."""
     many = 20_000_000
     header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({many // 8},), }}".ljust(117) + "\n"
     member = b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header.encode()
@@ -161,9 +161,9 @@ def _mat_bomb() -> bytes:
 
 
 def prepare() -> list[str]:
-    """Make all of them, and import what reads them: nothing of it must count as the time of an input.
+    """Make all files and import their readers, so that this does not count as run time of an input.
 
-    Gives the formats that are left out since a package is not installed.
+    Returns the formats that are skipped because a package is missing.
     """
     missing = []
     for make in (*(make for _, make in _SOUND), _zip_bomb, _nested_zip, _mat_bomb):

@@ -1,4 +1,4 @@
-"""Specifications that a grammar draws: of every construct, mostly well-formed, often of the right sorts."""
+"""Random specifications from a grammar: all constructs, mostly well-formed, often well-typed."""
 
 import random
 import re
@@ -21,14 +21,14 @@ def specification(rng: random.Random) -> str:
 
 
 def formula(rng: random.Random, depth: int = 1) -> str:
-    """A formula, or what looks like one."""
+    """A formula, sometimes malformed."""
     if depth >= _DEEPEST or rng.random() < 0.2 * depth:
         return rng.choice(_ATOMS)(rng, depth + 1)
     return rng.choice(_FORMULAS)(rng, depth + 1)
 
 
 def number(rng: random.Random, depth: int = 0) -> str:
-    """A number, or what looks like one."""
+    """A numeric expression, sometimes malformed."""
     if depth >= _DEEPEST or rng.random() < 0.5:
         return rng.choice(_NUMBERS) if rng.random() < 0.6 else f"{literal(rng)}{rng.choice(_UNITS)}"
     return rng.choice(_ARITHMETIC)(rng, depth + 1)
@@ -123,7 +123,7 @@ _ATOMS: tuple[Draw, ...] = (_comparison, _comparison, _simple, _member)
 
 
 def region(rng: random.Random, depth: int = 0) -> str:
-    """A region, or what looks like one."""
+    """A region, sometimes malformed."""
     a, b = number(rng, depth), number(rng, depth)
     simple = [
         f"circle(center = [{a}, {b}], radius = {literal(rng)})",

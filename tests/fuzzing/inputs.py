@@ -1,6 +1,6 @@
 """Random, mutated and malicious inputs for `tools/fuzz.py`: a command line and its files.
 
-Everything follows from one `random.Random`; nothing is read but the specifications and systems of the tree.
+Inputs are determined by one `random.Random` and the specifications and systems of the tree.
 """
 
 import random
@@ -23,7 +23,7 @@ from fuzzing.valid import FORMATS, SPEC, WAVE, battered
 
 @dataclass
 class Input:
-    """A command line, and the files that lie in the folder where it runs.
+    """A command line, and the files in its working folder.
 
     Without a command line `a.stl` is read by the library (`fuzz_laws.laws`).
     """
@@ -34,11 +34,11 @@ class Input:
     typed: bytes = b""
     """The standard input."""
     missing: str = ""
-    """A package that is not installed, without which the input cannot be made."""
+    """Name of a missing package that the input needs, or ""."""
 
 
 def draw(rng: random.Random, kinds: tuple[str, ...] = ()) -> Input:
-    """One input, of one of these kinds if any are named; all of them follow from the numbers alone."""
+    """Draw one input, of one of `kinds` if any are given; it is determined by `rng`."""
     known = kinds or tuple(KINDS)
     (kind,) = rng.choices(known, weights=[KINDS[name][1] for name in known])
     try:
@@ -65,7 +65,7 @@ def _text(rng: random.Random) -> Input:
 
 
 def _piece(data: bytes, rng: random.Random) -> bytes:
-    """Some of it: whole files are slow, and most of them is alike."""
+    """A random part of a file: whole files are slow and repetitive."""
     return data[: rng.choice([300, 300, 1000, 1000, len(data)])]
 
 
@@ -76,7 +76,7 @@ def _bomb(rng: random.Random) -> str:
 
 
 def _pick(bombs: Iterator[tuple[str, str]], many: int, rng: random.Random) -> str:
-    """One of a sequence that is told only as it goes."""
+    """A random element of a lazy sequence."""
     at = rng.randrange(many)
     return next(islice(bombs, at, None))[1]
 
@@ -113,7 +113,7 @@ def _spec(rng: random.Random) -> Input:
 
 
 def _some(text: str, rng: random.Random) -> str:
-    """The declarations of a specification and a few of its requirements, which are read much faster."""
+    """The declarations of a specification and a few of its requirements, for speed."""
     if rng.random() < 0.2:
         return text
     lines = text.splitlines(keepends=True)
@@ -146,7 +146,7 @@ _READERS = (
 
 @cache
 def commands() -> frozenset[str]:
-    """Names of the commands that there are."""
+    """Names of all commands."""
     from stlc.cli.framework.app import PROGRAM
 
     return frozenset(PROGRAM.names())
@@ -188,7 +188,7 @@ def _trace(rng: random.Random) -> Input:
 
 
 def _files(rng: random.Random) -> Input:
-    """Files that lead to others."""
+    """An input of files that refer to others."""
     if rng.random() < 0.3:
         command = rng.choice([["system", "show"], ["system", "check"], ["compile", "a.stl", "--system"]])
         return Input("files", [*command, "b.yaml"], {"a.stl": TRAINED.encode(), **extended(rng)})
@@ -196,7 +196,7 @@ def _files(rng: random.Random) -> Input:
 
 
 def _of(form: str) -> Callable[[random.Random], Input]:
-    """A sound file of a format, damaged, and a command that reads it."""
+    """A maker of inputs: a damaged file of a format, and a command that reads it."""
 
     def make(rng: random.Random) -> Input:
         suffix, data = FORMATS[form](rng)
@@ -218,7 +218,7 @@ def _of(form: str) -> Callable[[random.Random], Input]:
 
 
 def _stream(rng: random.Random) -> Input:
-    """Samples that come line by line: a table or JSON, for what is usual or for anything."""
+    """An input of streamed samples: CSV or JSON lines, for a usual or a random specification."""
     roll = rng.random()
     if roll < 0.5:
         spec = SPEC.encode()
@@ -265,7 +265,7 @@ VALUES = (*_VALUES.split(), "", " ", "\n", "9" * 4000, "x" * 5000, "\udc80", "a\
 
 
 _BUSY = frozenset({"train", "simulate", "lsp", "doctor"})
-"""Commands that may work, or wait, for longer than any input is worth."""
+"""Commands that may run or wait for too long."""
 
 
 def _line(rng: random.Random) -> Input:
@@ -274,7 +274,7 @@ def _line(rng: random.Random) -> Input:
         [rng.choice(names)] if rng.random() < 0.9 else [rng.choice([*VALUES, "chek", "train", "simulate"])]
     )
     words = [rng.choice(OPTIONS if rng.random() < 0.5 else VALUES) for _ in range(rng.randrange(6))]
-    if front[0] in _BUSY:  # nothing that could run
+    if front[0] in _BUSY:  # nothing that can run
         words = ["--no-such-option", *words]
     files = {"a.stl": SMALL.encode(), "t.npz": small_trace(), "b.yaml": corpus("examples/*.yaml")[0]}
     return Input("line", [*front, *words], files)
@@ -285,4 +285,4 @@ KINDS: dict[str, tuple[Callable[[random.Random], Input], int]] = {
     **{"files": (_files, 3), "line": (_line, 3), "stream": (_stream, 8), "run": (_run, 5)},
     **{form: (_of(form), 1 if form == "bomb" else 2) for form in FORMATS},
 }
-"""How inputs of each kind are made, and how often they come."""
+"""Maker and weight of each kind of input."""

@@ -1,7 +1,7 @@
-"""What holds for every text, checked in process without the command line.
+"""Properties of every text, checked in process without the command line.
 
-Every way in gives a value or diagnostics; `fmt` keeps the meaning and settles at once; what is well-formed
-can be said in English.
+Every entry point gives a value or diagnostics; `fmt` keeps the meaning and is idempotent; a well-formed
+specification has an English translation.
 """
 
 import signal
@@ -14,12 +14,12 @@ from fuzzing.specs import SYSTEM
 
 
 def laws(source, limit: float, *, one_in: int = 1) -> int:
-    """0 for a text that compiles with a system or without, else 3; raises what is wrong with `stlc`.
+    """0 for a text that compiles with a system or without, else 3; raises an exception if a property fails.
 
     Args:
         source: of a specification.
         limit: seconds of processor time that one stage may take.
-        one_in: of so many texts one is laid out, which takes longer than everything else.
+        one_in: only one of so many texts is formatted, which takes longest.
     """
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import compile_spec
@@ -75,12 +75,12 @@ def _formatted(spec, source, limit) -> None:
 
 
 class HangError(BaseException):
-    """A stage took too long."""
+    """A stage exceeded its time limit."""
 
 
 @contextmanager
 def stage(name: str, limit: float):
-    """Raise HangError in what takes more than `limit` seconds of processor time."""
+    """Raise HangError within the block after `limit` seconds of processor time."""
 
     def alarm(_number, _frame):
         raise HangError(f"{name} takes more than {limit:g} s")

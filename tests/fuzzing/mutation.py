@@ -1,4 +1,4 @@
-"""What every random input is made from: the files of the tree, words of the language, and damage."""
+"""Mutation of random inputs: corpus files of the tree, words of the language, and damage."""
 
 import random
 from functools import cache
@@ -31,12 +31,12 @@ PIECES = (*_RAW, *(text.encode() for text in _PLAIN.split()))
 
 @cache
 def corpus(pattern: str) -> tuple[bytes, ...]:
-    """Files of the tree that match."""
+    """Contents of the files of the tree that match a pattern."""
     return tuple(path.read_bytes() for path in sorted(ROOT.glob(pattern)))
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """Some bytes changed, cut, doubled, moved, or replaced by what parsers stumble over."""
+    """Data with some bytes changed, cut, doubled, moved, or replaced by problematic tokens."""
     for _ in range(rng.choice([1, 1, 2, 3, 6, 15])):
         at, end = sorted((rng.randrange(len(data) + 1), rng.randrange(len(data) + 1)))
         end = min(end, at + rng.choice([1, 2, 5, 20, 200]))
@@ -67,6 +67,6 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
 
 
 def soup(rng: random.Random) -> str:
-    """Words of the language in no order."""
+    """Words of the language in random order."""
     glue = rng.choice([" ", " ", "", "\n"])
     return glue.join(rng.choices(WORDS, k=rng.choice([3, 20, 100, 1000])))

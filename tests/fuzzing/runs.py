@@ -1,4 +1,4 @@
-"""Folders of runs, each with one file or two that somebody has damaged: records, checkpoints, traces."""
+"""Run folders with one or two damaged files: records, checkpoints, traces."""
 
 import hashlib
 import json
@@ -26,12 +26,12 @@ COMMANDS = (
         "train --resume latest --steps 6 --no-pictures",
     ),
 )
-"""What reads a run; driving and resuming come again, since they read checkpoints, though no step is left."""
+"""Commands that read a run; simulation and resumption are repeated, as they read checkpoints."""
 
 
 @cache
 def run_files() -> dict[str, bytes]:
-    """Every file of a small run that was trained and driven, by its path.
+    """Path -> content of all files of a small trained and simulated run.
 
     Raises:
         ModuleNotFoundError: torch is not installed.
@@ -59,7 +59,7 @@ def _surroundings() -> dict[str, str]:
 
 
 def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes]]:
-    """A command line and the folder that it reads, with damage somewhere."""
+    """A command line and the damaged run folder that it reads."""
     files = dict(run_files())
     for _ in range(rng.choice([1, 1, 1, 2])):
         name = rng.choice(sorted(files))
@@ -77,7 +77,7 @@ def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes]]:
 
 
 def _with_weights(files: dict[str, bytes], name: str, rng: random.Random) -> dict[str, bytes]:
-    """Damaged weights, more often than not with a sum that fits."""
+    """Files with damaged weights, mostly with a matching checksum."""
     data = files[name]
     (size,) = (int.from_bytes(data[:8], "little"),)
     if rng.random() < 0.6:
@@ -119,7 +119,7 @@ _ODD = (
 
 
 def _said(data: bytes, rng: random.Random) -> bytes:
-    """JSON with another value somewhere; other texts with other words."""
+    """JSON with one value replaced; other texts with words replaced."""
     try:
         value = json.loads(data)
     except ValueError:
@@ -144,7 +144,7 @@ def _said(data: bytes, rng: random.Random) -> bytes:
 
 
 def prepare() -> list[str]:
-    """Train the run, and import what drives it; what is missing."""
+    """Train the run and import the simulator; return missing packages."""
     import importlib
 
     try:

@@ -1,4 +1,4 @@
-"""Specifications that are deep, long, huge or far away."""
+"""Specifications that are deeply nested, long, or contain huge numbers."""
 
 import random
 
@@ -30,7 +30,7 @@ TRAINED = (
     .replace("once[c, 1 s] mode == go or forall i in 0..2: q[i] > 0", "once[0, c] mode == go or z > 0")
     .replace("freeze x0 = x in next(abs(x - x0) < 1)", "z < 2")
 )
-"""What of it a system can have."""
+"""The part of `SMALL` that a system can declare."""
 
 SYSTEM = """stlc: 1
 name: small
@@ -53,7 +53,7 @@ init:
 
 
 def monster(rng: random.Random) -> str:
-    """A declaration that nobody would write by hand."""
+    """An extreme declaration."""
     text = rng.choice(rng.choice([_deep, _far, _wide])(rng))
     return text + rng.choice(["", "\n", "\r\n", " ;"])
 
@@ -75,7 +75,7 @@ def _between(rng: random.Random) -> str:
 
 
 def _deep(rng: random.Random) -> list[str]:
-    """What multiplies when it is written out."""
+    """Declarations that multiply when expanded."""
     few, both = rng.choice([5, 20, 40]), _between(rng)
     doubled = "".join(f"def d{i} = d{i - 1} {both} d{i - 1}\n" for i in range(1, few))
     return [
@@ -96,7 +96,7 @@ def _deep(rng: random.Random) -> list[str]:
 
 
 def _far(rng: random.Random) -> list[str]:
-    """Numbers without measure."""
+    """Declarations with huge numbers."""
     few, n, word = rng.choice([5, 20, 40]), _count(rng), _word(rng)
     big = rng.choice(["1e308", "9" * 300, "1e18", "1e12", "2^63", "10^400", "1e-300", "1e400", "9^9^9"])
     unit = rng.choice(["s", "steps", "ms", "h", ""])
@@ -122,7 +122,7 @@ def _far(rng: random.Random) -> list[str]:
 
 
 def _wide(rng: random.Random) -> list[str]:
-    """Brackets, chains and lists without end."""
+    """Very long brackets, chains and lists."""
     n, word, both = _count(rng), _word(rng), _between(rng)
     return [
         f"require r: {'(' * n}x > 0{')' * n}",

@@ -1,4 +1,4 @@
-"""Systems that explode, nest, or say what cannot be."""
+"""System files with exponential growth, deep nesting, or contradictions."""
 
 import random
 
@@ -6,7 +6,7 @@ from fuzzing.mutation import soup
 
 
 def monstrous_yaml(base: str, rng: random.Random) -> str:
-    """Anchors that multiply, endless nesting, tags, and values where they do not belong."""
+    """YAML with multiplying anchors, deep nesting, tags, and values of wrong types."""
     n, few = rng.choice([10, 100, 3000]), rng.choice([5, 9, 30])
     big = rng.choice(["1e308", "9" * 300, ".inf", "-.inf", ".nan", "0", "-1", "1e400", "0o777", "1:30:00"])
     laughs = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(

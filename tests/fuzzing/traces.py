@@ -1,4 +1,4 @@
-"""Traces: damaged, empty, lying about their size, or of another kind than their name says."""
+"""Traces: damaged, empty, with false sizes, or in another format than their suffix."""
 
 import io
 import json
@@ -13,7 +13,7 @@ from fuzzing.specs import SMALL
 
 @cache
 def small_trace() -> bytes:
-    """A sound trace for `SMALL`."""
+    """A valid trace for `SMALL`."""
     return archive({name: np.linspace(-1, 1, 12) for name in ("x", "y", "z")} | _rest())
 
 
@@ -30,7 +30,7 @@ def archive(arrays: dict[str, np.ndarray]) -> bytes:
 
 
 def archived(rng: random.Random) -> tuple[str, bytes]:
-    """An `.npz`: its suffix and what is in it."""
+    """An `.npz`: its suffix and content."""
     if rng.random() < 0.4:
         return ".npz", mutated(small_trace(), rng)
     if rng.random() < 0.1:
@@ -68,7 +68,7 @@ def archived(rng: random.Random) -> tuple[str, bytes]:
 
 
 def _claimed(rng: random.Random) -> bytes:
-    """An array whose header promises far more than there is."""
+    """An array whose header claims far more data than present."""
     shape = rng.choice(
         ["(1000000000000,)", "(-1,)", "(2, 99999999999, 9999999999)", "(1e9,)", "'x'", "(1,) * 99"]
     )
@@ -82,7 +82,7 @@ def _claimed(rng: random.Random) -> bytes:
 
 
 def table(rng: random.Random) -> tuple[str, bytes]:
-    """A `.csv`: its suffix and what is in it."""
+    """A `.csv`: its suffix and content."""
     names = ["t", "x", "y", "z", "n", "flag", "mode", "q[0]", "q[1]", "q[2]"]
     rows = [",".join(names), *(",".join([f"{k / 10}", *"001010010"]) for k in range(12))]
     if rng.random() < 0.5:

@@ -1,7 +1,7 @@
-"""Sound files of every format of traces, damaged: on the outside, or within what is packed.
+"""Valid files of every trace format, damaged: the file itself, or its compressed content.
 
-Damage within is packed again, with sums that fit, so that it gets past the door. What needs a library that is
-not installed raises ModuleNotFoundError, and is counted as skipped.
+Damaged content is compressed again with valid checksums, so that it reaches the parser. Formats whose library
+is not installed raise ModuleNotFoundError and count as skipped.
 """
 
 import bz2
@@ -26,7 +26,7 @@ signal y
 require low: always x > -0.5
 require back: eventually[0, 1 s] (x < 0.9 and y > 0)
 """
-"""What all of them are judged by."""
+"""Specification by which all traces are judged."""
 
 _LENGTHS = (
     0,
@@ -60,7 +60,7 @@ _NUMBERS = (
 
 
 def battered(data: bytes, rng: random.Random, others: tuple[bytes, ...] = ()) -> bytes:
-    """A few bits turned, a length or a number made huge, pieces cut, doubled, swapped, or of another file."""
+    """Data with flipped bits, huge numbers, or pieces cut, doubled, swapped, or of another file."""
     for _ in range(rng.choice([1, 1, 1, 1, 2, 6])):
         at = _place(len(data), rng)
         size = rng.choice([1, 2, 4, 8, 16, 64, 512, max(len(data) // 4, 1)])
@@ -97,7 +97,7 @@ def battered(data: bytes, rng: random.Random, others: tuple[bytes, ...] = ()) ->
 
 
 def _place(size: int, rng: random.Random) -> int:
-    """Somewhere, more often near the ends, where heads and tables stand."""
+    """A random position, more often near the ends, where headers and tables are."""
     near = min(size, 300)
     return rng.choice([rng.randrange(size + 1), rng.randrange(near + 1), size - rng.randrange(near + 1)])
 
@@ -106,7 +106,7 @@ def _place(size: int, rng: random.Random) -> int:
 
 
 def csv(rng: random.Random) -> tuple[str, bytes]:
-    """A table, often with a cell that is no number."""
+    """A CSV table, often with a non-numeric cell."""
     mark = rng.choice([",", ",", ";", "\t"])
     wave = WAVE * rng.choice([1, 1, 1, 60])
     rows = [["t", "x [m]", "y"], *([f"{k / 10!r}", repr(v), "1"] for k, v in enumerate(wave))]
@@ -121,7 +121,7 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile
 
 
 def npz(rng: random.Random) -> tuple[str, bytes]:
-    """Arrays, packed in any way, that carry their specification."""
+    """An `.npz` of arrays, compressed in any way, with its specification."""
     said = {"dt": 0.1, "spec_text": SPEC, "spec_set": {}, "signals": {"x": {"unit": "m", "kind": "real"}}}
     meta = json.dumps(said)
     if rng.random() < 0.3:
@@ -143,12 +143,12 @@ def npz(rng: random.Random) -> tuple[str, bytes]:
 
 
 def tables(rng: random.Random) -> tuple[str, bytes]:
-    """Columns of Arrow."""
+    """A Parquet table."""
     return ".parquet", battered(parquet(), rng)
 
 
 def mat(rng: random.Random) -> tuple[str, bytes]:
-    """MATLAB up to version 7; packed elements are damaged within."""
+    """A MATLAB file up to version 7 with damaged compressed elements."""
     if rng.random() < 0.4:
         return ".mat", battered(mat5(), rng, (mat5_plain(),))
     if rng.random() < 0.5:
@@ -164,7 +164,7 @@ def mat(rng: random.Random) -> tuple[str, bytes]:
 
 
 def hdf5(rng: random.Random) -> tuple[str, bytes]:
-    """MATLAB 7.3."""
+    """A MATLAB 7.3 file."""
     return ".mat", battered(_mat73(), rng)
 
 
@@ -189,7 +189,7 @@ def _mat73() -> bytes:
 
 
 def log(rng: random.Random) -> tuple[str, bytes]:
-    """MCAP with messages of ROS 2 or of JSON; chunks are damaged within."""
+    """An MCAP file with ROS 2 or JSON messages and damaged chunks."""
     data = rng.choice([mcap, lambda: robot_logs.json_mcap(WAVE)])()
     if rng.random() < 0.5:
         return ".mcap", battered(data, rng)
@@ -197,7 +197,7 @@ def log(rng: random.Random) -> tuple[str, bytes]:
 
 
 def _chunked(data: bytes, rng: random.Random) -> bytes:
-    """Records of MCAP with a chunk that says something else, and is packed anew."""
+    """MCAP records with one chunk modified and compressed again."""
     import zstandard
 
     out, at = data[:8], 8
@@ -220,7 +220,7 @@ def _chunked(data: bytes, rng: random.Random) -> bytes:
 
 
 def bag(rng: random.Random) -> tuple[str, bytes]:
-    """A bag of ROS 1; its chunk is damaged within."""
+    """A ROS 1 bag with a damaged chunk."""
     data = robot_logs.bag(WAVE, compression=rng.choice(["none", "bz2"]))
     if rng.random() < 0.5:
         return ".bag", battered(data, rng)
@@ -229,7 +229,7 @@ def bag(rng: random.Random) -> tuple[str, bytes]:
 
 
 def database(rng: random.Random) -> tuple[str, bytes]:
-    """The database of a bag of ROS 2."""
+    """The database of a ROS 2 bag."""
     return ".db3", battered(robot_logs.bag2(WAVE), rng)
 
 
@@ -251,7 +251,7 @@ def _bombs() -> tuple[tuple[str, Callable[[], bytes]], ...]:
 
 
 def bomb(rng: random.Random) -> tuple[str, bytes]:
-    """What is small, and large once it is read."""
+    """A decompression bomb."""
     suffix, make = rng.choice(_bombs())
     return suffix, _kept(make)
 
@@ -272,7 +272,7 @@ def _npz_bomb() -> bytes:
 
 
 def _bag_bomb() -> bytes:
-    """As many chunks as one likes, each of 60 MB."""
+    """A ROS 1 bag of many chunks, each of 60 MB."""
     packed = bz2.compress(bytes(60_000_000))
     fields = {b"op": b"\5", b"compression": b"bz2", b"size": struct.pack("<I", 60_000_000)}
     pairs = [name + b"=" + value for name, value in fields.items()]
@@ -336,7 +336,7 @@ FORMATS: dict[str, Callable[[random.Random], tuple[str, bytes]]] = {
 
 
 def prepare(formats: tuple[str, ...] = tuple(FORMATS)) -> list[str]:
-    """Make all bombs and sound files, so that it does not count as the time of an input; what is missing."""
+    """Make all bombs and valid files in advance; return missing packages."""
     missing = []
     makers = [
         *((name, lambda name=name: FORMATS[name](random.Random(0))) for name in formats if name != "bomb")

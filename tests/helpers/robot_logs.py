@@ -1,4 +1,4 @@
-"""Logs of robots, written by hand: what tests and `tools/fuzz.py` damage, wherever no writer is installed."""
+"""Robot logs written without libraries, for tests and `tools/fuzz.py`."""
 
 import bz2
 import io
@@ -35,14 +35,14 @@ DEFINITION_2 = DEFINITION.replace("uint32 seq\ntime stamp", "builtin_interfaces/
 
 
 def message(x: float, k: int) -> bytes:
-    """A message of ROS 1 after `DEFINITION`."""
+    """A ROS 1 message by `DEFINITION`."""
     head = struct.pack("<III", k, 5, 6) + _text(b"map")
     values = struct.pack("<5d", x, 2.0, 1.0, 2.0, 3.0)
     return head + values + struct.pack("<I2d", 2, 7.0, 8.0) + struct.pack("<?", k > 7) + _text(b"base")
 
 
 def message_2(x: float, k: int) -> bytes:
-    """A message of ROS 2 after `DEFINITION_2`."""
+    """A ROS 2 message by `DEFINITION_2`."""
     head = struct.pack("<iII", 5, 6, 4) + b"map\0"
     values = struct.pack("<5d", x, 2.0, 1.0, 2.0, 3.0)
     more = struct.pack("<I4x2d", 2, 7.0, 8.0) + struct.pack("<?3xI", k > 7, 5) + b"base\0"
@@ -59,7 +59,7 @@ def _record(content: bytes, **fields: bytes) -> bytes:
 
 
 def bag(values: list[float], *, compression: str = "bz2", change: Callable[[bytes], bytes] = bytes) -> bytes:
-    """A bag of ROS 1 with one topic, `/robot/state`, in one chunk, which is changed before it is packed."""
+    """A bag of ROS 1 with one topic, `/robot/state`, in one chunk, changed before compression."""
     facts = {
         "type": b"demo/State",
         "md5sum": b"0" * 32,
