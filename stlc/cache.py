@@ -1,8 +1,8 @@
 """The cache folder: reproducible artefacts kept between processes, protected from other users.
 
-Code is loaded from here, so the folder is used only if it belongs to the user, is no link, and nobody else
-may write to it; every file in it that is read is held to the same. Otherwise, and where there is no place for
-such a folder, a temporary folder of the process takes its place (`temporary`), or nothing is kept.
+Code is loaded from here, so the folder and each file read from it must belong to the user, be no link, and be
+writable by the user only. Otherwise, or if no such folder can be created, a temporary folder of the process
+is used (`temporary`), or nothing is cached.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Escaping of untrusted text for C, markup, tables, terminals, shells and paths.
 
-Names, comments, units and file names come from files that anybody may have written. Each target has one
-function here; what is written for that target goes through it, whoever wrote the text. Where the target has
-a way to write every character, the text comes back exactly when the target is read; where it has none (a
-comment, a terminal, a picture), what cannot be shown is replaced by a visible sign.
+Names, comments, units and file names come from untrusted files. Each target has one function here, through
+which every text for that target passes. If the target can represent every character, reading it restores the
+text exactly; if not (a comment, a terminal, a picture), such characters are replaced by a visible symbol.
 """
 
 from __future__ import annotations
@@ -103,8 +102,8 @@ def _raw(char: str) -> bool:
 def c_string(text: str) -> str:
     """A literal of C99 and C++11 that holds the text in UTF-8, quotes included.
 
-    What is not printable ASCII is written in octal, which ends after three digits; a question mark begins no
-    trigraph. The literal is no format: print it by `%s`.
+    Characters other than printable ASCII are written as three octal digits; question marks do not form
+    trigraphs. The literal is not a format string: print it by `%s`.
     """
     data = _SURROGATE.sub("\ufffd", text).encode()
     return '"' + "".join(_C_BYTES.get(byte) or f"\\{byte:03o}" for byte in data) + '"'

@@ -55,8 +55,8 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         task: specification and system.
-        steps: of an episode; by default the horizon of a plan, after which the episode is *terminated*.
-            A longer one goes on in the world of the system and is *truncated*.
+        steps: of an episode; by default the horizon of a plan, after which the episode is *terminated*. A
+            longer one continues in the world of the system and is *truncated*.
         reward: "dense" is the increase of the robustness in each step, which sums to that of the episode less
             that of its start; "sparse" is the robustness of the episode, at its last step.
         normalised: observations and actions are from -1 to 1, which most learners expect.

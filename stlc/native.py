@@ -133,17 +133,17 @@ class Kernel:
     def climb(
         self, x0: NDArray[np.float64], plans: NDArray[np.float64], how: Climb, *, threads: int = 1
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Improve plans by batched hill climbing on the exact robustness.
+        """Improve plans by batched local search on the exact robustness.
 
         Args:
             x0: (B, n), contiguous float64.
-            plans: where to start, (B, T, m).
-            how: the climb.
+            plans: initial guesses, (B, T, m).
+            how: parameters of the search.
             threads: to share the rows among; the result does not depend on it.
 
         Returns:
-            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN. Where the climb was
-            stopped the last rows are as they were given, and their robustness is NaN.
+            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN. If the search was
+            stopped, the last rows are unchanged, and their robustness is NaN.
 
         Raises:
             MemoryError: there is no room.
@@ -167,8 +167,8 @@ class Outcome:
 
     Attributes:
         by_rho: its derivative by the robustness of each requirement, (B, R).
-        by_columns: its derivative by the states, (n, T+1, B); None where it does not read them.
-        slope: of conditions, per unit.
+        by_columns: its derivative by the states, (n, T+1, B); None if it does not depend on them.
+        slope: of smoothed conditions, per unit.
     """
 
     by_rho: NDArray[np.float64]
@@ -191,12 +191,12 @@ class Adjoint:
         *,
         threads: int = 1,
     ) -> NDArray[np.float64]:
-        """The gradient by plans of what depends on robustness and states.
+        """The gradient by plans of an objective of robustness and states.
 
         Args:
             x0: (B, n).
             u: (B, T, m).
-            outcome: what to differentiate.
+            outcome: derivatives of the objective.
             threads: to share the rows among.
 
         Returns:
@@ -222,10 +222,10 @@ class Adjoint:
 def _share(
     rows: Callable[[int, int], int], batch: int, threads: int, *, grain: int = GRAIN, stop: Stop = never
 ) -> None:
-    """Call `rows(first, last)` on short parts of a batch, on so many threads side by side.
+    """Call `rows(first, last)` on short parts of a batch, on several threads.
 
-    Between two parts Python goes on: an interruption ends the work there, and so does `stop`, which leaves
-    the other rows undone. Raises MemoryError where a part gives not 0.
+    Python runs between two parts: an interruption or `stop` ends the work there, with the other rows
+    unprocessed. Raises MemoryError if a part returns a value other than 0.
     """
     queue = _Parts(batch, grain, stop)
     if threads < 2:
@@ -256,7 +256,7 @@ class _Parts:
         self._next = self._batch
 
     def work(self, rows: Callable[[int, int], int]) -> None:
-        """Do parts until there are none left; the size of the next follows from the time of the last."""
+        """Process parts until none are left; the size of the next follows from the time of the last."""
         grains = 1
         while not self.failed:
             with self._lock:
@@ -273,7 +273,7 @@ class _Parts:
 
 
 def load(text: str) -> ctypes.CDLL | None:
-    """The library of a C text, built if it is not in the cache; None where that cannot be done."""
+    """The library of a C text, built if it is not in the cache; None if that fails."""
     using = compiler()
     if using is None:
         return None
@@ -286,7 +286,7 @@ def load(text: str) -> ctypes.CDLL | None:
 
 
 def why_none(text: str) -> str:
-    """Reason for which `load` gave None for a text, in words that follow "because"."""
+    """Reason for which `load` returned None for a text, as a clause after "because"."""
     using = compiler()
     if using is None:
         return "there is no C compiler"
@@ -298,7 +298,7 @@ def why_none(text: str) -> str:
 
 
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
-    """The library, kept or built. Raises CompilerError."""
+    """The library, cached or built. Raises CompilerError."""
     key = _key(text, using)
     kept = cache.lasting()
     places = [place for place in (kept, _made.get("here")) if place is not None]
@@ -329,17 +329,17 @@ def _loaded(text: str, using: str) -> ctypes.CDLL | None:
 
 
 _made: dict[str, Cache | None] = {}
-"""The temporary folder, once it was needed."""
+"""The temporary folder, created when needed."""
 
 
 def _key(text: str, using: str) -> str:
-    """Hash of everything that a library is built from and by. Raises CompilerError."""
+    """Hash of all inputs of a build. Raises CompilerError."""
     parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, _processor())
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
 
 
 def _kept(place: Cache, key: str) -> ctypes.CDLL | None:
-    """A library that was built before, if its content is what it was then."""
+    """A cached library, if its content is unchanged."""
     for name in place.names(f"kernel-{key}-"):
         data = place.read(name)
         if data is None:
@@ -352,7 +352,7 @@ def _kept(place: Cache, key: str) -> ctypes.CDLL | None:
 
 
 def _opened(place: Cache, name: str) -> ctypes.CDLL | None:
-    """A library in memory; None where the system refuses, such as from a disk without programs."""
+    """Load a library; None if the system refuses, such as from a `noexec` disk."""
     try:
         return ctypes.CDLL(str(place.folder / name))
     except OSError:
@@ -360,7 +360,7 @@ def _opened(place: Cache, name: str) -> ctypes.CDLL | None:
 
 
 def _built(text: str, using: str, key: str) -> bytes | None:
-    """The bytes of a library; None where there is no room to build. Raises CompilerError."""
+    """Build a library; return its bytes, None if the disk is full. Raises CompilerError."""
     try:
         with tempfile.TemporaryDirectory(prefix="stlc-") as folder, leaving(lambda _code: rmtree(folder)):
             source, target = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
@@ -372,7 +372,7 @@ def _built(text: str, using: str, key: str) -> bytes | None:
 
 
 def _compile(using: str, source: Path, target: Path, key: str) -> None:
-    """Build as fast code; as slow code where the compiler takes too much time or memory for that."""
+    """Build with optimisation, or with less if the compiler exceeds its time or memory limit."""
     try:
         try:
             why = _attempted(using, source, target, "-O3" if source.stat().st_size < LONG else "-O2")
@@ -387,9 +387,9 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Build with vector forms of sine and the like where the C library has them, without elsewhere.
+    """Build with vectorised sine and other functions if the C library has them, else without.
 
-    Gives why that cannot be done, or "". Raises CompilerError where the compiler was given up.
+    Returns the reason of a failure, or "". Raises CompilerError if the compiler exceeded its limits.
     """
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
     for attempt in (*fast, []):

@@ -162,7 +162,7 @@ def parse_unit(text: str) -> Unit:
     """The unit that `text` writes: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
 
     Raises:
-        ValueError: it is not a unit; the message says what is wrong.
+        ValueError: it is not a unit; the message has the reason.
     """
     cleaned = text.strip()
     if not cleaned:

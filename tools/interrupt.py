@@ -1,16 +1,16 @@
 """Robustness test: commands that are interrupted, or run out of budget, at random moments.
 
-`python tools/interrupt.py --count 200 --seed 0` starts so many commands of every kind that works for a while:
-training (with a warm and a cold cache of kernels, without a C compiler, of missions, several runs side by
-side, resumed), simulation, checks, explanations, exports, tables, pictures. Most get SIGINT or SIGTERM after
-a random time, themselves or with their process group; the others have a budget. For each it is checked:
+`python tools/interrupt.py --count 200 --seed 0` starts 200 commands of all long-running kinds: training (with
+a warm and a cold cache of kernels, without a C compiler, of missions, several runs side by side, resumed),
+simulation, checks, explanations, exports, tables, pictures. Most get SIGINT or SIGTERM after a random time,
+themselves or with their process group; the others have a budget. For each it is checked:
 
 - it ends within 2 s of the signal, or has used no more processor time, on one core, than its budget plus 20 %
-  and 10 s (so that what else goes on does not matter; a compiler that it has started counts);
+  and 10 s (independent of other load; a compiler that it has started counts);
 - it takes at most 2 GB of memory, and so does each process that it has started;
-- its exit code is that of the signal (or of its end, where it was quicker), without a traceback;
-- no process is left that it has started, and no file that is half written;
-- run folders open, and `stlc train --resume` goes on with what was interrupted.
+- its exit code is that of the signal (or its normal one, if it ended before), without a traceback;
+- no child process and no incomplete file is left;
+- run folders are readable, and `stlc train --resume` resumes interrupted trainings.
 
 A line of JSON per command goes to the standard output, the summary to the standard error. Exit code 1 if any
 check failed.

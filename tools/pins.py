@@ -110,7 +110,7 @@ VOLATILE: Mapping[str, str] = {
 A place is the document's schema (or file) and the keys below it, joined by dots.
 """
 
-# ----------------------------------------------------------------------------------------- what is pinned
+# ----------------------------------------------------------------------------------------- pinned inputs
 
 SPECS = (
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("specs/**/*.stl")),

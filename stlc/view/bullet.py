@@ -73,7 +73,7 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
             begin = time.perf_counter()
             theatre.turn(index, deciders(scene, index, stage.joints.shape[1]))
             time.sleep(max(0.0, dt - (time.perf_counter() - begin)))
-    except theatre.client.error:  # somebody closed the window
+    except theatre.client.error:  # the user closed the window
         if theatre.open:
             raise
     finally:

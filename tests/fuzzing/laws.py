@@ -19,7 +19,7 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
     Args:
         source: of a specification.
         limit: seconds of processor time that one stage may take.
-        one_in: only one of so many texts is formatted, which takes longest.
+        one_in: one in this many texts is formatted, as that takes longest.
     """
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import compile_spec

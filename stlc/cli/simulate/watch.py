@@ -22,7 +22,7 @@ STANDARD_OUTPUT = "-"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """How a deployment is watched.
+    """Live output options of a deployment.
 
     Attributes:
         title: name of the deployment.
