@@ -65,16 +65,16 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One file and what to do with it.
+    """One file and its options.
 
     Attributes:
         name: of the file as given.
-        question: what is asked of it.
+        question: options of reading and judging.
         runs: folder of all runs.
-        out: where its robustness signals go.
-        chunk: judge it piece by piece, so many samples at a time; 0 as a whole where it fits.
+        out: file for its robustness signals.
+        chunk: samples per piece for chunked judging; 0: as a whole if it fits into memory.
         color: whether texts may be coloured.
-        mode: of the colour of the whole program.
+        mode: colour mode of the program.
     """
 
     name: str
