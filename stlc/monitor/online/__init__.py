@@ -1,4 +1,4 @@
-"""Samples one by one: verdicts as soon as they are decided, in bounded memory."""
+"""Online monitoring: verdicts as soon as they are decided, in bounded memory."""
 
 from stlc.monitor.online.online import How, Online
 

@@ -1,4 +1,4 @@
-"""Bounds of a requirement while its signals come in, and what gives them: a tracker."""
+"""Bounds of a requirement on a growing trace, and the interface of the trackers that compute them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Ending: TypeAlias = Literal["open", "truncate"]
 
 @dataclass(frozen=True, slots=True)
 class TrackingOptions:
-    """How values are taken.
+    """Options for the values of a requirement.
 
     Attributes:
-        ending: what becomes of windows that the end of the trace cuts.
+        ending: treatment of windows that the end of the trace cuts.
         truth: predicates are true or false (+inf or -inf), without any tolerance.
-        begin: the first sample that is judged.
+        begin: the first sample at which the requirement is evaluated.
     """
 
     ending: Ending = "open"
@@ -36,17 +36,17 @@ class Bounds(NamedTuple):
 
 
 class Tracker(Protocol):
-    """What is known of a requirement.
+    """Incremental evaluator of one requirement.
 
-    Instants are settled one after the other: from then on their value cannot change.
+    Instants are settled in order: the value of a settled instant cannot change.
     """
 
     @property
     def samples(self) -> int:
-        """How many it has taken in."""
+        """Number of samples taken in."""
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in; the arguments are those of `Side.grow`."""
+        """Take in new samples; the arguments are those of `Side.grow`."""
 
     @property
     def settled(self) -> int:
@@ -56,7 +56,7 @@ class Tracker(Protocol):
         """Bounds over all continuations at instants that are not settled, or just were."""
 
     def ended(self, starts: range) -> Bounds:
-        """The same where the trace is over and windows to its end end with the last sample."""
+        """Final bounds: the trace has ended, and windows to its end are clipped at the last sample."""
 
     def drop(self, start: int) -> int:
-        """Forget instants before `start`; the number of the first sample that is still needed."""
+        """Forget instants before `start`; returns the number of the first sample that is still needed."""

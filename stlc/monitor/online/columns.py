@@ -1,6 +1,6 @@
-"""Columns that grow sample by sample, in memory that the windows of a formula bound.
+"""Columns that grow sample by sample, in memory bounded by the windows of a formula.
 
-Every column is kept twice, as the least and as the greatest value over all continuations; where nothing is
+Every column is stored twice, as the least and as the greatest value over all continuations; where nothing is
 unknown the two agree.
 """
 
@@ -36,11 +36,11 @@ from stlc.monitor.values import by_truth
 Floats: TypeAlias = NDArray[np.float64]
 End: TypeAlias = Literal["lower", "upper", "truncate"]
 ColumnPlans: TypeAlias = Mapping[End, ColumnPlan]
-"""Least and greatest value wherever the trace ends, and the requirement as it is written."""
+"""Least and greatest value wherever the trace ends, and the value of the requirement as written."""
 Beyond: TypeAlias = Literal["lower", "upper", "truncate", "both"]
 
 NOTHING = ""
-"""A column for formulas that read none."""
+"""Placeholder column for formulas that read no column."""
 
 FAR = 1 << 40
 """More samples than any trace has."""
@@ -50,13 +50,13 @@ _EXACT = Windows(Exact(), NUMPY)
 
 
 class Reader:
-    """Evaluates the same formulas again and again; what has to be done is remembered for each extent.
+    """Repeated evaluator of the same formulas; the schedule of each extent is cached.
 
     Args:
         formulas: over columns.
-        end: what stands beyond the last row.
+        end: treatment of rows beyond the last one.
         going_on: the trace does not end with the last row.
-        back: rows before the first that is asked for which they read.
+        back: lookback in rows.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Reader:
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
-        """Values (count, traces) from row `start` on; columns may be longer than the shortest of them."""
+        """Values (count, traces) from row `start` on; rows beyond the shortest column are ignored."""
         names = self.names or (NOTHING if NOTHING in env else next(iter(env)),)
         length = min(len(env[name]) for name in names)
         if count <= 0:
@@ -89,7 +89,7 @@ class Reader:
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
     ) -> list[Floats]:
-        """The same of columns in which NaN is a value that is not known: the least or the most they may be.
+        """Values of columns in which NaN is an unknown value, taken at its least or at its greatest.
 
         Where `least` is None the columns (rows, 1) give both, (count, 2).
         """
@@ -105,7 +105,7 @@ class Reader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> Reader:
-        """What reads the formulas at one end of what is possible."""
+        """The reader of the formulas at their least or greatest value."""
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
@@ -115,16 +115,16 @@ class Reader:
 
 @dataclass(slots=True)
 class Side:
-    """The columns of a plan, at one end of what is possible.
+    """The columns of a plan, at their least or greatest values.
 
     Attributes:
-        plan: what there is to compute.
-        end: which end: least, greatest, or with windows cut at the last sample.
+        plan: the columns to compute.
+        end: which bound: least, greatest, or with windows cut at the last sample.
         beyond: rows after the last sample that the formula over the columns reads.
         truth: predicates are true or false, +inf or -inf.
-        least: what is not known of a signal is at its least, else at its most.
-        base: number of the first sample that is kept.
-        rows: column -> values from `base` on, (kept + beyond, traces).
+        least: unknown values of a signal are taken at their least, else at their greatest.
+        base: number of the first stored sample.
+        rows: column -> values from `base` on, (stored + beyond, traces).
     """
 
     plan: ColumnPlan
@@ -162,12 +162,12 @@ class Side:
                 self._pads[name] = max(self._pads[name], wanted)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in.
+        """Take in new samples.
 
         Args:
-            signals: columns (kept, traces) that end with the last sample.
+            signals: columns (stored, traces) that end with the last sample.
             first: number of their first row.
-            samples: how many there are by now.
+            samples: total number of samples.
         """
         self._seen = (signals, first, samples)
         signals = with_seen(signals) if self._told else signals
@@ -179,7 +179,7 @@ class Side:
             self._grow_latched(stream, reader, samples)
 
     def over(self) -> Side:
-        """The columns where the last sample is the end: what looks on then does without."""
+        """The columns with the last sample as the end of the trace: windows beyond it are clipped."""
         if self._seen is None or all(stream.ahead == 0 for stream in self.plan.streams):
             return self
         last = replace(
@@ -193,7 +193,7 @@ class Side:
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
-        """Forget rows before sample `first`, as far as no column needs them."""
+        """Forget rows before sample `first` that no column needs."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._latched]
         base = max(min([first, *needs]), self.base)
         if base > self.base:

@@ -1,4 +1,4 @@
-"""The samples of a stream that are kept: columns that grow at the end and are forgotten at the front."""
+"""Sample history of a stream: columns that grow at the end and are trimmed at the front."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _SPARE = 64
 
 
 class SampleHistory:
-    """Columns (samples, 1) of consecutive samples; one sample more costs amortized constant time.
+    """Columns (samples, 1) of consecutive samples; appending one takes amortized constant time.
 
     Attributes:
-        first: number of the first sample that is kept.
-        samples: how many there were by now.
+        first: number of the first stored sample.
+        samples: total number of samples taken in.
     """
 
     def __init__(self) -> None:
@@ -48,11 +48,11 @@ class SampleHistory:
         self._rows, self._origin = moved, self.first
 
     def columns(self, first: int | None = None, stop: int | None = None) -> dict[str, Floats]:
-        """Views of the samples from `first` up to `stop`, as far as they are kept."""
+        """Views of the stored samples from `first` up to `stop`."""
         low = max(self.first if first is None else first, self.first) - self._origin
         high = min(self.samples if stop is None else stop, self.samples) - self._origin
         return {name: rows[low:high] for name, rows in self._rows.items()}
 
     def forget(self, before: int) -> None:
-        """Forget the samples before one; their memory is freed when columns are moved the next time."""
+        """Forget the samples before one; their memory is freed when the columns are next moved."""
         self.first = min(max(before, self.first), self.samples)

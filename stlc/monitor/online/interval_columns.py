@@ -1,7 +1,7 @@
-"""Requirements whose windows have an end, judged together: both ends of what is possible in one array.
+"""Requirements with bounded windows, evaluated together: least and greatest values in one array.
 
 Every column is `(rows, 2)`: the least and the greatest value over all continuations. Known rows hold a value
-twice, the rows behind them -inf and +inf; so one evaluation gives both bounds of all requirements.
+twice, the rows after them -inf and +inf; so one evaluation gives both bounds of all requirements.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SPARE = 64
 
 
 def fits(plans: ColumnPlans) -> bool:
-    """Whether both ends follow from the same formula, over predicates of the present and what is latched."""
+    """Whether both bounds follow from one formula, over predicates of the present and latched values."""
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(map(_of_the_present, planned.streams))
 
@@ -39,11 +39,11 @@ def _of_the_present(stream: PredicateColumn | RecursiveColumn) -> bool:
 
 @dataclass(slots=True)
 class IntervalColumns:
-    """The columns of requirements whose instants are counted at the same time.
+    """The columns of requirements whose instants are settled at the same time.
 
     Attributes:
         truth: predicates are true or false, +inf or -inf.
-        samples: how many there are by now.
+        samples: number of samples taken in.
     """
 
     truth: bool
@@ -65,13 +65,13 @@ class IntervalColumns:
     _found: tuple[tuple[int, int], list[Floats]] | None = None
 
     def add(self, formula: ir.Formula) -> IntervalTracker:
-        """One more requirement; before the first sample."""
+        """Add a requirement; only before the first sample."""
         self._formulas.append(formula)
         self._starts.append(0)
         return IntervalTracker(self, len(self._starts) - 1, reach(formula).future)
 
     def grow(self, signals: Mapping[str, Floats], samples: int) -> None:
-        """Take in the samples that are new; `signals` (kept, 1) end with the last one."""
+        """Take in the new samples; `signals` (stored, 1) end with the last one."""
         if samples == self.samples:
             return
         first, self.samples, self._found = self.samples, samples, None
@@ -98,7 +98,7 @@ class IntervalColumns:
         return self._found[1][which]
 
     def drop(self, which: int, start: int) -> None:
-        """Forget what a requirement needs for instants before `start`."""
+        """Forget rows that a requirement needs only for instants before `start`."""
         self._starts[which] = start
         needed = min(min(self._starts) - self._back, self.samples - self._latch_back)
         if needed > self._base:
@@ -106,7 +106,7 @@ class IntervalColumns:
             self._view()
 
     def _view(self) -> None:
-        """What is kept, from `_base` on."""
+        """Update the views of the stored rows, from `_base` on."""
         kept = slice(self._base - self._origin, self.samples - self._origin + self._beyond)
         self._env = {name: column[kept] for name, column in self._rows.items()}
 
@@ -133,7 +133,7 @@ class IntervalColumns:
         }
 
     def _make_room(self, known: int) -> None:
-        """Move the rows from `_base` on to the front where those that come find no place behind them."""
+        """Move the rows from `_base` on to the front where the free rows at the end are too few."""
         if self.samples + self._beyond - self._origin <= self._room:
             return
         kept = slice(self._base - self._origin, known - self._origin)
@@ -147,12 +147,12 @@ class IntervalColumns:
 
 @dataclass(frozen=True, slots=True)
 class IntervalTracker:
-    """A formula whose windows have an end, at consecutive instants, beside others.
+    """Tracker of one formula with bounded windows; shares columns with others.
 
     Attributes:
         shared: the columns.
         which: number of the formula.
-        ahead: samples after an instant that it reads.
+        ahead: lookahead in samples.
     """
 
     shared: IntervalColumns
@@ -161,7 +161,7 @@ class IntervalTracker:
 
     @property
     def samples(self) -> int:
-        """How many there are by now."""
+        """Number of samples taken in."""
         return self.shared.samples
 
     @property
@@ -170,7 +170,7 @@ class IntervalTracker:
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Take new samples in."""
+        """Take in new samples."""
         self.shared.grow(signals, samples)
 
     def live(self, start: int, stop: int) -> Bounds:
@@ -181,10 +181,10 @@ class IntervalTracker:
         return Bounds(found[:, 0], found[:, 1])
 
     def ended(self, starts: range) -> Bounds:
-        """Where the trace is over: what is missing stays unknown."""
+        """Bounds at the end of the trace: what is missing stays unknown."""
         return self.live(starts.start, starts.stop)
 
     def drop(self, start: int) -> int:
-        """Forget instants before `start`; no signals are kept."""
+        """Forget instants before `start`; no signals are stored."""
         self.shared.drop(self.which, start)
         return self.shared.samples

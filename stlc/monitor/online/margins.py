@@ -1,4 +1,4 @@
-"""Margins of many traces side by side while they go on: for each what `Online` says of it, all at once."""
+"""Robustness margins of many growing traces side by side: the bounds of `Online`, for all traces at once."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _ROOM = 64
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """A requirement at the present sample of every trace, (traces,) each.
+    """Bounds of a requirement at the present sample of every trace, (traces,) each.
 
     Attributes:
-        low: least robustness over all that may follow, the least over the windows that are still open at
-            this sample; of a requirement that is judged once, over its one window.
-        high: greatest robustness, the least over the same windows: what can still be had of them.
-        violated: at how many starts it is violated by now, whatever follows.
-        open: whether a start so far is neither satisfied nor violated for certain.
+        low: least robustness over all continuations, minimized over the windows that are still open at
+            this sample; of a requirement that is evaluated once, over its one window.
+        high: greatest robustness over all continuations, minimized over the same windows.
+        violated: number of starts at which it is already violated, whatever follows.
+        open: whether a start so far is still undecided.
     """
 
     low: Floats
@@ -43,7 +43,7 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Violated if it is at one start, satisfied if it is at all so far."""
+        """Violated if it is at one start, satisfied if it is at all starts so far."""
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -51,11 +51,11 @@ class Margin:
 
 @dataclass(slots=True)
 class _Watched:
-    """A requirement and what is counted of it: starts before `next` are settled.
+    """A requirement and its running counts: starts before `next` are settled.
 
     Attributes:
         rule: the requirement.
-        horizon: what `T` means, in steps.
+        horizon: value of `T`, in steps.
         whole: its bounds, wherever the traces end.
         next: the first start that is not settled.
         violated: settled starts that are violated, (traces,).
@@ -71,12 +71,12 @@ class _Watched:
 
     @property
     def everywhere(self) -> bool:
-        """Whether it is judged at every start, and not only at the first sample."""
+        """Whether it is evaluated at every start, and not only at the first sample."""
         return self.rule.windowed and not self.rule.absolute and self.horizon is not None
 
     @property
     def ahead(self) -> int | None:
-        """How many samples behind its start decide it; None where the end of the trace does."""
+        """Lookahead in samples; None where the end of the trace decides it."""
         moving = window_of(self.rule, self.horizon)
         if moving is not None:
             return max(moving, self.rule.reach)
@@ -92,12 +92,12 @@ class _Watched:
         return max(self.next - history(self.rule.formula), 0)
 
     def look(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """The margin at the last of so many samples; `env` (kept, traces) begins with sample `first`."""
+        """The margin at the last of `samples` samples; `env` (stored, traces) begins with sample `first`."""
         if not self.everywhere and self.next:
             assert self.last is not None
             return self.last
         stop = samples if self.everywhere else 1
-        begin = max(self.needs(), first)  # as many samples every time: what is planned for them is known
+        begin = max(self.needs(), first)  # a constant number of samples: its schedule is cached
         starts = range(self.next - begin, stop - begin)
         self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
         shape = (len(starts), _traces(env))
@@ -126,22 +126,22 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Where, among the starts that are not settled, the windows begin that hold the last sample."""
+        """The first start that is not settled and whose window holds the last sample."""
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)
 
 
 class Margins:
-    """Samples of many traces that go on at the same time, in; margins of every requirement, out.
+    """Robustness margins of every requirement on many traces that grow together.
 
-    Memory is bounded by the windows of the requirements, but for those that look at the whole trace. To take
-    a sample in costs next to nothing; to look costs about as much for many traces as for one, and for all
-    samples since the last look as much as for one.
+    Memory is bounded by the windows of the requirements, except those that read the whole trace. `push` is
+    cheap; `look` takes about as long for many traces as for one, and for all samples since the last call as
+    for one.
 
     Args:
         rules: compiled requirements.
-        horizon: what `T` means, in steps.
+        horizon: value of `T`, in steps.
     """
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
@@ -159,7 +159,7 @@ class Margins:
         return tuple(watched.rule.name for watched in self._watched)
 
     def push(self, signals: Mapping[str, Floats]) -> None:
-        """Take one sample of every trace in: (traces,) by name."""
+        """Take in one sample of every trace: (traces,) by name."""
         used = self.samples - self._first
         if not self._kept:
             names = self._names or list(signals)[:1]
@@ -172,7 +172,7 @@ class Margins:
         self.samples += 1
 
     def look(self) -> dict[str, Margin]:
-        """Every requirement at the last sample; there has to be one."""
+        """Margins of every requirement at the last sample; there has to be one."""
         if self._looked != self.samples:
             env = {name: column[: self.samples - self._first] for name, column in self._kept.items()}
             look = (each.look(env, self._first, self.samples) for each in self._watched)
@@ -180,7 +180,7 @@ class Margins:
         return self._found
 
     def _make_room(self, used: int) -> int:
-        """Drop what nobody reads any more, and double the columns where that is little; what is left."""
+        """Drop unneeded samples, and double the columns if that frees too few; returns how many remain."""
         dropped = min([each.needs() for each in self._watched], default=self.samples) - self._first
         dropped = max(dropped, 0)
         left = used - dropped

@@ -1,4 +1,4 @@
-"""Samples one by one: verdicts as soon as they are decided, bounds before, in bounded memory."""
+"""Online monitor: samples in, verdicts as soon as they are decided, bounds before, in bounded memory."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _BEYOND_FLOATS = 1 << 1023
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """A verdict that cannot change any more.
+    """A final verdict.
 
     Attributes:
         requirement: its name.
-        start: sample at which the requirement was judged.
-        time: of that sample in seconds; its number where no time step is known.
+        start: sample at which the requirement was evaluated.
+        time: of that sample in seconds; its number where the time step is unknown.
         status: satisfied or violated.
         low: least robustness over all continuations.
         high: greatest robustness.
@@ -59,14 +59,14 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class How:
-    """How a stream of samples is judged.
+    """Options of an online monitor.
 
     Attributes:
-        at: "all" judges every requirement at every sample, a number at that one; None as each asks for.
-        end: where the stream is too short at its end: bounds, a refusal, or cut windows.
+        at: "all" evaluates every requirement at every sample, a number at that one; None as each requires.
+        end: treatment of windows cut by the end of the stream: bounds, an error, or clipping.
         tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
         t0: time of the first sample in seconds.
-        reasons: keep the samples that `Online.cause` takes.
+        reasons: keep the samples that `Online.cause` needs.
     """
 
     at: At = None
@@ -79,7 +79,7 @@ class How:
 @final
 @dataclass(slots=True)
 class Watched:
-    """A requirement and what is known of it so far."""
+    """A requirement with its tracker and its running verdict."""
 
     rule: CompiledRequirement
     everywhere: bool
@@ -90,7 +90,7 @@ class Watched:
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def grow(self, kept: SampleHistory) -> None:
-        """Take new samples in."""
+        """Take in new samples."""
         if self.over or self.values.samples == kept.samples:
             return
         signals = kept.columns()
@@ -99,21 +99,21 @@ class Watched:
             self.truths.grow(signals, kept.first, kept.samples)
 
     def due(self, samples: int) -> bool:
-        """Whether it is worth the work to judge it after so many samples."""
+        """Whether to evaluate it again after so many samples."""
         return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
 
     @property
     def over(self) -> bool:
-        """Whether it was judged once and for all."""
+        """Whether its only instant is settled."""
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> Judged:
-        """Bounds and verdicts at instants while the trace goes on."""
+        """Bounds and verdicts at instants while the trace continues."""
         truths = None if self.truths is None else self.truths.live(start, stop)
         return self._judged(self.values.live(start, stop), truths)
 
     def ended(self, starts: range) -> Judged:
-        """The same where the trace is over."""
+        """Bounds and verdicts at instants once the trace has ended."""
         truths = None if self.truths is None else self.truths.ended(starts)
         return self._judged(self.values.ended(starts), truths)
 
@@ -124,17 +124,17 @@ class Watched:
         return Judged(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Forget what has been counted; the first sample that is still needed."""
+        """Forget settled instants; returns the first sample that is still needed."""
         trackers = [self.values] if self.truths is None else [self.values, self.truths]
         return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in trackers)
 
 
 class Online:
-    """A monitor for samples that come one after the other; see `Monitor.online`.
+    """Monitor of a stream of samples; see `Monitor.online`.
 
-    What is kept is bounded by the windows of the requirements, not by the length of the stream. A window to
+    Memory is bounded by the windows of the requirements, not by the length of the stream. A window to
     the end of the trace costs nothing where it stands outermost or under other such windows; a requirement
-    that has one under a window with an end is judged on all samples, which are kept for it.
+    with one under a bounded window is evaluated on all samples, which are stored for it.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Online:
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.gaps: dict[str, Gap] = {}
-        """Where signals are not known."""
+        """Samples at which signals are unknown."""
         self._kept = SampleHistory()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
@@ -171,9 +171,9 @@ class Online:
     # ------------------------------------------------------------------------ samples
 
     def push(self, sample: Sample) -> tuple[Decision, ...]:
-        """Take one sample in; the verdicts that it decides, in the order of the requirements.
+        """Take in one sample; returns the verdicts that it decides, in the order of the requirements.
 
-        A value that is NaN is not known.
+        NaN is an unknown value.
 
         Raises:
             TraceError: E601, a signal is missing; E604, one is infinite; E605, one is not a single number.
@@ -194,7 +194,7 @@ class Online:
         return tuple(found)
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> None:
-        """Take many samples in at once, arrays (time,) by name or a piece of a trace.
+        """Take in many samples at once, arrays (time,) by name or a piece of a trace.
 
         Verdicts are counted, not reported.
 
@@ -245,12 +245,12 @@ class Online:
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
-        """The instants that are not counted yet."""
+        """The range of instants that are not counted yet."""
         start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
         return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Add what the last sample has decided. What was decided once stays so."""
+        """Record the verdicts that the last sample decided; earlier ones stay."""
         start, stop = self._pending(watched)
         judged = watched.judged(start, stop)
         known = judged.holds | judged.fails
@@ -271,14 +271,14 @@ class Online:
         return watched.judged(start, min(stop, self._countable(watched)))
 
     def _countable(self, watched: Watched) -> int:
-        """The first instant that is not to be counted yet: unsettled, or without a whole window."""
+        """The first instant that cannot be counted yet: unsettled, or without a complete window."""
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: Judged) -> int:
-        """Count what is settled of instants that are not counted yet: how many."""
+        """Count the settled ones of the pending instants; returns how many."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count
@@ -290,7 +290,7 @@ class Online:
                 self._count(watched, self._settled(watched))
 
     def time(self, sample: int) -> float:
-        """Time of a sample in seconds; its number where no time step is known."""
+        """Time of a sample in seconds; its number where the time step is unknown."""
         dt = self.compiled.grid.dt
         return float(sample) if dt is None else self.how.t0 + sample * float(dt)
 
@@ -306,17 +306,17 @@ class Online:
         return self._find(name).rule
 
     def repeats(self, name: str) -> bool:
-        """Whether a requirement is judged at every start, and not only at the first sample."""
+        """Whether a requirement is evaluated at every start, and not only at the first sample."""
         return self._find(name).everywhere
 
     @property
     def kept(self) -> int:
-        """How many samples of the signals are kept."""
+        """Number of stored samples of the signals."""
         return self.samples - self._kept.first
 
     @property
     def samples(self) -> int:
-        """How many there were by now."""
+        """Number of samples taken in."""
         return self._kept.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
@@ -330,7 +330,7 @@ class Online:
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
     def standing(self, name: str) -> Tally:
-        """What is known of a requirement so far, its open starts included."""
+        """Running verdict of a requirement, its open starts included."""
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> Tally:
@@ -351,7 +351,7 @@ class Online:
         return True if found <= {"satisfied"} else None
 
     def finish(self) -> dict[str, Tally]:
-        """The trace is over: what `Monitor.check` says of it, requirement by requirement.
+        """End the trace; returns what `Monitor.check` gives, by requirement.
 
         Raises:
             TraceError: E306 where `end` is "strict" and it is too short; E605, there was no sample.
@@ -374,23 +374,23 @@ class Online:
         return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
 
     def _ended(self, watched: Watched, starts: range) -> Tally:
-        """A requirement where the trace is over."""
+        """Verdict of a requirement once the trace has ended."""
         watched.grow(self._kept)
         rest = range(min(watched.tally.next, starts.stop), starts.stop)
         return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
 
     def _worst(self, watched: Watched) -> Worst | None:
-        """Where a requirement would be violated most if the trace were over."""
+        """The start of the worst violation of a requirement if the trace ended now."""
         if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
             return None
         tally = self._ended(watched, self._starts(watched))
         return Worst(tally.high_at, tally.high) if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
-        """Why a requirement is violated at its worst start so far, as `explain` says it of a recording.
+        """The cause of a violation at its worst start so far, as `explain` gives it for a recording.
 
-        The cause is remembered however long ago it was. None without `reasons`, where nothing is violated,
-        and where the samples that say why are gone: about two million numbers are kept.
+        Causes are stored, however old they are. None without `reasons`, where nothing is violated, and where
+        the samples that show the cause are gone: about two million numbers are stored.
         """
         watched = self._find(name)
         worst = None if self._recall is None else self._worst(watched)

@@ -1,9 +1,9 @@
-"""Requirements with wide windows in a stream: judged often enough, at a bounded cost a sample.
+"""Evaluation of requirements with wide windows in a stream, at a bounded cost per sample.
 
-What is not settled is worked out anew whenever it is judged. With narrow windows that is done after every
-sample; with wide ones after so many samples that the cost of one stays bounded. A window that is wider than
-the stream is long reads nothing beyond what came so far, so it is cut to a few times that, and lengthened
-while the stream goes on: memory follows what came, not what is written.
+Unsettled instants are recomputed at every evaluation: with narrow windows after every sample, with wide ones
+after so many samples that the cost per sample stays bounded. A window that is wider than the stream is long
+reads nothing beyond the samples so far, so it is cut to a few times their number, and lengthened as the
+stream grows: memory follows the samples taken in, not the width of the windows.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from stlc.monitor.online.bounds import Bounds, Floats, Tracker
 from stlc.monitor.online.streams import endless
 
 WIDE = 1 << 13
-"""Rows of windows that are worked out after every sample."""
+"""Rows of windows that are evaluated after every sample."""
 
 MOST = 1 << 26
-"""Rows that may be worked out at once because every instant has windows of its own."""
+"""Greatest number of rows evaluated at once because every instant has windows of its own."""
 
 _LATE = 8
-"""A verdict comes later by at most this part of the samples that a requirement looks at."""
+"""Inverse of the greatest delay of a verdict, as a share of the samples that the requirement spans."""
 
 _GROWN = 2
-"""By how much cut windows are lengthened at a time."""
+"""Factor by which cut windows are lengthened at a time."""
 
 _SHORT = 1 << 9
-"""Samples for which windows are cut at first."""
+"""Initial length of cut windows in samples."""
 
 _NARROW = 1 << 12
-"""Samples that windows of one direction look at, at most, where those of the other are cut."""
+"""Greatest span in samples of windows of one direction where those of the other are cut."""
 
 _FROZEN = 500
-"""Rows that take as long as one instant of a `freeze`, apart from what stands in it."""
+"""Overhead of one instant of a `freeze`, in rows, without its body."""
 
 
 # ---------------------------------------------------------------------------- measures
 
 
 def span(formula: ir.Formula) -> Reach:
-    """How many samples before and after its instant the windows of a formula look where they have an end."""
+    """Lookback and lookahead of the bounded windows of a formula, in samples."""
     inner = [span(part) for part in operands(formula)]
     past, future = (
         max((each.past for each in inner), default=0),
@@ -72,12 +72,12 @@ def _width(window: ir.Window) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """Rows that are worked out to judge a formula once.
+    """Number of rows computed for one evaluation of a formula.
 
     Attributes:
         rows: all of them.
-        own: those that instants have for themselves: of a `freeze`.
-        heaviest: the formula that asks for most of these.
+        own: those not shared between instants: of a `freeze`.
+        heaviest: the formula that needs most of these.
     """
 
     rows: int = 0
@@ -85,18 +85,18 @@ class Work:
     heaviest: ir.Formula | None = None
 
     def and_(self, other: Work) -> Work:
-        """Both together."""
+        """The sum of both."""
         heaviest = self.heaviest if self.own >= other.own else other.heaviest
         return Work(self.rows + other.rows, self.own + other.own, heaviest)
 
 
 def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
-    """What it takes to judge a formula at so many instants.
+    """The work of evaluating a formula at several instants.
 
     Args:
-        formula: what is judged.
+        formula: to evaluate.
         instants: how many.
-        samples: how many a window without an end looks at.
+        samples: width of an unbounded window.
     """
     match formula:
         case ir.Freeze(body=body):
@@ -125,11 +125,11 @@ def _endless(formula: ir.Formula) -> bool:
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
-    """A formula that is worth the same while a stream has no more than so many samples.
+    """A formula of equal value as long as a stream has no more than `samples` samples.
 
-    Nothing is known beyond the last sample, apart from what bounded windows of the past and shifts still see
-    of it; further on, all instants are alike. Where these are wide themselves, windows of the future stay as
-    they are; where those are wide, windows of the past do.
+    Beyond the last sample only bounded past windows and shifts still read known values; further on, all
+    instants are alike. Future windows are cut where past ones are narrow, else past windows where future ones
+    are narrow; if both are wide, the formula is unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))
@@ -172,7 +172,7 @@ def _shorter(window: ir.Window, most: int | None) -> ir.Window:
 
 
 class Asking(Protocol):
-    """How a requirement is asked for; `PacedTracker` says it of itself."""
+    """Evaluation options of a requirement; see `PacedTracker`."""
 
     everywhere: bool
     all_kept: bool
@@ -180,7 +180,7 @@ class Asking(Protocol):
 
 
 def effort(formula: ir.Formula, looks: int, asking: Asking) -> Work:
-    """What it takes to judge a requirement once that looks at so many samples."""
+    """The work of evaluating once a requirement that spans so many samples."""
     many = asking.everywhere or endless(formula) or any(map(_unbounded, nodes(formula)))
     found = work(formula, looks if many else 1, looks if asking.all_kept else 0)
     if asking.window is None:
@@ -198,15 +198,15 @@ Make: TypeAlias = Callable[[CompiledRequirement], Tracker]
 
 @dataclass(slots=True)
 class PacedTracker:
-    """A requirement that is judged now and then.
+    """Tracker of a requirement that is evaluated only after some of the samples.
 
     Attributes:
         rule: the requirement.
         make: its tracker, or that of the requirement with shorter windows.
-        everywhere: it is judged at every instant, and not only at the first one.
-        all_kept: all samples are kept for it, and all of them looked at.
-        window: how many samples after each instant its record ends, where that depends on the instant.
-        samples: how many it has taken in.
+        everywhere: it is evaluated at every instant, and not only at the first one.
+        all_kept: all samples are stored for it, and all of them read.
+        window: number of samples from each instant to the end of its record, where that is fixed.
+        samples: number of samples taken in.
     """
 
     rule: CompiledRequirement
@@ -220,11 +220,11 @@ class PacedTracker:
     _pace: int = 1
 
     def due(self, samples: int) -> bool:
-        """Whether it is worth the work to judge it again after so many samples."""
+        """Whether to evaluate it again after so many samples."""
         return samples - self.samples >= self._pace
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
+        """Take in new samples."""
         if self._most is not None and samples > self._most:
             self._lengthen(samples)
         assert self._inner is not None
@@ -260,7 +260,7 @@ class PacedTracker:
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> Bounds:
-        """The same where the trace is over."""
+        """Bounds at the end of the trace."""
         assert self._inner is not None
         return self._inner.ended(starts)
 

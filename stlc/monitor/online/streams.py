@@ -1,7 +1,7 @@
-"""A formula cut into columns that can grow sample by sample.
+"""Decomposition of a formula into columns that can grow sample by sample.
 
-Predicates become columns of robustness values. A past operator without a bound becomes a column that is
-continued from its last value. What is left is a formula over columns whose windows all have an end.
+Predicates become columns of robustness values. An unbounded past operator becomes a column that is
+continued from its last value. The remaining formula over columns has bounded windows only.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
 
 class EndlessError(Exception):
-    """The formula cannot be judged in bounded memory: a past operator looks at what only the end decides."""
+    """The formula needs unbounded memory: a past operator reads a value that only the end decides."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredicateColumn:
-    """A column that follows from the signals: the robustness of a predicate.
+    """Column that follows from the signals: the robustness of a predicate.
 
     Attributes:
         name: of the column.
-        formula: a predicate, or what is frozen around one.
-        back: how many samples before its instant it reads.
-        ahead: how many after it.
+        formula: a predicate, or a `freeze` around one.
+        back: lookback in samples.
+        ahead: lookahead in samples.
     """
 
     name: str
@@ -42,7 +42,7 @@ class PredicateColumn:
 
 @dataclass(frozen=True, slots=True)
 class RecursiveColumn:
-    """A column that continues from its last value: a past operator from the start of the trace on.
+    """Column that continues from its last value: a past operator from the start of the trace on.
 
     `once`: max(body, last). `since`: min(left, max(right, last)); the others are their duals.
 
@@ -50,8 +50,8 @@ class RecursiveColumn:
         name: of the column.
         op: which operator.
         parts: its operands, over other columns.
-        back: rows before an instant that the operands read.
-        ahead: rows after it.
+        back: lookback of the operands in rows.
+        ahead: their lookahead in rows.
     """
 
     name: str
@@ -66,7 +66,7 @@ DerivedColumn: TypeAlias = PredicateColumn | RecursiveColumn
 
 @dataclass(frozen=True, slots=True)
 class ColumnPlan:
-    """A formula over columns, and the columns, each after those that it reads.
+    """A formula over columns, and the columns in order of dependency.
 
     Attributes:
         formula: over the columns.
@@ -97,7 +97,7 @@ def read_by(stream: DerivedColumn) -> frozenset[str]:
 
 
 def endless(formula: ir.Formula) -> bool:
-    """Whether a window of the future has no end."""
+    """Whether the formula has an unbounded future window."""
     return any(
         isinstance(node, (ir.Temporal, ir.Until)) and node.window.hi is None for node in nodes(formula)
     )
@@ -112,10 +112,10 @@ def column(name: str) -> ir.Predicate:
 
 
 def plan(formula: ir.Formula) -> ColumnPlan:
-    """Cut a formula into columns.
+    """Decompose a formula into columns.
 
     Raises:
-        EndlessError: it has to be judged on the whole trace.
+        EndlessError: it needs the whole trace.
     """
     planner = _Planner()
     over_columns = planner.over_columns(formula)
@@ -194,12 +194,12 @@ def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
 
 
 def unbounded_past(node: ir.Formula) -> bool:
-    """Whether a node is a past operator that looks back to the start of the trace."""
+    """Whether a node is a past operator with an unbounded window."""
     return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """How far the predicates look ahead, at samples that some do without at the end of the trace."""
+    """Lookahead of the predicates: samples that may be missing at the end of the trace."""
     return max(0, *_offsets(formula))
 
 

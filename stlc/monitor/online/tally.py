@@ -1,4 +1,4 @@
-"""What is left of judged instants once they are counted: verdict, least robustness, and where."""
+"""Running summary of evaluated instants: verdict, least robustness, and its instant."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Judged(NamedTuple):
 
 @dataclass(slots=True)
 class Tally:
-    """A requirement at consecutive instants of one trace.
+    """Summary of a requirement at consecutive instants of one trace.
 
     Attributes:
         instants: how many.
@@ -76,11 +76,11 @@ class Tally:
 
     @property
     def next(self) -> int:
-        """The instant that comes after those."""
+        """The instant after the last counted one."""
         return self.first + self.instants
 
     def with_more(self, judged: Judged) -> Tally:
-        """The same with more instants, itself unchanged."""
+        """A copy with more instants."""
         more = replace(self)
         more.add(judged, len(judged.low))
         return more
@@ -94,14 +94,14 @@ class Tally:
 
     @property
     def robustness(self) -> float:
-        """The least; where that is not known, the bound from which the verdict follows, else NaN."""
+        """The least robustness; where unknown, the bound from which the verdict follows, else NaN."""
         if self.low == self.high or self.status == "satisfied":
             return self.low
         return self.high if self.status == "violated" else math.nan
 
     @property
     def worst(self) -> int:
-        """The instant of the least robustness; of a violation where there is one."""
+        """The instant of the least robustness; where violated, that of a violation."""
         return self.high_at if self.fails else self.low_at
 
     @property

@@ -1,4 +1,4 @@
-"""What is kept of a stream to explain a violation: its last samples, and causes that lie before them."""
+"""Trace buffer for explanations: the last samples of a stream, and causes that lie before them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
 
 _MOST = 1 << 21
-"""Numbers that are kept at least, and twice as many at most; causes are worked out before samples go."""
+"""Fewest numbers stored, at most twice as many; causes are computed before samples are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Worst:
-    """The start at which a requirement is violated most.
+    """Start of the worst violation of a requirement.
 
     Attributes:
         start: its sample.
@@ -40,7 +40,7 @@ class Worst:
 
 @dataclass(slots=True)
 class TraceBuffer:
-    """The last samples, and the causes that were found before samples were forgotten.
+    """The last samples, and the causes found before older samples were dropped.
 
     Attributes:
         compiled: the specification.
@@ -54,27 +54,27 @@ class TraceBuffer:
     _wide: int = 1
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Keep samples."""
+        """Store samples."""
         self._wide = len(columns)
         self._kept.take(columns, count)
 
     @property
     def full(self) -> bool:
-        """Whether samples have to be forgotten."""
+        """Whether samples have to be dropped."""
         return (self._kept.samples - self._kept.first) * self._wide > 2 * _MOST
 
     def forget(self) -> None:
-        """Forget the older half of the samples; causes that lie there have to be `remember`ed before."""
+        """Drop the older half of the samples; first `remember` the causes that lie there."""
         self._kept.forget(self._kept.samples - _MOST // self._wide)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Work out why a requirement is violated while the samples that say it are there."""
+        """Store the cause of a violation while its samples are available."""
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """Why a requirement is violated; None where the samples that say it are gone."""
+        """The cause of a violation; None where its samples are gone."""
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
             return known[1]
@@ -99,7 +99,7 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """The number of the first sample, that of the start from there on, and columns (samples, 1)."""
+        """The number of the first sample, the offset of the start from it, and columns (samples, 1)."""
         kept = self._kept
         formula, horizon = rule.lowered, self.compiled.grid.horizon
         reads = _around(rule, formula, horizon)
@@ -120,7 +120,7 @@ class TraceBuffer:
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """Whether a requirement says that something bounded holds at all samples from one on."""
+    """Whether a requirement is `always` over an unbounded window, with a bounded body."""
     return (
         isinstance(formula, ir.Temporal)
         and formula.op == "always"
@@ -131,9 +131,9 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """How many samples before and after a start say why it fails; None where no number does.
+    """Samples before and after a start that explain its failure; None where they are unbounded.
 
-    What is explained is the requirement as it is written: where one part decides, others are told, too.
+    The requirement is explained as written: beside the part that decides, others are reported, too.
     """
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):

@@ -1,4 +1,4 @@
-"""One requirement while its signals come in: the trackers, and which one a requirement gets."""
+"""Trackers of one requirement on a growing trace, and the choice among them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
+    """The formula for one bound; with a `window`, an early end of the trace is unknown or cuts."""
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """Both ends of what is possible, and where windows are cut at the end both of what it is there."""
+    """The sides of both bounds, and where the end of the trace cuts windows both of the cut formula."""
     going_on: list[End] = ["lower", "upper"]
     sides = [Side(plans[end], end, beyond, options.truth, least=end == "lower") for end in going_on]
     if options.ending == "open":
@@ -55,7 +55,7 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 
 
 class _CutTracker(ABC):
-    """A tracker that knows settled instants where windows are cut, and bounds of any others."""
+    """Tracker with exact settled values where windows are cut, and bounds at all other instants."""
 
     __slots__ = ()
 
@@ -71,16 +71,16 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Bounds at settled instants, where windows are cut to the trace."""
+        """Bounds at settled instants, with windows cut to the trace."""
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, where nothing is assumed of what lies outside of the trace."""
+        """Bounds at any instants, with everything outside of the trace unknown."""
 
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations.
 
-        Where windows are cut, what a settled instant reads before the first sample is false, not unknown.
+        Where windows are cut, samples before the first one count as false, not as unknown.
         """
         middle = min(max(self.settled, start), stop)
         if not self.cuts or middle <= start:
@@ -89,18 +89,18 @@ class _CutTracker(ABC):
         return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds where the trace is over."""
+        """Bounds at the end of the trace."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
 @dataclass(slots=True)
 class _ColumnTracker(_CutTracker):
-    """A formula over columns at consecutive instants: two sides where windows are open, four where cut.
+    """Tracker of a formula over columns: two sides where windows are open, four where they are cut.
 
     Attributes:
         plans: the columns.
-        options: how values are taken.
-        samples: how many there are by now.
+        options: of the values.
+        samples: number of samples taken in.
     """
 
     plans: ColumnPlans
@@ -111,7 +111,7 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def planned(self) -> ColumnPlan:
-        """The requirement as it is written."""
+        """The plan of the requirement as written."""
         return self.plans["truncate"]
 
     @property
@@ -120,11 +120,11 @@ class _ColumnTracker(_CutTracker):
         return self.options.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
-        """Bounds at settled instants, where windows are cut to the trace."""
+        """Bounds at settled instants, with windows cut to the trace."""
         return Bounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
 
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, where nothing is assumed of what lies outside of the trace."""
+        """Bounds at any instants, with everything outside of the trace unknown."""
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
@@ -148,7 +148,7 @@ def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPla
 
 @dataclass(slots=True)
 class BoundedTracker(_ColumnTracker):
-    """A formula whose windows have an end, at consecutive instants."""
+    """Tracker of a formula with bounded windows, at consecutive instants."""
 
     _readers: list[Reader] = field(default_factory=list, init=False)
     _ahead: int = field(default=0, init=False)
@@ -165,13 +165,13 @@ class BoundedTracker(_ColumnTracker):
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
+        """Take in new samples."""
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds where the trace is over."""
+        """Bounds at the end of the trace."""
         sides = self._sides
         self._sides = [side.over() for side in sides]
         try:
@@ -187,14 +187,14 @@ class BoundedTracker(_ColumnTracker):
 
 @dataclass(slots=True)
 class PlanningWindowTracker(_ColumnTracker):
-    """A formula with windows to the end of a planning window, at consecutive instants.
+    """Tracker of a formula with windows to the end of a planning window, at consecutive instants.
 
-    Every instant sees the record up to the end of its window. Windows of the formula that reach beyond it may
-    still meet what the past holds there: the columns as they go on from that sample, nothing else being
-    known. Samples are then taken one by one, and a value is kept when its window is full.
+    Every instant reads the record up to the end of its window. Windows of the formula that reach beyond it
+    may still read values that follow from the past: the columns continued from that sample, with all else
+    unknown. Samples are then taken one by one, and a value is stored when its window is complete.
 
     Attributes:
-        window: how many samples after its instant the end of a window is.
+        window: samples from an instant to the end of its window.
     """
 
     window: int = field(kw_only=True)
@@ -215,7 +215,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
+        """Take in new samples."""
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -225,7 +225,7 @@ class PlanningWindowTracker(_ColumnTracker):
                 self._kept.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
 
     def either(self, start: int, stop: int) -> Bounds:
-        """At any instants, where nothing is assumed of what lies outside of the trace."""
+        """Bounds at any instants, with everything outside of the trace unknown."""
         if not self._beyond:
             return _ColumnTracker.either(self, start, stop)
         middle = min(max(self.settled, start), stop)
@@ -253,7 +253,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Where the formula reads the columns beyond the ends of its windows, many instants at once."""
+        """Values of a formula that reads columns beyond the ends of its windows, many instants at once."""
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
         ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
@@ -266,7 +266,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """Whether more than nothing is known of a column beyond the last sample."""
+    """Whether a column has known values beyond the last sample."""
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -275,7 +275,7 @@ def _remembers(planned: ColumnPlan) -> bool:
 
 @dataclass(slots=True)
 class UnboundedTracker:
-    """A formula with endless windows, at the first sample."""
+    """Tracker of a formula with unbounded windows, at the first sample."""
 
     plans: ColumnPlans
     options: TrackingOptions
@@ -299,7 +299,7 @@ class UnboundedTracker:
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
+        """Take in new samples."""
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
@@ -313,14 +313,14 @@ class UnboundedTracker:
         return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
     def ended(self, starts: range) -> Bounds:
-        """Where the trace is over."""
+        """Bounds at the end of the trace."""
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
-    def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is judged
-        """Forget what the frontier has passed, and before it is reached what nobody reads any more."""
+    def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
+        """Forget samples behind the frontier, and before it is reached those no longer read."""
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)
         return first_needed(self.plans["truncate"], self.samples)
@@ -328,7 +328,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """A requirement that has to be judged on the whole trace: nothing is forgotten."""
+    """Tracker of a requirement that needs the whole trace: nothing is forgotten."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -347,7 +347,7 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def window(self) -> int | None:
-        """How many samples after its instant `end` is; None: the end of the trace."""
+        """Samples from an instant to its `end`; None: the end of the trace."""
         return window_of(self.rule, self.horizon)
 
     @property
@@ -359,7 +359,7 @@ class RecomputeTracker(_CutTracker):
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Take new samples in."""
+        """Take in new samples."""
         self._signals, self.samples = signals, samples
 
     @property
@@ -368,11 +368,11 @@ class RecomputeTracker(_CutTracker):
         return self.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
-        """At settled instants, where windows are cut to the trace."""
+        """Bounds at settled instants, with windows cut to the trace."""
         return self.ended(starts)
 
     def either(self, start: int, stop: int) -> Bounds:
-        """At any instants, where nothing is assumed of what lies outside of the trace."""
+        """Bounds at any instants, with everything outside of the trace unknown."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         starts = range(start, stop)
@@ -380,7 +380,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Both ends of what is possible, wherever the traces end: (instants, traces) each."""
+        """Least and greatest values, wherever the traces end: (instants, traces) each."""
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
@@ -401,7 +401,7 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> Bounds:
-        """Where the trace is over."""
+        """Bounds at the end of the trace."""
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
 
@@ -415,10 +415,10 @@ class RecomputeTracker(_CutTracker):
 
 @dataclass(slots=True)
 class Trackers:
-    """Makes the trackers of requirements; what is counted at the same time shares its columns.
+    """Factory of trackers; requirements that are settled at the same time share columns.
 
     Attributes:
-        horizon: what `T` means, in steps.
+        horizon: value of `T`, in steps.
     """
 
     horizon: int | None
@@ -429,11 +429,11 @@ class Trackers:
 
         Args:
             rule: the requirement.
-            options: how its values are taken.
-            everywhere: it is judged at every instant, and not only at the first one.
+            options: of its values.
+            everywhere: it is evaluated at every instant, and not only at the first one.
 
         Raises:
-            UsageError: E313, what every instant has windows of its own for is too much.
+            UsageError: E313, the work that instants do not share is too large.
         """
         alone = Trackers(self.horizon)
         tried = alone.plain(rule, options, everywhere=everywhere)
@@ -451,7 +451,7 @@ class Trackers:
         return self.plain(rule, options, everywhere=everywhere)
 
     def plain(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """The tracker that judges a requirement after every sample."""
+        """The tracker that evaluates a requirement after every sample."""
         formula, window = rule.formula, window_of(rule, self.horizon)
         if window is not None and (bounded := without_end(formula, window)) is not None:
             formula, window = bounded, None
@@ -478,10 +478,10 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """The formula with `end` so many samples after its instant; None where `end` depends on more than that.
+    """The formula with `end` at a fixed number of samples after its instant; None if there is none.
 
-    It does under another window, for segments that would leave it (`sweep`), and where windows with an end of
-    their own reach beyond it.
+    That is so where `end` stands under another window, in segments that would leave it (`sweep`), or where
+    bounded windows reach beyond `end`.
     """
     moved = _ended(formula, window)
     if moved is None or endless(moved) or uses_end(moved) or reach(moved).future > window:
@@ -501,7 +501,7 @@ def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
 
 
 def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
-    """E313 for a formula that every instant judges on its own, on too many samples."""
+    """E313 for a formula whose instants are evaluated separately, on too many samples."""
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
     return Diagnostic(

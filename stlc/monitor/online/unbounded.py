@@ -1,8 +1,8 @@
-"""Windows that run to the end of the trace, judged from its first sample on in bounded memory.
+"""Windows to the end of the trace, evaluated at its first sample in bounded memory.
 
-What has been seen up to a frontier is a monotone function of what the endless operators will be worth from
-the frontier on: a lattice polynomial. It is known by its values where each of them is -inf or +inf, which are
-the formula on the samples seen, with each endless operator continued by that constant.
+The value is a monotone function of the values of the unbounded operators from a frontier on: a lattice
+polynomial. Its coefficients are its values where each operator is -inf or +inf, which are the formula on
+the samples up to the frontier, with each unbounded operator continued by that constant.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from stlc.monitor.online.streams import ColumnPlan, EndlessError, column, endles
 Floats: TypeAlias = NDArray[np.float64]
 
 _MOST = 6
-"""More endless operators than this are not worth their 2^n coefficients."""
+"""Greatest number n of unbounded operators; there are 2^n coefficients."""
 
 _FOREVER = ir.Window(0, None)
 
 
 @dataclass(frozen=True, slots=True)
 class DelayedFormula:
-    """A formula without endless windows, read some samples later than its instant."""
+    """A formula without unbounded windows, read some samples after its instant."""
 
     formula: ir.Formula
     steps: int
 
     @property
     def reach(self) -> int:
-        """Samples after the instant that it reads."""
+        """Lookahead in samples."""
         return self.steps + reach(self.formula).future
 
 
 @dataclass(slots=True)
 class UnboundedOperators:
-    """The endless operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
+    """The unbounded operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
 
-    What an operator is worth from the last row on is a column of its own, `!0`, `!1`, …: the rest.
+    The value of an operator after the last row, its rest, is a column of its own, `!0`, `!1`, ….
 
     Attributes:
         root: the formula.
-        parts: column -> what it stands for.
-        origins: rest -> its operator, before the lower bound was taken off.
+        parts: column -> the formula that it stands for.
+        origins: rest -> its operator, before the lower bound was removed.
         operators: rest -> its operator over columns, the rest among them.
     """
 
@@ -61,25 +61,25 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Samples after an instant that have to be known before it goes into a polynomial."""
+        """Samples after an instant that have to be known before it enters a polynomial."""
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
-        """After how many unknown samples one more makes no difference."""
+        """Number of unknown samples after which one more makes no difference."""
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
 
     @property
     def back(self) -> int:
-        """Rows before an instant that the parts read."""
+        """Lookback of the parts in rows."""
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
 def skeleton(formula: ir.Formula) -> UnboundedOperators:
-    """Take a formula over columns apart.
+    """Decompose a formula over columns.
 
     Raises:
-        EndlessError: an endless operator stands under one with an end, or there are too many.
+        EndlessError: an unbounded operator stands under a bounded one, or there are too many.
     """
     found = UnboundedOperators(formula)
     found.root = _taken(formula, 0, found)
@@ -112,10 +112,10 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """The column of what an operator is worth from the last row on.
+    """The column of the value of an operator from the last row on.
 
-    Operators that read the same columns may still end in different ways: `next` of an operator is not the
-    operator of `next` where the trace is over.
+    Operators that read the same columns may still differ at the end of the trace: `next` of an operator is
+    not the operator of `next` there.
     """
     for name, known in found.origins.items():
         if known == origin:
@@ -126,7 +126,7 @@ def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """`until` or `release` without a lower bound: met among the rows, or held through them and met later."""
+    """`until` or `release` without a lower bound: met within the rows, or held throughout and met later."""
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
     seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
@@ -142,7 +142,7 @@ def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
 def _held(
     every: bool, before: ir.Temporal, then: ir.Formula, steps: int, found: UnboundedOperators
 ) -> ir.Formula:
-    """What `until` asks of its left side before its window starts; of `release` the dual."""
+    """The condition of `until` on its left side before its window starts; of `release` the dual."""
     if endless(before.body):
         raise EndlessError
     if not every:
@@ -163,21 +163,21 @@ def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Form
 
 
 def _neutral(origin: DelayedFormula) -> float:
-    """What the rest of an operator is worth where all rows are there: nothing more is met, nothing fails."""
+    """The value of the rest of an operator at the end of the trace: nothing more is met, nothing fails."""
     assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
 @dataclass(slots=True)
 class UnboundedState:
-    """The value of a formula at its first sample, at one end of what is possible.
+    """The value of a formula at its first sample: its least or its greatest.
 
     Attributes:
         bones: the formula.
         side: the columns.
-        begin: the sample at which the formula is judged.
+        begin: the sample at which the formula is evaluated.
         at: number of the first sample that is not yet in the polynomial.
-        coefficients: (subsets of the operators, traces): the value where those operators are worth +inf from
+        coefficients: (subsets of the operators, traces): the value where those operators are +inf from
             there on and the others -inf; None at first.
     """
 
@@ -203,7 +203,7 @@ class UnboundedState:
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
-        """Put the samples before `settled` into the polynomial."""
+        """Fold the samples before `settled` into the polynomial."""
         count = settled - self.at
         if count <= 0:
             return
@@ -218,7 +218,7 @@ class UnboundedState:
         self.at = settled
 
     def value(self, samples: int) -> Floats:
-        """The value while the trace goes on: as many unknown samples follow as the formula can tell apart."""
+        """The value while the trace continues, followed by as many unknown samples as affect the formula."""
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
             env[name] = np.full(env[NOTHING].shape, _neutral(origin))
@@ -226,7 +226,7 @@ class UnboundedState:
         return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
-        """The value where the last sample is the end of the trace."""
+        """The value with the last sample as the end of the trace."""
         if self.coefficients is None:
             return self._plain(formula, self.begin, samples)
         origins = self.bones.origins.values()
@@ -239,7 +239,7 @@ class UnboundedState:
         return np.concatenate(reader(env, 0, 1))
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
-        """A formula over columns at one sample, endless windows up to the last sample."""
+        """A formula over columns at one sample, unbounded windows clipped at the last sample."""
         parts: dict[str, DelayedFormula] = {}
         plain = _outlined(formula, parts)
         first = min(self.at, at)
@@ -257,14 +257,14 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """The polynomial where the operators are worth `rests` (operators, points, traces): a row a point."""
+        """The polynomial at the operators' values `rests` (operators, points, traces): a row per point."""
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
 
 
 def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formula:
-    """The formula with columns for all that has no endless window."""
+    """The formula with columns for all parts without unbounded windows."""
     if not endless(formula):
         return _part(formula, 0, UnboundedOperators(formula, parts))
     match formula:
