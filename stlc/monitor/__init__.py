@@ -1,1 +1,1 @@
-"""How a recorded trace is judged and explained."""
+"""Evaluation and explanation of recorded traces."""

@@ -1,4 +1,4 @@
-"""What `T` and `dt` mean for a monitor: from its arguments, the trace, or the system that the spec names."""
+"""Values of `T` and `dt` for a monitor: from its arguments, the trace, or the system that the spec names."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A time step and a horizon, both in seconds and exact; None where nobody said.
+    """A time step and a horizon, both in seconds and exact; None where unknown.
 
-    `trace` names the file that the step was measured in, "" where it was said.
+    `trace` names the file that the step was measured in, "" where it was given.
     """
 
     dt: Fraction | None = None
@@ -30,7 +30,7 @@ class Times:
     trace: str = ""
 
     def or_else(self, other: Times) -> Times:
-        """What is unknown here is taken from `other`."""
+        """These times, with unknown ones taken from `other`."""
         step = self if self.dt is not None else other
         return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
@@ -40,11 +40,11 @@ class Times:
         return self.dt is not None and self.horizon is not None
 
     def grid(self) -> Grid:
-        """The same in steps.
+        """The time grid, in steps.
 
         Raises:
             TraceError: E602, the horizon is not a whole number of steps of a trace.
-            UsageError: U101, it is not one of the steps that were asked for.
+            UsageError: U101, it is not a whole number of the requested steps.
         """
         if self.dt is None or self.horizon is None:
             return Grid(self.dt, None)
@@ -61,7 +61,7 @@ class Times:
 
 
 def _dividing(horizon: float, dt: float) -> str:
-    """A way out: the largest short number of seconds up to the step that divides the horizon."""
+    """Advice: the largest short number of seconds up to the step that divides the horizon."""
     least = math.ceil(horizon / dt)
     short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
     step = horizon / next(short, least)
@@ -101,7 +101,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 
 
 def recorded_times(trace: Trace, asked: Times) -> Times:
-    """Times of a trace. Raises TraceError (E602) where the monitor was told another time step."""
+    """Times of a trace. Raises TraceError (E602) where they contradict the monitor's time step."""
     dt = as_fraction(trace.dt)
     if asked.dt is not None and abs(asked.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(asked.dt):g} s"

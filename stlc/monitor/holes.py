@@ -1,9 +1,8 @@
-"""Samples that nobody knows: what a formula is worth at least and at most, whatever they were.
+"""Unknown samples: least and greatest value of a formula over all values that they may have.
 
-In arrays a value that is not known is NaN. Bounds are those of open traces (`stlc.monitor.prefix_bounds`): a
-predicate that reads an unknown value is unknown, -inf at least and +inf at most, and all operators are
-monotone in their predicates. So a verdict that follows from the bounds holds for every value that the samples
-may have had.
+In arrays an unknown value is NaN. Bounds are those of open traces (`stlc.monitor.prefix_bounds`): a predicate
+that reads an unknown value is unknown, -inf at least and +inf at most, and all operators are monotone in
+their predicates. So a verdict that follows from the bounds holds for every value that the samples may have.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from stlc.compile.ir.traverse import leaves, map_children
 Floats: TypeAlias = NDArray[np.float64]
 
 KNOWN = "@known "
-"""A column of this name and that of a signal is 1 where the signal is known, else -1."""
+"""Prefix of the column that is 1 where the signal of that name is known, else -1."""
 
 
 def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
@@ -31,7 +30,7 @@ def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """The columns (samples, batch) with any value for an unknown one, and those that tell which are known."""
+    """The columns (samples, batch), unknown values replaced, and the columns that mark known values."""
     filled = dict(env)
     for name in holes:
         unknown = np.isnan(env[name])
@@ -43,12 +42,12 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """The formula that is worth the least, or the most, that `formula` may be.
+    """The formula whose value is the least, or the greatest, possible value of `formula`.
 
     Args:
         formula: in negation normal form.
-        holes: signals that are not known everywhere; names that a `freeze` binds to them are found here.
-        least: which end of what is possible.
+        holes: signals with unknown values; names that a `freeze` binds to them are added here.
+        least: which of the two.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -64,7 +63,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
 
 
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
-    """A number that is 1 where all that `num` reads is known, else -1; None where it always is."""
+    """A number that is 1 where all that `num` reads is known, else -1; None if that is everywhere."""
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)
@@ -78,7 +77,7 @@ def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
 def _guarded(atom: ir.Predicate, known: ir.Num | None, *, least: bool) -> ir.Formula:
     if known is None:
         return atom
-    # outside of the trace the guard is what the predicate is: false before a negation where windows are cut
+    # outside of the trace the guard equals the predicate: false before a negation where windows are cut
     test = ir.Predicate(
         known if least is (atom.sign > 0) else ir.Op("neg", (known,)), sign=atom.sign, guard=True
     )

@@ -1,8 +1,8 @@
-"""At which instants a requirement is judged, and its values there.
+"""Instants at which a requirement is evaluated, and its values there.
 
-A requirement that mentions `T` speaks about every planning window: it is judged at each start whose window
-fits, with `end` at the end of the window. One that does not, or that has an interval on the mission clock, is
-judged once, at the start of the trace.
+A requirement that mentions `T` concerns every planning window: it is evaluated at each start whose window
+fits, with `end` at the end of the window. Others, and those with an interval on the mission clock, are
+evaluated once, at the start of the trace.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
-"""A sample; every start at which the requirement has a value; or what the requirement itself asks for."""
+"""A sample; every start at which the requirement has a value; or the instants of the requirement itself."""
 
 
 def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:
-    """The instants at which a requirement is judged on a trace of so many samples.
+    """The instants at which a requirement is evaluated on a trace of so many samples.
 
     Raises:
         UsageError: U101, `at` is not a sample of the trace.
@@ -50,14 +50,14 @@ def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: 
 
 
 def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
-    """How many samples after its instant `end` is, where that depends on the instant."""
+    """Samples from an instant to its `end`; None where `end` does not move with the instant."""
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
 def rule_bounds(
     rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
-    """Both ends of the values at the judged instants, each `(count, batch)`; one array where all is known."""
+    """Least and greatest values at the evaluated instants, each `(count, batch)`; one array if all known."""
     window = window_of(rule, horizon)
     if window is None:
         return bounds(rule.under(record.semantics), record, starts, ends)
@@ -67,7 +67,7 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """Where no value at the judged instants depends on what comes after `samples`, (count,)."""
+    """Whether values at the evaluated instants are independent of samples from `samples` on, (count,)."""
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
@@ -78,8 +78,8 @@ def rule_known(
 def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: Boundary) -> Array:
     """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
 
-    So it is where they depend on what is not known, unless `end` is "lower" or "upper".
-    A requirement on the mission clock has one value, whatever the sample.
+    They are also NaN where they depend on unknown values, unless `end` is "lower" or "upper".
+    A requirement on the mission clock has one value at all samples.
     """
     if record.holes:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
@@ -94,7 +94,7 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
 
 
 def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
-    """The same where `end` moves along: windows that do not fit are NaN under "strict"."""
+    """`rule_signal` with a moving `end`: windows that do not fit are NaN under "strict"."""
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
     ends: Ends = "truncate" if end == "truncate" else "open"
@@ -111,7 +111,7 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
 def rules_at(
     rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
 ) -> list[Array]:
-    """Values at one sample, `(1, batch)` each; NaN where `rule_signal` has it."""
+    """Values at one sample, `(1, batch)` each; NaN as in `rule_signal`."""
     if record.holes:
         sides = [_sides(rule, record) for rule in rules]
         least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
@@ -133,7 +133,7 @@ def rules_at(
 
 
 def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
-    """The requirement at its least and at its most, whatever the samples are that are not known."""
+    """The requirement at its least and at its greatest value over all values of unknown samples."""
     formula = rule.under(record.semantics)
     least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)

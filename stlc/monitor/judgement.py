@@ -1,4 +1,4 @@
-"""What a monitor says: per requirement and over all, per trace and over all."""
+"""Verdicts per requirement and in total, per trace and over all traces."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Bools: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """One requirement on one or many traces.
+    """Verdict and robustness of one requirement on one or many traces.
 
     Attributes:
         rule: the requirement.
-        start: the first judged sample; the others follow one by one.
+        start: the first evaluated sample; the others follow one by one.
         low: least robustness over all continuations of the traces, (instants, traces).
         high: greatest robustness; the array `low` itself where nothing is unknown.
         holds: certainly satisfied, (instants, traces).
         fails: certainly violated, (instants, traces).
         shape: of the signals before their time axis; () for a single trace.
-        scope: which traces the assumptions allow, (traces,); None means all. Others count for nothing.
-        told: `low` and `high` in the semantics that was asked for; None: the exact ones.
+        scope: traces that satisfy the assumptions, (traces,); None means all. Others are not counted.
+        told: `low` and `high` in the requested semantics; None: the exact ones.
     """
 
     rule: CompiledRequirement
@@ -48,22 +48,22 @@ class Judgement:
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
-        """Least and greatest robustness in the semantics that was asked for, each (instants, traces)."""
+        """Least and greatest robustness in the requested semantics, each (instants, traces)."""
         return (self.low, self.high) if self.told is None else self.told
 
     @property
     def name(self) -> str:
-        """Of the requirement."""
+        """Name of the requirement."""
         return self.rule.name
 
     @property
     def unit(self) -> str:
-        """Of the robustness: that of what is compared; "" where there are several."""
+        """Unit of the robustness: that of the compared quantities; "" where there are several."""
         return self.rule.unit
 
     @property
     def statuses(self) -> list[Status]:
-        """One for each trace."""
+        """Status of each trace."""
         inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
         return [
             _status(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
@@ -71,7 +71,7 @@ class Judgement:
         ]
 
     def counted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Of values (…, traces) those of the traces that count."""
+        """The values (…, traces) of the traces within `scope`."""
         return values if self.scope is None else values[..., self.scope]
 
     @property
@@ -81,26 +81,26 @@ class Judgement:
 
     @property
     def overall(self) -> Status:
-        """Over all traces: violated if one is, satisfied if all are."""
+        """Status over all traces: violated if one is, satisfied if all are."""
         holds = self.counted(self.holds)
         return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
     @property
     def satisfied(self) -> bool | None:
-        """Over all traces: True, False, or None where that is not known."""
+        """Whether all traces satisfy it: True, False, or None where that is unknown."""
         return _known(self.overall)
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """Both ends of the robustness over all continuations, the least over the judged instants."""
+        """Bounds of the robustness over all continuations, the least over the evaluated instants."""
         low, high = self.margins
         return _shaped(low.min(axis=0), self.shape), _shaped(high.min(axis=0), self.shape)
 
     @property
     def robustness(self) -> Any:
-        """The least over the judged instants; a float, or an array for a batch.
+        """The least robustness over the evaluated instants; a float, or an array for a batch.
 
-        Where a trace is too short to say: the known bound if the verdict follows from it, else NaN.
+        Where a trace is too short: the known bound if the verdict follows from it, else NaN.
         """
         return _shaped(self.least, self.shape)
 
@@ -114,18 +114,18 @@ class Judgement:
 
     @property
     def share(self) -> float:
-        """Share of the judged instants of all traces at which it certainly holds."""
+        """Share of the evaluated instants of all traces at which it certainly holds."""
         holds = self.counted(self.holds)
         return float(holds.mean()) if holds.size else 0.0
 
     @property
     def instants(self) -> int:
-        """How many instants were judged in each trace."""
+        """Number of evaluated instants per trace."""
         return len(self.low)
 
     @property
     def worst(self) -> tuple[int, int]:
-        """(trace, sample) of the least robustness; of a violation where there is one."""
+        """(trace, sample) of the least robustness; where violated, that of a violation."""
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
@@ -135,11 +135,11 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """All requirements of a specification on one or many traces.
+    """Verdicts of all requirements of a specification on one or many traces.
 
     Attributes:
         requirements: one judgement each, in the order of the specification.
-        subject: what was judged.
+        subject: the prepared signals and requirements.
     """
 
     requirements: tuple[Judgement, ...]
@@ -147,7 +147,7 @@ class Verdict:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the signals before their time axis; () for a single trace."""
+        """Shape of the signals before their time axis; () for a single trace."""
         return self.subject.signals.shape
 
     def __getitem__(self, name: str) -> Judgement:
@@ -162,12 +162,12 @@ class Verdict:
 
     @property
     def traces(self) -> int:
-        """How many traces were judged."""
+        """Number of traces."""
         return self.subject.signals.batch
 
     @property
     def statuses(self) -> list[Status]:
-        """One for each trace: violated if a requirement is, satisfied if all are."""
+        """Status of each trace: violated if a requirement is, satisfied if all are."""
         rows = [judgement.statuses for judgement in self.requirements]
         return [
             "out of scope"
@@ -182,26 +182,26 @@ class Verdict:
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """The same where only the traces that the assumptions allow count, (traces,)."""
+        """The verdict with only the traces in `scope` (traces,), which satisfy the assumptions, counted."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
 
     @property
     def in_scope(self) -> int:
-        """How many traces the assumptions allow."""
+        """Number of traces that satisfy the assumptions."""
         scope = self.requirements[0].scope
         return self.traces if scope is None else int(scope.sum())
 
     @property
     def overall(self) -> Status:
-        """Over all traces and requirements."""
+        """Status over all traces and requirements."""
         found = {judgement.overall for judgement in self.requirements}
         return _status("violated" in found, found <= {"satisfied"})
 
     @property
     def satisfied(self) -> bool | None:
-        """Over all traces and requirements: True, False, or None where that is not known."""
+        """Whether all traces satisfy all requirements: True, False, or None where that is unknown."""
         return _known(self.overall)
 
     @property
@@ -214,7 +214,7 @@ class Verdict:
     def share(self) -> float:
         """Share of the instants of all traces at which all requirements certainly hold.
 
-        Requirements that are judged once hold, or not, at every instant.
+        Requirements that are evaluated once hold, or not, at every instant.
         """
         most = self._most_instants
         return self._mean(np.logical_and.reduce([self._spread(j, j.holds, most) for j in self.requirements]))
@@ -227,7 +227,7 @@ class Verdict:
 
     @property
     def _most_instants(self) -> int:
-        """Of the requirement that has most of them."""
+        """The greatest number of instants of a requirement."""
         return max(judgement.instants for judgement in self.requirements)
 
     def _mean(self, truth: Bools) -> float:
@@ -235,7 +235,7 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """At as many instants as the requirement that has most of them: (instants, traces)."""
+        """Truth at `most` instants, a single instant repeated: (instants, traces)."""
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)
@@ -243,7 +243,7 @@ class Verdict:
 
     @property
     def satisfied_traces(self) -> int:
-        """How many traces satisfy every requirement at all its instants."""
+        """Number of traces that satisfy every requirement at all its instants."""
         return self.statuses.count("satisfied")
 
 
@@ -260,7 +260,7 @@ def _status(violated: bool, satisfied: bool) -> Status:
 
 
 def _together(statuses: tuple[Status, ...]) -> Status:
-    """Of all requirements on one trace."""
+    """Status of all requirements on one trace."""
     if "out of scope" in statuses:
         return "out of scope"
     return _status("violated" in statuses, {*statuses} <= {"satisfied"})

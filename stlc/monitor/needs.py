@@ -1,4 +1,4 @@
-"""Which signals requirements read."""
+"""Signals that requirements read."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _INDEX = re.compile(r"\[\d+\]$")
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """A signal that requirements read.
+    """Signal that requirements read.
 
     Attributes:
         column: as the specification declares it.
         by: names of the requirements.
         span: of its declaration.
-        parameter: it is a `param`, which may be given a value instead.
+        parameter: it is a `param`, for which a value may be given instead.
     """
 
     column: Column
@@ -39,7 +39,7 @@ def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[
     """The signals that `rules` read, in the order of the specification.
 
     Raises:
-        UsageError: E107, they call functions that nobody loaded.
+        UsageError: E107, they call functions that are not loaded.
     """
     _require_functions(compiled, rules)
     read = {rule.name: columns(rule.formula) for rule in rules}

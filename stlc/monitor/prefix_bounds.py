@@ -1,9 +1,9 @@
-"""Bounds for a stream that may end with any sample: windows that an early end cuts say so themselves.
+"""Bounds for a stream that may end with any sample, with the effect of an early end written into the formula.
 
-A window to the end of the trace has no end yet. `eventually` is worth least if the trace ends now, `always`
-if it goes on; the greatest values are the other way round. `prefix_bound` writes that into the formula, with
-a predicate that is true at every sample and unknown afterwards: values found beyond the last sample then do
-not count. So the two ends of what is possible are two formulas.
+A window to the end of the trace has no end yet. `eventually` has its least value if the trace ends now,
+`always` if it continues; for the greatest values it is the other way round. `prefix_bound` adds to the
+formula a predicate that is true at every sample and unknown afterwards, so that values beyond the last sample
+do not count. The least and the greatest value are thus two formulas.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bo
     """The formula whose least (or greatest) value holds wherever the trace ends from the last sample on.
 
     Args:
-        formula: what is judged.
-        end: which end of what is possible.
-        cut: the end of the trace cuts windows that have an end of their own, too.
+        formula: to bound.
+        end: which bound.
+        cut: the end of the trace cuts bounded windows, too.
     """
     return _PrefixBound(end == "lower", cut).of(formula)
 
@@ -45,7 +45,7 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """The formula with what its windows may miss."""
+        """The formula, with instants that an early end of the trace removes from its windows left out."""
         match formula:
             case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
@@ -64,18 +64,18 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """What a window finds: where an early end is the worst for it, at samples only."""
+        """The body of a window, restricted to samples where an early end is its worst case."""
         inner = self.of(body)
         return self._seen(inner, 0) if cut and some is self.least else inner
 
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """A window to the end that starts after it is worth nobody knows what, or nothing where it is cut."""
+        """An unbounded window that starts after the end of the trace: unknown, or empty where it is cut."""
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """The formula, and for the greatest value its dual, where there is a sample so many steps later."""
+        """The formula where a sample so many steps later exists; for the greatest value the dual."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
@@ -87,7 +87,7 @@ def reads_seen(formula: ir.Formula) -> bool:
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
-    """The columns (samples, traces), and the one that says which samples there are."""
+    """The columns (samples, traces), and the one that marks existing samples."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 
@@ -95,7 +95,7 @@ def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
 
 
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
+    """The formula with windows to the end of the trace lengthened beyond all known values."""
     bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
     return _long(formula, samples + sum(bounds) + 1)
 

@@ -1,4 +1,4 @@
-"""Signals and requirements that fit together: what there is to judge."""
+"""Signals laid out together with the requirements to evaluate."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Prepared:
 
     Attributes:
         compiled: the specification.
-        rules: its requirements that are to be judged.
-        signals: where the columns come from.
-        record: the columns, and how to compute with them.
+        rules: the requirements to evaluate.
+        signals: source of the columns.
+        record: the columns, and their array library.
     """
 
     compiled: Compiled
@@ -28,17 +28,17 @@ class Prepared:
 
     @property
     def horizon(self) -> int | None:
-        """What `T` means, in steps; None where nothing said so."""
+        """Value of `T` in steps; None where unknown."""
         return self.compiled.grid.horizon
 
     @property
     def dt(self) -> float | None:
-        """Time step in seconds; None where nothing said so."""
+        """Time step in seconds; None where unknown."""
         return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
 
     @property
     def gaps(self) -> dict[str, Gap]:
-        """Where signals that are needed are not known."""
+        """Gaps in the needed signals."""
         return gaps_of(self.signals)
 
     def time(self, sample: int) -> float:
@@ -46,7 +46,7 @@ class Prepared:
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
 
     def moment(self, sample: int) -> str:
-        """The same in words: `t = 4.6 s`."""
+        """Time of a sample in words: `t = 4.6 s`."""
         return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
 
 
@@ -58,5 +58,5 @@ def gap_text(name: str, gap: Gap, samples: int, moments: tuple[str, str]) -> str
 
 
 def beside(moment: str, start: str) -> str:
-    """An instant, and the start of its window where that is another: `t = 4.6 s (window from 2 s)`."""
+    """An instant, and the start of its window where they differ: `t = 4.6 s (window from 2 s)`."""
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"

@@ -1,4 +1,4 @@
-"""How a file is read for a specification: what words are worth, and which signals are discrete."""
+"""Options for reading a file for a specification: numeric values of words, and discrete signals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
 def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
-    """How to read a file whose signals `spec` declares.
+    """Options for reading a file whose signals `spec` declares.
 
     Args:
         spec: the specification.
@@ -26,19 +26,19 @@ def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
 
 
 def _column(columns: Mapping[str, str], name: str) -> str:
-    """What the column of a signal, or of a component of one, is called: `p[0]` of `p from "q"` is `q[0]`."""
+    """The column name of a signal, or of a component of one: `p[0]` of `p from "q"` is `q[0]`."""
     base, bracket, index = name.partition("[")
     return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
 
 def _kinds(spec: ast.Spec) -> dict[str, Kind]:
-    """What the numbers of a signal mean, as far as the specification says so."""
+    """The kind of each signal's numbers, where the specification gives it."""
     signals = [item for item in spec.items if isinstance(item, ast.Signal) and item.type is not None]
     return {s.column or s.name: _KINDS.get(s.type.name, "enum") for s in signals if s.type is not None}
 
 
 def _words(spec: ast.Spec) -> dict[str, Words]:
-    """What the words of every signal are worth, as far as the specification says so."""
+    """The values of the words of each signal, where the specification gives them."""
     members = {item.name: dict(item.members) for item in spec.items if isinstance(item, ast.Enum)}
     worth: dict[str, Words] = {"bool": TRUTH, **members}
     return {

@@ -1,4 +1,4 @@
-"""Signals as a user gives them -> columns `(time, batch)` that the evaluator reads."""
+"""Conversion of given signals to columns `(time, batch)` for the evaluator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
 
 CLOCK = "t"
-"""Under this name a trace also offers its time in seconds."""
+"""Name under which a trace also offers its time in seconds."""
 
 UNNAMED = "the signals"
 
@@ -38,7 +38,7 @@ class Signals:
 
     Attributes:
         env: name -> (time, batch).
-        shape: what stood before the time axis: () for a single trace.
+        shape: leading axes before the time axis: () for a single trace.
         samples: length of the time axis.
         ops: the library of the arrays.
         name: of the trace, for messages.
@@ -56,15 +56,15 @@ class Signals:
 
     @property
     def batch(self) -> int:
-        """How many traces."""
+        """Number of traces."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     def like_given(self, values: Array) -> Array:
-        """(time, batch) -> (…, time)."""
+        """Reshape (time, batch) to (…, time)."""
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
-        """(1, batch) -> (…)."""
+        """Reshape (1, batch) to (…)."""
         flat = values.reshape(self.shape)
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
@@ -72,7 +72,7 @@ class Signals:
 def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False) -> Signals:
     """Lay out the signals that are needed.
 
-    NaN is a value that is not known. NumPy arrays and lists become float64; torch tensors keep dtype, device
+    NaN is an unknown value. NumPy arrays and lists become float64; torch tensors keep dtype, device
     and gradients, or with `plain` become NumPy arrays too.
 
     Raises:
@@ -106,7 +106,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
 
 
 def _any_one(data: Given) -> dict[str, Any]:
-    """Where no signal is read: one that tells how many traces and samples there are, best not a vector."""
+    """A signal that gives the numbers of traces and samples where none is read, preferably not a vector."""
     names = sorted(data, key=lambda name: (name == CLOCK, np.ndim(data[name])))
     return {name: _find(data, name) for name in names[:1]}
 
@@ -208,7 +208,7 @@ def _torch_columns(
 
 
 def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Numbers in the units that the specification declares, where both sides say what they mean."""
+    """Numbers in the units that the specification declares, where both units are known."""
     converted = dict(columns)
     findings: list[Diagnostic] = []
     for need in needs:
@@ -229,7 +229,7 @@ def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace)
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """From one unit to another: `x * factor + shift`."""
+    """Conversion between units: `x * factor + shift`."""
 
     factor: float
     shift: float
@@ -241,10 +241,10 @@ class Conversion:
 
 
 def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
-    """How recorded numbers become those of a column; None where they are, or one side does not say its unit.
+    """Conversion of recorded numbers to the unit of a column; None where equal, or one unit is unknown.
 
     Raises:
-        TraceError: E605, they measure something else than is declared.
+        TraceError: E605, the quantities differ.
     """
     wanted = column.unit
     if not wanted.text or not recorded.text:
@@ -288,7 +288,7 @@ def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Samples at which a signal is not known.
+    """Unknown samples of a signal.
 
     Attributes:
         samples: how many, over all traces.
@@ -301,7 +301,7 @@ class Gap:
     last: int = 0
 
     def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
-        """The same with those of (samples,) or (samples, traces) that follow from sample `offset` on."""
+        """The gap extended by unknown samples, (samples,) or (samples, traces), from sample `offset` on."""
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):
             return self
@@ -310,7 +310,7 @@ class Gap:
 
 
 def gaps_of(signals: Signals) -> dict[str, Gap]:
-    """Where the columns are not known; of NumPy arrays alone."""
+    """Gaps of the columns; for NumPy arrays only."""
     if signals.ops is not NUMPY:
         return {}
     found = {name: Gap().with_more(np.isnan(values)) for name, values in signals.env.items()}

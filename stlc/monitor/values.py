@@ -1,4 +1,4 @@
-"""Values of one requirement on a record, at the instants at which it is judged."""
+"""Values of one requirement on a record, at the instants at which it is evaluated."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.holes import holes_in, unsure, without_holes
 
 Ends: TypeAlias = Literal["open", "truncate"]
-"""`open`: the trace may go on, values are bounds over all continuations; `truncate`: windows are cut."""
+"""`open`: the trace may continue, values are bounds over all continuations; `truncate`: windows are cut."""
 
 _CHUNK = 1 << 22
-"""Numbers of one column that windows are unrolled into at a time."""
+"""Numbers of one column per block when windows are unrolled."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Columns `(samples, batch)` and how to compute with them.
+    """Columns `(samples, batch)` and their array library.
 
     Attributes:
         env: name -> values, none of them NaN.
         ops: the array library.
         semantics: of min and max.
-        holes: signals that are not known everywhere (`stlc.monitor.holes`).
+        holes: signals with unknown values (`stlc.monitor.holes`).
     """
 
     env: Mapping[str, Array]
@@ -44,13 +44,13 @@ class Record:
 
     @staticmethod
     def of(env: Mapping[str, Array], ops: Ops) -> Record:
-        """A record of columns in which NaN stands for what is not known; in NumPy arrays alone."""
+        """A record of columns in which NaN is an unknown value; for NumPy arrays only."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
         return Record(without_holes(env, holes) if holes else env, ops, holes=holes)
 
     @property
     def sure(self) -> Record:
-        """The same for formulas that say themselves what is not known."""
+        """The record without `holes`, for formulas that treat unknown values themselves."""
         return replace(self, holes=frozenset()) if self.holes else self
 
     @property
@@ -81,10 +81,10 @@ class Record:
 def bounds(
     formula: ir.Formula, record: Record, starts: range, ends: Ends, stop: int | None = None
 ) -> tuple[Array, Array]:
-    """Both ends of the values at consecutive instants, each `(count, batch)`.
+    """Least and greatest values at consecutive instants, each `(count, batch)`.
 
-    Where nothing is unknown, both are one and the same array. `stop` says how many samples there will be,
-    where that are more than are known.
+    Where nothing is unknown, both are one and the same array. `stop` is the final number of samples,
+    where it exceeds the known ones.
     """
     if record.holes:
         least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
@@ -108,11 +108,11 @@ def bounds(
 def window_bounds(
     formula: ir.Formula, record: Record, starts: range, window: int, ends: Ends
 ) -> tuple[Array, Array]:
-    """The same where `end` is `window` samples after each instant: `(count, batch)`.
+    """`bounds` where `end` is `window` samples after each instant: `(count, batch)`.
 
-    Every instant sees its own record, from what the past operators look back at to its own end. Many of them
-    are evaluated at once: they become columns. Of a record that ends before the window does the rest is not
-    known; where windows are cut its last sample is the end.
+    Every instant has its own record, from the lookback of the past operators to its own end. Many of them
+    are evaluated at once, as columns. Where a record ends before its window, the rest is unknown; where
+    windows are cut, its last sample is the end.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
@@ -129,7 +129,7 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Records whose columns are the surroundings of instants, some instants at a time."""
+    """Records whose columns are the surroundings of instants, in blocks of instants."""
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]
@@ -143,13 +143,13 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
         yield replace(record, env={name: x[k - back :] for name, x in record.env.items()}), 1
 
 
-# ------------------------------------------------------------------ signals that nobody gave
+# --------------------------------------------------------------------------- missing signals
 
 
 def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
-    """The formula where a predicate is true that reads other columns than those: the most that it can be.
+    """The formula with predicates that read other columns assumed true: its upper bound.
 
-    Names that `freeze` binds to what nobody gave are such columns, too.
+    Names that `freeze` binds to missing columns count as missing, too.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -171,7 +171,7 @@ def _read(num: ir.Num) -> set[str]:
 
 
 def by_truth(formula: ir.Formula) -> ir.Formula:
-    """The formula with the truth of its predicates for values: +inf (true) and -inf (false).
+    """The formula with the truth values of its predicates: +inf (true) and -inf (false).
 
     `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
     """

@@ -1,4 +1,4 @@
-"""A specification made ready to judge recorded signals."""
+"""Monitor of recorded signals against a specification."""
 
 from __future__ import annotations
 
@@ -52,21 +52,21 @@ _SUFFIXES = (".stl", ".stlc")
 
 
 class Monitor:
-    """Judges recorded signals: exact, per requirement, without torch unless the signals are torch tensors.
+    """Exact monitor of recorded signals, per requirement; uses torch only for torch tensors.
 
     Args:
         spec: a specification, its text, or the path of its file.
         dt: time step of the signals in seconds; by default that of the trace, or of the system.
-        horizon: what `T` means, in seconds; by default that of the trace, or of the system.
+        horizon: value of `T`, in seconds; by default that of the trace, or of the system.
         system: path or name of a system file; the specification is then checked against it. By default
-            the system that the specification names says what is missing of `dt` and `T`.
+            the system that the specification names gives a missing `dt` or `T`.
         overrides: constant -> its value, as text.
 
     Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is (…, time, k) or one
     signal per component, `q[0]`. Results are float64 for NumPy; for torch, dtype, device and gradients stay.
 
     Raises:
-        SpecError: the specification is invalid; E311 where `dt` or `T` is needed and nobody says what it is.
+        SpecError: the specification is invalid; E311 where `dt` or `T` is needed and unknown.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Monitor:
         self._compiled: dict[Grid, Compiled] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
         known = Times(self._asked.dt, self._asked.horizon).or_else(self._system)
-        if not self._lacks(known):  # else the first trace may say the time step
+        if not self._lacks(known):  # else the first trace may give the time step
             self._compile(known)
 
     @property
@@ -97,12 +97,12 @@ class Monitor:
 
     @property
     def compiled(self) -> Compiled:
-        """The specification as it was compiled for the time step and the horizon that are known here."""
+        """The specification, compiled for the known time step and horizon."""
         return self._ready(Times())
 
     @property
     def horizon(self) -> float:
-        """Seconds of signal that a verdict at time 0 needs; windows to the end take what there is."""
+        """Seconds of signal that a verdict at time 0 needs; windows to the end are clipped."""
         return float(self.compiled.reach * (self.compiled.grid.dt or 0))
 
     # -------------------------------------------------------------------- judging
@@ -117,16 +117,16 @@ class Monitor:
         require: Sequence[str] = (),
         semantics: str | Semantics = "exact",
     ) -> Verdict:
-        """Judge every requirement at the instants at which it speaks (`stlc.monitor.instants`).
+        """Evaluate every requirement at its instants (`stlc.monitor.instants`).
 
         Args:
             signals: by name, or a trace, or the path of one.
-            at: judge at this sample, or at "all" starts; None takes what each requirement asks for.
+            at: evaluate at this sample, or at "all" starts; None takes each requirement's own instants.
             end: where a trace is too short: "open" takes bounds over all its continuations and may be
                 inconclusive, "strict" refuses, "truncate" cuts windows.
             tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
-            require: names of the requirements to judge; none means all.
-            semantics: of the robustness that is told, or its name; verdicts and reasons are always exact.
+            require: names of the requirements to evaluate; none means all.
+            semantics: of the reported robustness, or its name; verdicts and reasons are always exact.
 
         Raises:
             TraceError: signals are missing (E601), not finite (E604), or do not fit (E605); with `end`
@@ -157,13 +157,13 @@ class Monitor:
         smoothing: float | None = None,
         semantics: str | Semantics = "exact",
     ) -> Array:
-        """Robustness of the whole: the least `weight * robustness / scale` over the requirements.
+        """Robustness of the specification: the least `weight * robustness / scale` over the requirements.
 
         Args:
             signals: as in `check`; (time,) or (…, time).
-            end: "strict" leaves NaN where a window is not whole, "truncate" cuts windows.
+            end: "strict" leaves NaN where a window is incomplete, "truncate" cuts windows.
             at: at this sample only.
-            smoothing: scale k of log-sum-exp, which it asks for by itself.
+            smoothing: scale k of log-sum-exp; selects that semantics by itself.
             semantics: of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
         Returns:
@@ -194,9 +194,9 @@ class Monitor:
         return {rule.name: laid(row) for rule, row in zip(ready.rules, rows, strict=True)}
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
-        """Least and greatest robustness of the whole over all continuations of the signals.
+        """Least and greatest robustness of the specification over all continuations of the signals.
 
-        Samples that are not there may be anything, predicate by predicate. Shapes as in `robustness`.
+        Missing samples make the predicates that read them unknown. Shapes as in `robustness`.
         """
         ready = self._prepare(signals, ())
         ends = []
@@ -214,13 +214,13 @@ class Monitor:
         like: Trace | None = None,
         dt: Seconds | None = None,
     ) -> Online:
-        """A monitor that takes samples one by one: verdicts as soon as they are decided, bounds before.
+        """Return a monitor for samples one by one: verdicts as soon as they are decided, bounds before.
 
         Args:
-            how: which instants are judged, what happens at the end, and the tolerance.
-            require: names of the requirements to judge; none means all.
-            like: a trace, or the first piece of one, that says what `dt` and `T` are.
-            dt: time step in seconds, where neither a trace nor this monitor says it.
+            how: instants, treatment of the end of the stream, and tolerance.
+            require: names of the requirements to evaluate; none means all.
+            like: a trace, or the first piece of one, that gives `dt` and `T`.
+            dt: time step in seconds, where neither a trace nor this monitor gives it.
 
         Raises:
             UsageError: U101, an unknown requirement, or none at all.
@@ -250,7 +250,7 @@ class Monitor:
         return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
-        """Compiled for what the arguments, the trace and the given system say; at last the named system."""
+        """Compile for the times of the arguments, the trace, the given system, or else the named one."""
         step = recorded.or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._asked.horizon).or_else(self._system).or_else(recorded)
         known = Times(step.dt, whole.horizon, step.trace)
@@ -265,12 +265,12 @@ class Monitor:
             raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
 
     def _lacks(self, times: Times) -> bool:
-        """Whether a time in the specification needs a step or a horizon that nobody has said."""
+        """Whether the specification needs a time step or horizon that is unknown."""
         grid, spec = times.grid(), self._resolved
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """E311 with what became of the system that the specification names."""
+        """E311, noting that the file of the system that the specification names does not exist."""
         if finding.code != "E311" or self.spec.system is None:
             return finding
         return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
@@ -283,7 +283,7 @@ class Monitor:
 
 
 def _source(spec: str | Path) -> Source:
-    """A path where it looks like one; everything else is the text itself."""
+    """The source at a path, or the text itself where it does not look like a path."""
     if isinstance(spec, Path) or (spec.endswith(_SUFFIXES) and "\n" not in spec):
         return read_source(spec)
     return Source("<text>", spec)
@@ -312,7 +312,7 @@ def _weighed(rules: Sequence[CompiledRequirement], rows: Sequence[Array]) -> lis
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """Which traces the assumptions do not exclude: (traces,)."""
+    """Traces that the assumptions do not exclude: (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
@@ -334,9 +334,9 @@ def _judge(
 
 
 def _told(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """The same judgement with the robustness of another semantics.
+    """The judgement with the robustness of another semantics.
 
-    Where something is unknown, a semantics whose extrema are means has only the sign of the exact bounds.
+    Where something is unknown, a semantics whose extrema are means keeps only the sign of the exact bounds.
     """
     starts = range(judgement.start, judgement.start + judgement.instants)
     ends: Ends = "truncate" if end == "truncate" else "open"

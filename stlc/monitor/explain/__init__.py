@@ -1,4 +1,4 @@
-"""Why a formula fails: causes, and words for them."""
+"""Causes of a violation, and their wording."""
 
 from stlc.monitor.explain.report import explain
 

@@ -1,9 +1,9 @@
-"""Why a formula fails at an instant: the least tree of sub-formulas, instants and signals that explains it.
+"""Cause of a violation at an instant: the least tree of sub-formulas, instants and signals that explains it.
 
 A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant,
-`eventually` at every one, of which the closest is shown. The main path goes from minimum to maximum to the
-parts that attain them, down to one predicate at one instant: its value is the robustness. Where several
-values are equal to it, one is taken whose own change changes the robustness, if there is such a one.
+`eventually` at every one, of which the closest is shown. The main path follows the parts that attain each
+minimum and maximum, down to one predicate at one instant: its value is the robustness. Where several values
+equal the robustness, one is chosen whose change alone changes the robustness, if there is one.
 """
 
 from __future__ import annotations
@@ -38,30 +38,30 @@ from stlc.source import Span
 Floats = NDArray[np.float64]
 
 MOST_TIED = 64
-"""Values that are equal to the robustness, of which one is looked for that decides alone."""
+"""Greatest number of values equal to the robustness that are tried for one that decides alone."""
 
 _MOST_NUMBERS = 1 << 26
-"""Values of predicates that are kept for that."""
+"""Greatest number of stored predicate values for that search."""
 
 _MOST_LATER = 64
-"""How many instants after the last sample are looked at where past operators still know something there."""
+"""Greatest number of instants after the last sample at which past operators are still evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
 class CauseNode:
-    """A sub-formula that is not as it should be.
+    """A sub-formula whose truth value is not the wanted one.
 
     Attributes:
         formula: as typed.
-        holds: what it is: true or false (it should be the other).
-        sample: where.
+        holds: its truth value (the other one is wanted).
+        sample: the instant.
         rho: its robustness there, by whose sign it `holds`.
         until: for an operator that fails at every instant of a window: the last one.
-        reads: the signals that it reads, and how many samples later; of a predicate alone.
-        parts: why; empty for a predicate.
-        main: which of the parts decides.
+        reads: the signals that a predicate reads, and how many samples later; else empty.
+        parts: causes among its operands; empty for a predicate.
+        main: index of the part that decides.
         premise: it is the left side of an implication.
-        moves: a change of the value that decides in it changes it; a frozen value may change along.
+        moves: its value follows changes of the value that decides; a frozen value may change along.
     """
 
     formula: typed.Formula
@@ -77,17 +77,17 @@ class CauseNode:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the signals that it reads; of a predicate alone."""
+        """Names of the signals that a predicate reads."""
         return tuple(dict.fromkeys(name for name, _ in self.reads))
 
     @property
     def instants(self) -> set[tuple[str, int]]:
-        """The signals that it reads, and the samples at which it does; of a predicate alone."""
+        """The signals that a predicate reads, with the samples at which it reads them."""
         return {(name, self.sample + later) for name, later in self.reads}
 
     @property
     def span(self) -> Span:
-        """Where it is written."""
+        """Its place in the source text."""
         return self.formula.span
 
     @property
@@ -97,29 +97,29 @@ class CauseNode:
 
     @property
     def path_moves(self) -> bool:
-        """Whether all on the path to the predicate that decides `moves`."""
+        """Whether `moves` holds for all nodes on the path to the predicate that decides."""
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
     def leaves(self) -> tuple[CauseNode, ...]:
-        """All predicates."""
+        """All predicates of the tree."""
         return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
 
 
 Spot: TypeAlias = tuple[ir.Formula, int]
-"""A predicate, or a formula that freezes values, at an instant."""
+"""A predicate, or a `freeze` formula, at an instant."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Tied:
-    """A formula over the values of its predicates, of which one may be raised by the least there is.
+    """A formula over the values of its predicates, of which one may be raised to the next larger float.
 
     Attributes:
         record: the trace.
         names: predicate -> its column.
         env: column -> values (samples, 1); columns of predicates that come later are added.
-        raised: which value is more than it is.
-        stop: how many samples there will be, where that are more than are known.
+        raised: the value that is raised.
+        stop: final number of samples, where it exceeds the known ones.
     """
 
     record: Record
@@ -130,7 +130,7 @@ class _Tied:
 
     @property
     def columns(self) -> dict[str, Floats]:
-        """The columns where that value is raised."""
+        """The columns, with that value raised."""
         return self.env if self.raised is None else self._with(self.raised)
 
     def _with(self, spot: Spot) -> dict[str, Floats]:
@@ -148,7 +148,7 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """The robustness where a value is raised."""
+        """The robustness with a value raised."""
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
@@ -156,7 +156,7 @@ class _Tied:
 
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
-    """The predicates of a formula; what freezes values is one."""
+    """The predicates of a formula; a `freeze` counts as one."""
     if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return {formula: None}
     return {leaf: None for part in operands(formula) for leaf in _leaves_of(part)}
@@ -170,15 +170,15 @@ def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Fo
 
 @dataclass(frozen=True, slots=True)
 class CauseFinder:
-    """Explains failures on one trace.
+    """Finder of causes on one trace.
 
     Attributes:
-        record: columns of the one trace, (samples, 1), up to what `end` is.
+        record: columns of the one trace, (samples, 1), up to `end`.
         grid: of time.
-        cache: formulas, or their negations, as lowered.
-        known: the most that lowered formulas can be, at which instants.
-        tied: values of predicates that are taken instead of those of the trace, one of them a trifle more.
-        stop: how many samples there will be, where that are more than are known.
+        cache: lowered formulas, or their negations.
+        known: upper bounds of lowered formulas, with their instants.
+        tied: predicate values that replace those of the trace, one of them slightly raised.
+        stop: final number of samples, where it exceeds the known ones.
     """
 
     record: Record
@@ -191,10 +191,10 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Why `formula` is not `wanted`, and whether the value at the end of the path decides alone.
+        """The cause of `formula` not being `wanted`, and whether the value at the path's end decides alone.
 
-        Where other values are equal to it, the path leads to one whose own change changes the robustness, if
-        there is such a one among the first `MOST_TIED`.
+        Where other values equal it, the path leads to one whose change alone changes the robustness, if
+        there is one among the first `MOST_TIED`.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)
@@ -217,7 +217,7 @@ class CauseFinder:
         return tree, False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
-        """The predicates of a formula, and the instants, at which they are worth the same as it."""
+        """The predicates of a formula, with the instants, whose value equals that of the formula."""
         wanted = _leaves_of(lowered)
         found = {
             (node, its.start + int(k)): None
@@ -229,7 +229,7 @@ class CauseFinder:
         return sorted(found, key=lambda spot: spot[1])
 
     def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
-        """The values of its predicates as columns; None where some lie beyond the last sample."""
+        """Predicate values as columns; None where some lie beyond the last sample, or they are too many."""
         leaves = list(_leaves_of(lowered))
         samples = self.record.samples
         if any(instant >= samples for _, instant in equal) or samples * len(leaves) > _MOST_NUMBERS:
@@ -240,7 +240,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """Why `formula` is not `wanted` at `sample`."""
+        """The cause of `formula` not being `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -282,7 +282,7 @@ class CauseFinder:
         }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
-        """What the formula binds at a sample; what does not exist becomes a sample beyond the trace."""
+        """The values that the formula binds at a sample; missing ones become a sample beyond the trace."""
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
         for name, num in formula.bindings:
@@ -295,9 +295,9 @@ class CauseFinder:
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
-        """The formula, or its negation where it is not wanted: what fails.
+        """The lowered formula, or its negation where it is not wanted: the one that fails.
 
-        A requirement may not depend on all that it mentions, and what it does not depend on is not given.
+        Signals on which a requirement does not depend may be missing.
         """
         key = (formula, wanted)
         if key not in self.cache:
@@ -307,7 +307,7 @@ class CauseFinder:
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
-        """By how much the formula is as wanted, at best, at consecutive instants: (instants,)."""
+        """Upper bound of the margin by which the formula is as wanted, at instants in order, (instants,)."""
         lowered = self._lowered(formula, wanted)
         if self.tied is not None:
             lowered = self.tied.coded(lowered)
@@ -324,11 +324,11 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """Whether the trace does not tell: it was cut, and what is not there is not as it is wanted."""
+        """Whether the formula is undecided because the trace was cut: its margin has no upper bound."""
         return bool(np.isposinf(self._margins(formula, wanted, range(sample, sample + 1))[0]))
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
-        """Its values, where an evaluation of something around it has told them already."""
+        """Values that an evaluation of an enclosing formula has already stored."""
         for known, values in self.known.get(lowered, ()):
             if known.start <= instants.start and instants.stop <= known.stop:
                 rows = values[instants.start - known.start : instants.stop - known.start]
@@ -349,18 +349,18 @@ class CauseFinder:
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
     def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
-        """How many samples after an instant a predicate reads a signal."""
+        """Samples from an instant to the one at which a predicate reads a signal."""
         if isinstance(leaf, ir.Signal):
             return 0
         there = sample + leaf.steps
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
-        """The part that is farthest from what is wanted of it."""
+        """The part with the least margin."""
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
 
     def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
-        """By how much the formula is as wanted, at best, at one instant."""
+        """Upper bound of the margin by which the formula is as wanted, at one instant."""
         return float(self._margins(formula, wanted, range(sample, sample + 1))[0])
 
     # ---------------------------------------------------------------- connectives
@@ -393,7 +393,7 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """Of the two ways in which an equivalence is as wanted, what is farthest from it in each."""
+        """The part with the least margin in each of the two cases in which an equivalence is as wanted."""
         left, right = formula.items
         same = (formula.op == "<->") is wanted
         ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
@@ -415,7 +415,7 @@ class CauseFinder:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """The instants of the window of a temporal operator of which something is known, in order of time."""
+        """The instants in the window of a temporal operator at which something is known, in order of time."""
         lowered = self._lowered(formula, wanted)
         match lowered:
             case ir.Temporal(window=window) | ir.Until(window=window):
@@ -433,7 +433,7 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """The first instant after the last sample at which nothing is known of the parts of a formula."""
+        """The first instant after the last sample at which the operands of a formula are unknown."""
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
     def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> CauseNode:
@@ -492,7 +492,7 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """Whether the window goes on where nothing is known any more."""
+        """Whether the window extends to instants at which everything is unknown."""
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
             return False
@@ -508,9 +508,10 @@ class CauseFinder:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """Where `until` comes closest: an offset from now, and whether it is the left side that decides there.
+    """The closest attempt of `until`: its offset from now, and whether the left side decides there.
 
-    It is worth the most, over the instants of the right side, of the least of that and the left side so far.
+    Its value is the maximum, over the instants of the right side, of the minimum of that and the left side
+    so far.
     """
     skipped = len(left) - len(right)
     held = np.minimum.accumulate(left)[skipped:]
@@ -521,7 +522,7 @@ def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
 
 
 def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
-    """Where `release` fails: offset of the right side, of the best of the left side so far, which decides."""
+    """Failure of `release`: offsets of the right side and of the best left value so far; which decides."""
     skipped = len(left) - len(right)
     freed = np.maximum.accumulate(left)[skipped:]
     worst = int(np.argmin(np.maximum(freed, right)))

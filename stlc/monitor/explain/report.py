@@ -1,4 +1,4 @@
-"""A violation in the words of the specification: the sub-formula, the instant, the signal and its value."""
+"""Report of a violation in terms of the specification: sub-formula, instant, signal and value."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST_LABELS = 6
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a signal was.
+    """Value of a signal at the instant that decides.
 
     Attributes:
         signal: its name.
@@ -41,22 +41,22 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Why one requirement is violated by one trace in one window.
+    """Cause of the violation of one requirement by one trace in one window.
 
     Attributes:
         judgement: of the requirement.
-        trace: which trace.
-        start: sample at which the requirement was judged.
+        trace: index of the trace.
+        start: sample at which the requirement was evaluated.
         sample: sample of the predicate that decides.
         time: of that sample in seconds.
         predicate: its text.
         span: of the predicate.
         readings: the signals that it reads, at that sample.
-        place: what to underline in the requirement, and what to say there.
-        labels: what else to underline.
+        place: the part of the requirement to underline, and its label.
+        labels: the other parts to underline.
         because: one line in words.
         tree: the whole explanation.
-        alone: a change of the value that decides, towards the side that is wanted, raises the robustness.
+        alone: a change of the value that decides, towards the wanted side, raises the robustness.
     """
 
     judgement: Judgement
@@ -75,12 +75,12 @@ class Cause:
 
     @property
     def unit(self) -> str:
-        """Of the value that decides."""
+        """Unit of the value that decides."""
         return margin_unit(self.tree.leaf.formula)
 
 
 MOST = 500
-"""Violated requirements that are explained at once: nobody reads more, and each takes half a millisecond."""
+"""Greatest number of violated requirements explained at once; each takes half a millisecond."""
 
 
 def explain(verdict: Verdict, name: str) -> Cause | None:
@@ -106,7 +106,7 @@ def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
 
 
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
-    """The causes of violated requirements, by their names; of the first `MOST` where there are more."""
+    """The causes of violated requirements, by name; only the first `MOST`."""
     definitions = _definitions(verdict.subject.compiled.spec)
     violated = [judgement for judgement in verdict if judgement.overall == "violated"]
     return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
@@ -158,7 +158,7 @@ class _Words:
     definitions: dict[str, ast.Expr]
 
     def readings(self, blame: CauseNode) -> tuple[Reading, ...]:
-        """The signals that the predicates below read, each at the instants where they do."""
+        """The signals that the predicates of the tree read, each at the instants where they do."""
         seen: dict[tuple[str, int], Reading] = {}
         read = self.subject.compiled.signature
         for leaf in blame.leaves:
@@ -173,7 +173,7 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """What to underline: the predicate that decides first."""
+        """Labels of the parts to underline, the predicate that decides first."""
         found: dict[Span, str] = {}
         for blame in _told(tree):
             found.setdefault(self.site(blame.span), self.told(blame))
@@ -182,7 +182,7 @@ class _Words:
         return [Label(span, found[span]) for span in spans]
 
     def told(self, blame: CauseNode) -> str:
-        """What is said beside an underlined part."""
+        """The label of an underlined part."""
         word = "true" if blame.holds else "false"
         if blame.until is not None:
             window = f"from {self.subject.moment(blame.sample)} to {self.subject.moment(blame.until)}"
@@ -194,7 +194,7 @@ class _Words:
         return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
 
     def because(self, tree: CauseNode) -> str:
-        """Why, in words: where a premise decides, what the conclusion was is told, too."""
+        """The cause in words; where a premise decides, the conclusion is described, too."""
         text = self.reason(tree)
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
@@ -222,12 +222,12 @@ class _Words:
         return f"{name} means {body}, and {found} (line {leaf.span.line})"
 
     def site(self, span: Span) -> Span:
-        """The place in the requirement that brings `span` in, be it by a definition."""
+        """The part of the requirement that contains `span`, or refers to its definition."""
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
-        """The names by which `expr` comes to the definition that holds `span`; None if it does not."""
+        """The chain of names from `expr` to the definition that holds `span`; None if there is none."""
         if _within(span, expr.span):
             return ()
         for name in names_in(expr):
@@ -239,7 +239,7 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """The signals of a predicate as its text has them; those behind a name come last."""
+    """The signals of a predicate in the order of its text; those behind a name come last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
     return sorted(
@@ -248,7 +248,7 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 
 
 def _told(tree: CauseNode) -> Iterator[CauseNode]:
-    """The nodes that get a label: premises as a whole, windows without success, predicates."""
+    """The nodes that get a label: premises as a whole, windows that never succeed, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
         yield replace(tree, formula=_body(tree.formula)) if tree.until is not None else tree
         return
@@ -257,14 +257,14 @@ def _told(tree: CauseNode) -> Iterator[CauseNode]:
 
 
 def _telling(tree: CauseNode) -> CauseNode:
-    """The one among them that decides."""
+    """The labelled node that decides."""
     if tree.until is not None:
         return replace(tree, formula=_body(tree.formula))
     return _telling(tree.parts[tree.main]) if tree.parts else tree
 
 
 def _closest(tree: CauseNode) -> bool:
-    """Whether the predicate that decides is what a window looks for, the best in it, and nothing succeeds."""
+    """Whether the predicate that decides is the closest attempt of a window in which nothing succeeds."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]
@@ -281,7 +281,7 @@ def _body(formula: typed.Formula) -> typed.Formula:
 
 
 def shown(value: float, column: Column) -> str:
-    """A value as one reads it: the label of an enum, a number with its unit."""
+    """A value as text: the label of an enum, a number with its unit."""
     for label, number in column.labels:
         if number == value:
             return label
