@@ -1,4 +1,4 @@
-"""Traces that are larger than memory, read a number of samples at a time."""
+"""Chunked reading of traces that are larger than memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stlc.trace.time_grid import TOLERANCE, resample_advice
 from stlc.trace.trace import Reading, Trace, trace_of
 
 LARGE = 1_500_000_000
-"""Files whose numbers take more bytes than this are not read as a whole."""
+"""Files whose numbers take more bytes than this are read in chunks."""
 
 
 def size_of(path: Path) -> int:
@@ -33,7 +33,7 @@ def size_of(path: Path) -> int:
 
 
 def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
-    """The trace of a file, so many samples at a time, with continuing times.
+    """Chunks of a file's trace, so many samples each, with continuing times.
 
     Raises:
         TraceError: as `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its format
@@ -66,7 +66,7 @@ def _single(trace: Trace) -> Trace:
 
 
 def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
-    """The first date of a clock that is written as dates."""
+    """The first date of a clock that is written as dates; None for other clocks."""
     clock = reading.names.get(CLOCK)
     (group,) = (recording if clock is None else recording.clocked_by(clock)).groups
     if group.clock is None or group.clock.dtype.kind != "U":
@@ -98,7 +98,7 @@ class _Clock:
         return replace(trace, t0=start)
 
     def _seconds(self, group: ClockGroup) -> NDArray[np.float64]:
-        """The times of a chunk; of dates, seconds since the first of the file."""
+        """The times of a chunk in seconds; dates are relative to the first of the file."""
         assert group.clock is not None
         if group.clock.dtype.kind not in "Uc":
             return group.clock.astype(np.float64)

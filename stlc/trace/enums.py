@@ -1,6 +1,6 @@
 """Conversion of words in a trace to numbers: members of enums, and truth values.
 
-What is no number of any kind, words and complex numbers, is set aside, and refused where a signal needs it.
+Words and complex numbers that cannot be converted are set aside, and refused where a signal needs them.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
     Args:
         recording: whose arrays may be text.
-        words: name in the file -> what its words are worth; empty for a signal that has numbers. A signal
-            that is not among them is of no interest: where it holds words it is set aside.
+        words: name in the file -> the values of its words; empty for a signal that has numbers. Other
+            signals are not needed: those that hold words are set aside.
 
     Raises:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does

@@ -1,7 +1,6 @@
 """Samples that arrive line by line, as a table with a header or as JSON, on one time grid.
 
-What a line says is what a file with these lines would say (`stlc.trace.formats.csv`): names, units, words,
-clocks.
+Lines are interpreted as in a file (`stlc.trace.formats.csv`): names, units, words, clocks.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from stlc.trace.trace import Reading
 
 Floats = NDArray[np.float64]
 Sample = Mapping[str, float]
-"""Signal -> number; NaN where it is not known. The components of a vector are `q[0]`, `q[1]`, …"""
+"""Signal -> number; NaN where it is unknown. The components of a vector are `q[0]`, `q[1]`, …"""
 
 MAX_LINE = 1_000_000
 
@@ -57,8 +56,8 @@ class SampleStream:
 
     Attributes:
         name: of the stream, for messages.
-        reading: what signals are called there, what their words are worth, and which clock there is.
-        units: signal -> the unit that the header says, "" where it says none; known with the first sample.
+        reading: names of the signals in the stream, values of their words, and the clock.
+        units: signal -> unit in the header, "" where it has none; known with the first sample.
     """
 
     name: str
@@ -75,8 +74,8 @@ class SampleStream:
         """The samples of the lines; empty lines are skipped.
 
         Raises:
-            TraceError: E601, a signal or clock that was named is missing; E603, a line that is no sample, or
-                a word that is worth nothing; E605, a header or line that does not fit.
+            TraceError: E601, a signal or clock that was named is missing; E603, a line that is not a sample,
+                or a word without a value; E605, a header or line that does not fit.
         """
         is_json: bool | None = None
         for number, raw in enumerate(lines, 1):
@@ -188,7 +187,7 @@ class SampleStream:
         raise self._bad(number, f"has {shown}")
 
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """The number of a cell; None for words of a signal that nothing reads."""
+        """The number of a cell; None for words of a signal that is not needed."""
         if value is None:
             return math.nan
         found = _plain(value)
@@ -209,7 +208,7 @@ def _with_point(cell: str) -> str:
 
 
 def _plain(value: object) -> float | None:
-    """The number that a value of JSON or the text of a cell is; None where it is none."""
+    """The number of a JSON value or of the text of a cell; None where it is not a number."""
     if isinstance(value, str):
         return value_of(value)
     if isinstance(value, int):
@@ -226,8 +225,8 @@ class Uniform:
 
     Attributes:
         t0: time of the first one, in seconds.
-        dt: time between two of them; None where nothing says it.
-        samples: one after the other; they raise TraceError where what comes does not fit.
+        dt: time between two of them; None where unknown.
+        samples: iterator over them; it raises TraceError for input that does not fit.
     """
 
     t0: float
@@ -238,12 +237,12 @@ class Uniform:
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
     """Samples on the grid that `stlc.trace.trace.trace_of` would use, as soon as they are known.
 
-    Without a new grid they have to be on one. With one (`resample`, or a longest gap) a sample is known when
-    the next one of every signal has come, or none within the longest gap.
+    Without a new grid their times have to be uniform. With one (`resample`, or a longest gap) a sample is
+    known when the next one of every signal has arrived, or none within the longest gap.
 
     Raises:
-        TraceError: E601, nothing says when samples were taken; E602, times that are not uniform, or that
-            decrease; E605, there are none.
+        TraceError: E601, the times of the samples are unknown; E602, times that are not uniform, or that
+            decrease; E605, there are no samples.
     """
     first = next(moments, None)
     if first is None:
@@ -333,12 +332,12 @@ class _Track:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """The values on a grid; nothing came after the last sample until `end`."""
+        """The values on a grid; no sample follows the last one until `end`."""
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
-        """The instant up to which later samples change nothing."""
+        """The instant before which values are final."""
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
 

@@ -34,11 +34,11 @@ class Carried:
     """A specification that is stored in a trace.
 
     Attributes:
-        name: of it, where that is known.
-        path: where it lay.
-        text: the whole; "" where the trace has none.
+        name: its name, where known.
+        path: its path.
+        text: its whole text; "" where the trace has none.
         library: texts of the files that it imports, by key.
-        overrides: constants that were set to something else than the text says, as texts.
+        overrides: constants that were overridden, with their values as texts.
     """
 
     name: str
@@ -57,10 +57,10 @@ class TraceMeta:
         spec_path: its path as the user gave it.
         spec_text: its whole text, so that `stlc check` needs no other file.
         spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
-        spec_set: constants that were set to something else than the text says, as texts.
+        spec_set: constants that were overridden, with their values as texts.
         spec_hash: SHA-256 of those texts, hexadecimal.
-        judge_path: where the specification by which drives are judged was read; the same for `judge_text`,
-            `judge_library` and `judge_set`. Without a text what was recorded is judged by `spec_text`.
+        judge_path: path of the specification that closed-loop runs are evaluated by; likewise `judge_text`,
+            `judge_library` and `judge_set`. Without a text the recording is evaluated by `spec_text`.
         system_name: name of the system.
         system_path: its path as the user gave it.
         system_text: the text of its file.
@@ -69,7 +69,7 @@ class TraceMeta:
         seed: of the recording.
         horizon: planning horizon T in steps.
         dt: time step in seconds.
-        origin: the time 0 in ns since 1970, of what was logged with the time of day.
+        origin: time 0 in ns since 1970, for logs with the time of day.
         created: ISO 8601 time.
         stlc_version: of the recorder.
     """
@@ -98,12 +98,12 @@ class TraceMeta:
 
     @property
     def planned(self) -> Carried:
-        """The specification that plans were made for."""
+        """The specification that the plans were made for."""
         return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
 
     @property
     def carried(self) -> Carried:
-        """The specification that the trace is judged by: that of closed-loop runs, else `planned`."""
+        """The specification for evaluating the trace: that of closed-loop runs, else `planned`."""
         if not self.judge_text:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
@@ -113,7 +113,7 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
     """The metadata in the array `meta` of a trace, and the columns that it describes.
 
     Raises:
-        TraceError: E603, it is no JSON text of the expected form.
+        TraceError: E603, it is not a JSON text of the expected form.
     """
     if array is None:
         return TraceMeta(), {}

@@ -21,9 +21,9 @@ Floats = NDArray[np.float64]
 
 CLOCK = "t"
 ROSTOPIC = "%time"
-"""The clock in output of `rostopic echo -p`, in nanoseconds."""
+"""Name of the clock in output of `rostopic echo -p`, in nanoseconds."""
 CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
-"""Names of a clock, in any case of letters."""
+"""Names of a clock, case-insensitive."""
 EXTRA = "extra."
 
 
@@ -33,8 +33,8 @@ class ClockGroup:
 
     Attributes:
         arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
-        clock: times in seconds, (samples,); None where the file does not say.
-        named: how the file calls the clock.
+        clock: times in seconds, (samples,); None where the file has none.
+        named: name of the clock in the file.
     """
 
     arrays: Mapping[str, Array]
@@ -44,14 +44,14 @@ class ClockGroup:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A trace file as read.
+    """Content of a trace file.
 
     Attributes:
         name: the path as the user gave it, for messages.
         groups: the signals; files with one clock have one.
-        columns: signal -> unit, kind and range, where the file says so.
-        meta: where it comes from.
-        extras: whatever else was recorded.
+        columns: signal -> unit, kind and range, where the file gives them.
+        meta: origin of the recording.
+        extras: all other recorded arrays.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Recording:
         return tuple(name for group in self.groups for name in group.arrays)
 
     def clocked_by(self, signal: str) -> Recording:
-        """The same with `signal` as the clock of its group.
+        """The recording with `signal` as the clock of its group.
 
         Raises:
             TraceError: E601, there is no such signal.
@@ -113,7 +113,7 @@ def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = 
 
 
 def unit_of(path: Path, name: str, text: str) -> Unit:
-    """The unit that a file gives for a column. Raises TraceError (E605) for a text that is none."""
+    """The unit that a file gives for a column. Raises TraceError (E605) for an invalid unit."""
     try:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:

@@ -1,6 +1,6 @@
 """Resampling of signals with any clocks to one grid: discrete ones are held, real ones interpolated.
 
-In gaps that are too long for that a signal is not known: NaN.
+In gaps that are too long for that, a signal is unknown: NaN.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ MAX_SAMPLES = 100_000_000
 _ROUNDING = 1e-6
 
 _GAPS = 9
-"""So many gaps between the first samples say what is usual,"""
+"""Number of gaps between the first samples from which the usual step is computed."""
 
 BRIDGED = 3
-"""and a gap of so many usual steps is bridged where nobody says how long a gap may be."""
+"""Default longest gap that is bridged, in usual steps."""
 
 _SAME = 1 + 1e-9
 
@@ -59,7 +59,7 @@ class Spacing:
 
     @staticmethod
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
-        """The grid for samples at `times`; without `max_gap` three steps are bridged, and all between events.
+        """Grid for samples at `times`; by default gaps up to three steps are bridged, all between events.
 
         A step is the longer of `dt` and the usual one.
         """
@@ -76,18 +76,18 @@ class Spacing:
 def values_on(
     grid: Floats, times: Floats, values: Array, spacing: Spacing, *, held: bool, end: float
 ) -> Floats:
-    """A signal on a grid: NaN where it is not known.
+    """A signal on a grid: NaN where it is unknown.
 
-    It is not within gaps that are too long, before its first sample, and, unless it is held, after the last.
-    Samples that are NaN are none.
+    It is unknown within gaps that are too long, before its first sample, and, unless it is held, after the
+    last. Samples that are NaN are ignored.
 
     Args:
         grid: instants (points,) in seconds, which increase.
         times: of the samples (samples,), which never decrease.
         values: at those times.
         spacing: of the grid.
-        held: between samples the last one counts (zero-order hold); else there are straight lines.
-        end: until when nothing came after the last sample.
+        held: zero-order hold between samples; else linear interpolation.
+        end: time until which no sample follows the last one.
     """
     there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
     if not there.all():
@@ -127,7 +127,7 @@ class _Timed:
 
     @property
     def last(self) -> float:
-        """The last time at which all signals are known; held ones are known from their first on."""
+        """The last time at which all signals are known; held ones are known from their first sample on."""
         return math.inf if self.events else float(self.times[-1])
 
 
@@ -137,7 +137,7 @@ class ResampleGrid:
 
     Attributes:
         dt: seconds between instants; None takes the usual step of the samples.
-        max_gap: the longest gap in seconds in which values are known; None bridges three steps, and between
+        max_gap: the longest gap in seconds that is bridged; None bridges three steps, and between
             events (a group beside others, all of whose signals are discrete) any gap.
     """
 
@@ -164,16 +164,16 @@ def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind
     """The signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
-    (zero-order hold), real ones are interpolated; in gaps that are too long neither is known.
+    (zero-order hold), real ones are interpolated; in gaps that are too long both are unknown.
 
     Args:
         recording: of one or more groups.
-        grid: what they are laid on.
-        kinds: signal -> what its numbers mean, where the caller knows better than the file.
+        grid: the requested grid.
+        kinds: signal -> kind of its numbers; overrides the file.
 
     Raises:
-        TraceError: E601, a group has no clock; E602, times decrease, or have no stretch in common, or `dt`
-            is no time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
+        TraceError: E601, a group has no clock; E602, times decrease, or have no common interval, or `dt` is
+            not a time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
             samples.
     """
     groups = [_timed(recording, group, kinds) for group in recording.groups if group.arrays]

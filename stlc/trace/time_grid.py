@@ -1,4 +1,4 @@
-"""The uniform time grid of a trace, or a diagnostic of where it is not uniform."""
+"""Uniform time grid of a trace, and diagnostics where times are not uniform."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from stlc.diagnostics import Diagnostic, TraceError
 Floats = NDArray[np.float64]
 
 TOLERANCE = 0.05
-"""Share of a step by which samples may stand beside the grid (rounded decimals, jitter)."""
+"""Tolerance of sample times, as a share of a step (rounded decimals, jitter)."""
 
 NO_CLOCK = "add an array `t` with the time of every sample in seconds, or name it: --map t=NAME"
 NO_STEP = "--dt 0.01s  says how far apart samples are that have no clock"
 
 SHORTEST, LONGEST = 1e-15, 1e12
-"""Time steps in seconds: nothing is sampled faster than each femtosecond, or less than each 30,000 years."""
+"""Valid time steps in seconds: from a femtosecond to 30,000 years."""
 
 _SNAP = 1e-6
 
@@ -28,7 +28,7 @@ _SNAP = 1e-6
 def resample_advice(step: float) -> str:
     """Advice for samples that are not on one grid, from their usual time step in seconds.
 
-    The grid is at least twice as fine: on one of their own step samples would be passed over.
+    The proposed grid is at least twice as fine: one of their own step would skip samples.
     """
     if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
         return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
@@ -38,7 +38,7 @@ def resample_advice(step: float) -> str:
 
 
 def gap_advice(step: float) -> str:
-    """Advice for samples on a grid of which some are missing."""
+    """Advice for a grid with missing samples."""
     return (
         f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
         "in longer ones signals are unknown, and what needs them is inconclusive"
@@ -54,8 +54,8 @@ def read_clock(
         name: of the trace, for messages.
         clock: the recorded times (samples,) in seconds, or None.
         dt: the recorded time step, or None; needed where there are no times, or only one.
-        samples: of the signals, where there are no times.
-        others: what the trace holds besides, for messages.
+        samples: number of samples, where there are no times.
+        others: names of the other arrays in the trace, for messages.
 
     Raises:
         TraceError: E601, neither times nor a step; E602, times that are not uniform; E605, no samples.
@@ -88,14 +88,14 @@ def read_clock(
 
 
 def require_step(name: str, dt: float) -> None:
-    """Raise TraceError (E602) for a time step that is none, or far from everything that is sampled."""
+    """Raise TraceError (E602) for a time step that is invalid or out of range."""
     if not SHORTEST <= dt <= LONGEST:
         help_ = (f"time is in seconds, and a step at least {SHORTEST:g} s and at most {LONGEST:g} s",)
         raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
 
 
 def require_same_step(name: str, found: float, said: float) -> None:
-    """Raise TraceError (E602) where the clock of a trace has another step than was said."""
+    """Raise TraceError (E602) where the clock of a trace has another step than the given one."""
     if abs(found - said) > 1e-3 * said:
         message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
         help_ = ("leave out --dt: the file says what its step is",)

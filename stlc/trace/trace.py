@@ -1,7 +1,7 @@
 """Traces: a signature, a time step and arrays, read and written without pickles.
 
 An `.npz` trace holds `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal, arrays
-`extra.NAME` of any shape, and `meta`, a JSON text that says what was recorded, with which specification.
+`extra.NAME` of any shape, and `meta`, a JSON text on the origin of the recording and its specification.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Trace:
         dt: time step in seconds.
         data: signal -> (traces, samples), float64, in the units of the signature.
         t0: time of the first sample in seconds.
-        extras: whatever else was recorded, any shape; never judged.
-        meta: where it comes from.
+        extras: all other recorded arrays, any shape; never evaluated.
+        meta: origin of the recording.
         name: the path as the user gave it, for messages.
     """
 
@@ -69,7 +69,7 @@ class Trace:
 
     @property
     def samples(self) -> int:
-        """Number of samples of each."""
+        """Number of samples per trace."""
         return next((values.shape[1] for values in self.data.values()), 0)
 
     @property
@@ -78,7 +78,7 @@ class Trace:
         return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
 
     def renamed(self, names: Mapping[str, str]) -> Trace:
-        """The same trace where signal `names[new]` is called `new`.
+        """The trace with signal `names[new]` renamed to `new`.
 
         Raises:
             TraceError: E601, a signal that is not in the trace.
@@ -101,13 +101,13 @@ class Reading:
 
     Attributes:
         names: signal -> its name in the file; `t` names the clock.
-        resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
-        dt: seconds between samples, where the file does not say; it must not say otherwise.
-        max_gap: put the signals on a grid, on which they are unknown (NaN) within longer gaps in seconds;
-            without `resample` the grid has the usual step of the file.
-        kinds: signal -> what its numbers mean, which says how it is resampled.
-        words: signal -> what its words are worth, of all signals of interest; those of no interest, and with
-            None all, are set aside among the extras.
+        resample: time step of a new grid in seconds; None takes the file's own, which is uniform.
+        dt: seconds between samples, where the file does not give them; it must not contradict the file.
+        max_gap: resample, with signals unknown (NaN) within longer gaps in seconds; without `resample`
+            the grid has the usual step of the file.
+        kinds: signal -> kind of its numbers, which determines how it is resampled.
+        words: signal -> values of its words, for all needed signals; others, and with None all, are set
+            aside among the extras.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -128,7 +128,7 @@ def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
     """Read a trace; the format follows the suffix.
 
     It is one of `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`, or the folder of a bag;
-    everything else is an `.npz`. Values may be NaN or infinite here: the monitor refuses them where a
+    all others are read as `.npz`. Values may be NaN or infinite here: the monitor refuses them where a
     requirement needs them.
 
     Raises:
@@ -141,7 +141,7 @@ def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
-    """The trace of a file that was read: renamed, and on one uniform grid.
+    """The trace of a recording: renamed, and on one uniform grid.
 
     Raises:
         TraceError: as `load_trace`.
@@ -165,7 +165,7 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """The recording with clocks of this step for signals that have none."""
+    """The recording with clocks of step `dt` for signals that have none."""
     step = dt or recording.meta.dt
     if step is None:
         return recording
@@ -181,7 +181,7 @@ def _longest(group: ClockGroup) -> int:
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:
-    """The trace of a file with one uniform clock."""
+    """The trace of a recording with one uniform clock."""
     name = recording.name
     groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
     if len(groups) > 1:
@@ -227,7 +227,7 @@ def check_writable(path: Path | str) -> None:
     """Check that a trace can be written to a path.
 
     Raises:
-        UsageError: U101, the suffix is none that traces are written with.
+        UsageError: U101, the suffix is not that of a writable format.
         MissingError: R301, an `.mcap` needs a package that is not installed.
     """
     suffix, found = Path(path).suffix.lower(), format_of(Path(path))
@@ -241,6 +241,6 @@ def check_writable(path: Path | str) -> None:
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:
-    """A time step as the fraction that was meant: 0.1 is 1/10, 0.0333… is 1/30."""
+    """A time step as the intended fraction: 0.1 is 1/10, 0.0333… is 1/30."""
     near = Fraction(dt).limit_denominator(1_000_000)
     return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)

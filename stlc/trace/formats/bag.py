@@ -1,8 +1,8 @@
 """Bags of ROS 1 (`.bag`) and ROS 2 (folders, `.db3`), read without a ROS installation.
 
-A bag of ROS 1 is a file of records, some of them in packed chunks (http://wiki.ros.org/Bags/Format/2.0). One
-of ROS 2 is a folder with a database of SQLite, or with `.mcap` files. Bags of ROS 2 before Iron do not say
-what their messages look like: the definitions of the usual ones are those of `rosbags` (extra `bag`).
+A bag of ROS 1 is a file of records, some of them in compressed chunks (http://wiki.ros.org/Bags/Format/2.0).
+One of ROS 2 is a folder with a database of SQLite, or with `.mcap` files. Bags of ROS 2 before Iron lack
+message definitions: for the usual messages those of `rosbags` (extra `bag`) are used.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 _PACKED = ".zstd"
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
-"""Operations that a query may use: no function, pragma or recursion that a database contains."""
+"""Database operations that a query may use: no functions, pragmas or recursion."""
 _LONGEST = 256_000_000
-"""Bytes of a message."""
+"""Greatest number of bytes of a message."""
 
 
 def read(path: Path) -> Recording:
@@ -262,7 +262,7 @@ def _usual(kind: str) -> str:
     store = _usual_ones()
     try:
         text, _ = store.generate_msgdef(kind, ros_version=2)
-    except Exception:  # whatever the library says of a name that it does not know
+    except Exception:  # the library's error for an unknown name
         raise DamageError(f"`{kind[:60]}` is defined neither in the bag nor by ROS itself") from None
     return str(text)
 

@@ -1,7 +1,7 @@
 """Numbers from the cells of tables: one at a time, or all of a large file in little extra memory.
 
 `cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is
-installed, else NumPy's reader, a stretch at a time. All leave what is unusual to others, and give the same
+installed, else NumPy's reader, in blocks. Each leaves unusual cells to slower readers, and all give the same
 numbers.
 """
 
@@ -29,11 +29,11 @@ _WORDS = {"true": 1.0, "false": 0.0}
 _ANY = re.compile(r"\S")
 _SOURCE = Path(__file__).with_name("cells.c")
 STRETCH = 1 << 18
-"""Bytes, or characters, that NumPy's reader is given at a time."""
+"""Bytes, or characters, per block for NumPy's reader."""
 _PLAIN = bytes({*range(32, 127), *b"\t\n\r"} - {*b'"('})
-"""Characters that Arrow reads correctly: no quotes, no `nan(1)`, no others."""
+"""Characters that Arrow reads correctly: neither quotes nor `nan(1)`."""
 _DOUBTS = 32
-"""One cell in so many may be unusual."""
+"""Inverse of the greatest share of cells that may be unusual."""
 _TOO_MANY = -2
 
 
@@ -55,16 +55,16 @@ def bare(raw: str) -> str:
 
 
 def value_of(text: str) -> float | None:
-    """The number of a cell's text: NaN where it is empty, None where it is no number."""
+    """The number of a cell's text: NaN where it is empty, None where it is not a number."""
     if NUMBER.fullmatch(text):
         return float(text)
     return _WORDS.get(text.lower()) if text else math.nan
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """The numbers of these columns, (lines, columns); None where something is none, or nothing is there.
+    """The numbers of these columns, (lines, columns); None where a cell is not a number, or there is none.
 
-    Empty cells are NaN, truth values 0 and 1; quotes around a number are taken off.
+    Empty cells are NaN, truth values 0 and 1; quotes around a number are removed.
     """
     if not _ANY.search(body):
         return None
@@ -125,9 +125,9 @@ def _mended(body: str, delimiter: str) -> str:
 
 
 def read_lines(lines: TableText) -> list[Array] | None:
-    """The columns of a table of numbers; None where a line or a cell is not what it should be.
+    """The columns of a table of numbers; None where a line or a cell does not fit.
 
-    Lines may end in any way. Lines of empty cells are left out; an empty cell beside others is NaN.
+    Any line ending is allowed. Lines of empty cells are left out; an empty cell beside others is NaN.
     """
     library = _library()
     if library is not None:

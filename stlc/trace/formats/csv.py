@@ -1,7 +1,7 @@
 """Traces as `.csv` files; every cell is a number, a word, empty or a diagnostic.
 
-The first line names the columns, units in brackets if one likes: `t, x [m], v (km/h)`. A column `trace` or
-`agent` says to which of several traces a line belongs. A column whose first
+The first line names the columns, with optional units in brackets: `t, x [m], v (km/h)`. A column `trace` or
+`agent` gives the trace of each line, if there are several. A column whose first
 cell is a word holds words; in the others an empty cell is NaN, which the monitor refuses where it is needed.
 """
 
@@ -35,7 +35,7 @@ Array = NDArray[Any]
 
 MAX_BYTES = 1_000_000_000
 LARGE = 4_000_000
-"""Bytes of a file from which on its numbers are read from its bytes, without a text beside them."""
+"""Size in bytes from which on a file is parsed without decoding it to text."""
 
 _HEAD_BYTES = 1 << 16
 _END = re.compile(rb"\r\n|\r|\n")
@@ -65,7 +65,7 @@ def read(path: Path) -> Recording:
 
 
 def size(path: Path) -> int:
-    """Bytes of the file, about as many as its numbers take."""
+    """Bytes of the file, an estimate for its numbers in memory."""
     return path.stat().st_size
 
 
@@ -151,7 +151,7 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     units: dict[str, str] = {}
     names: list[str] = []
     for text, span in _head_cells(sheet):
-        bare = text.removeprefix("#").strip() if not names else text  # how np.savetxt begins a header
+        bare = text.removeprefix("#").strip() if not names else text  # np.savetxt begins a header with it
         name, unit = split_head(bare)
         if not _HEAD.fullmatch(bare):
             shown = f"`{text}` is not the name of a column" if text else "a column without a name"
@@ -253,7 +253,7 @@ def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
 
 
 def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
-    """Whole lines at once with NumPy's reader; None if anything about them is unusual."""
+    """Whole lines at once with NumPy's reader; None if any of them is unusual."""
     if len(texts) == width or (texts and '"' in body):
         return None
     numbers = [i for i in range(width) if i not in texts]
@@ -319,7 +319,7 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write the signals of a trace, a line a sample; `trace` numbers them where there are several.
+    """Write the signals of a trace, a line per sample; a column `trace` numbers several traces.
 
     Raises:
         TraceError: E605, a signal has a name that the format reserves, or as `write_csv`.
@@ -365,7 +365,7 @@ def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
 
 
 def _names_in(path: Path, header: str) -> list[str]:
-    """The names of a header; [] where it is refused."""
+    """The names of a header; [] if it is invalid."""
     try:
         return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
     except TraceError:

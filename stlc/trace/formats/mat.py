@@ -2,7 +2,7 @@
 
 Numeric and logical arrays are signals, with `t` as the clock; the fields of a structure `s` are called `s.x`.
 A column of a matrix (samples, k) is a component of a vector. Texts, cells and objects are left out. Complex
-numbers are no signal: where one is asked for, that is said.
+numbers are not signals: requesting one is an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[Any]
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _COMPLEX = ("real", "imag")
 _RATIO = 1100
-"""More than deflate can shrink anything."""
+"""Limit on the compression ratio: more than deflate can reach."""
 
 
 def read(path: Path) -> Recording:
@@ -52,7 +52,7 @@ def read(path: Path) -> Recording:
 
 
 def _as_signal(values: Array) -> Array:
-    """MATLAB's columns and rows are plain signals."""
+    """The array, with MATLAB's columns and rows as plain signals."""
     if values.ndim == 2 and 1 in values.shape:
         return values.reshape(-1)
     return values
@@ -76,7 +76,7 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
 
 
 def _real(values: Array) -> Array:
-    """Pairs of real and imaginary parts as complex numbers; real ones where all of the latter are 0."""
+    """Pairs of real and imaginary parts as complex numbers; real numbers where all imaginary parts are 0."""
     if values.dtype.names is None:
         return values
     real, turned = (values[part] for part in _COMPLEX)

@@ -1,7 +1,7 @@
-"""MATLAB's file format of version 5 ("MAT-File Level 5"), as far as it holds numbers; nothing is ever run.
+"""MATLAB's file format of version 5 ("MAT-File Level 5"), restricted to numbers; no content is executed.
 
 Elements are a tag (type, number of bytes) and data, padded to 8 bytes; a compressed element is one element
-deflated. Sizes are checked against what is there before memory is asked for.
+deflated. Sizes are checked against the available bytes before memory is allocated.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth:
 
 
 def complex_of(real: Array, turned: Array) -> Array:
-    """Complex numbers of their real and imaginary parts."""
+    """Complex numbers from their real and imaginary parts."""
     made = np.empty(real.shape, dtype=np.complex128)
     made.real, made.imag = real, turned
     return made

@@ -1,7 +1,7 @@
-"""Logs in `.mcap` files (extra `mcap`), in and out: messages of ROS 1 and 2, JSON and Protocol Buffers.
+"""Logs in `.mcap` files (extra `mcap`), read and written: messages of ROS 1 and 2, JSON, Protocol Buffers.
 
-What stlc writes is JSON with a schema, as Foxglove plots it: a topic a trace, a message a sample. A record of
-the file says what the signals mean, so that reading it back gives the same trace.
+Written files hold JSON with a schema, which Foxglove can plot: a topic per trace, a message per sample. A
+metadata record describes the signals, so that reading the file back gives the same trace.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from stlc.trace.trace import Trace
 
 OURS = "stlc"
-"""The record of a file that says what its signals mean."""
+"""The metadata record that describes the signals."""
 _READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
@@ -49,7 +49,7 @@ def read(path: Path) -> Recording:
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        MissingError: R301, `mcap`, or what an encoding needs, is not installed.
+        MissingError: R301, `mcap`, or a package for an encoding, is not installed.
         TraceError: E603, another format, damaged, or without numbers.
     """
     log = Log(path)
@@ -133,7 +133,7 @@ def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
                     file.take(part)
             elif type(record).__name__ == "Metadata" and record.name == OURS:
                 ours = record.metadata
-            elif type(record).__name__ == "DataEnd":  # what follows is an index
+            elif type(record).__name__ == "DataEnd":  # followed by an index
                 break
             else:
                 file.take(record)
@@ -234,7 +234,7 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def _cell(value: float) -> str:
-    """A number of JSON; null for NaN, and one that no float can hold for what is infinite."""
+    """A number as JSON; null for NaN, and a number beyond the range of floats for infinity."""
     if math.isnan(value):
         return "null"
     return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"

@@ -1,8 +1,8 @@
 """Logged messages as a recording: every number is a signal, every topic has a clock.
 
-`/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`; a message that holds nothing but `data`
-is called by its topic. Times are those at which a message was logged, in seconds since the first one. Most
-logs are read with `--resample`, since no two topics follow the same clock.
+`/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`; a message with the single field `data`
+is named after its topic. Times are those at which a message was logged, in seconds since the first one. Most
+logs are read with `--resample`, since no two topics share a clock.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ MAX_VALUES = 100_000_000
 LONGEST = 64
 """Arrays of more numbers than this are data (images, scans), not signals."""
 DEEPEST = 12
-"""A number below so many fields of fields is no signal."""
+"""Greatest nesting depth of a number that is a signal."""
 STAMPS = ({"sec", "nanosec"}, {"secs", "nsecs"}, {"sec", "nsec"}, {"seconds", "nanos"})
-"""Fields of a point in time, as the languages of messages call them."""
+"""Field names of a time stamp in the message languages."""
 HEADER = "header"
-"""A field whose stamps are left to the clock."""
+"""The field whose stamps are used for the clock only."""
 
 _ROOM = 64_000_000
 _RATIO = 50
-"""Packed data may unpack to `_ROOM` bytes, or to this multiple of the file's size."""
+"""Compressed data may expand to `_ROOM` bytes, or to this multiple of the file's size."""
 _LATEST = 2**63 - 1
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
@@ -164,7 +164,7 @@ def _called(topic: str, name: str) -> str:
     return f"{topic}.{name}" if name and not name.startswith("[") and topic else topic + name
 
 
-# ----------------------------------------------------------------- content of any language
+# ----------------------------------------------------------------------- JSON-like content
 
 
 def numbers_of(content: object) -> Iterator[Number]:
@@ -203,18 +203,18 @@ def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Num
             yield from _walk(f"{name}.{key}" if name else key, item, depth + 1)
 
 
-# -------------------------------------------------------------------------- what is packed
+# ------------------------------------------------------------------------- compressed data
 
 
 class Room:
-    """The limit on unpacked bytes, shared by all parts of a file."""
+    """The limit on decompressed bytes, shared by all parts of a file."""
 
     def __init__(self, path: Path, size: int) -> None:
         self.path = path
         self.left = min(MAX_BYTES, max(_ROOM, _RATIO * size))
 
     def unpacked(self, how: str, data: bytes, size: int) -> bytes:
-        """The bytes without compression (`bz2`, `lz4`, `zstd`, or none), as many as were declared.
+        """The decompressed bytes (`bz2`, `lz4`, `zstd`, or none), as many as were declared.
 
         Raises:
             TraceError: E603, more than there is room for.
@@ -240,7 +240,7 @@ class Room:
         return out
 
     def whole(self, message: bytes) -> bytes:
-        """A message, unpacked where it is a `zstd` frame of its own, as in ROS 2."""
+        """A message, decompressed where it is a `zstd` frame of its own, as in ROS 2."""
         return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
 
     def of_unknown_size(self, data: bytes) -> bytes:

@@ -1,7 +1,7 @@
 """Traces as `.npz` archives, read without unpickling.
 
 The archive is read member by member: the header of each array is checked against the size that the archive
-declares before memory is asked for, so that neither a pickle nor a bomb gets past the door.
+declares before memory is allocated, against pickles and decompression bombs.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 try:
     from lzma import LZMAError
-except ImportError:  # a Python without it: `zipfile` says so
+except ImportError:  # a Python without it: `zipfile` reports it
     LZMAError = zlib.error  # type: ignore[misc, assignment]
 
 Array = NDArray[Any]
 
 MAX_NAME = 60_000
-"""Bytes of the name of an array that an archive has room for."""
+"""Greatest length in bytes of the name of an array in an archive."""
 MAX_ARRAYS = 10_000
 
 _LAST_LETTER, _PAIRS = 0x10FFFF, (0xD800, 0xDFFF)
@@ -107,8 +107,8 @@ class Member:
     """One array of an open archive: read as a whole, or from its start on, so many samples at a time.
 
     Attributes:
-        length: samples: of the last axis of (samples,) and (1, samples), else of the first one; -1 where
-            samples do not lie one after the other.
+        length: number of samples: of the last axis of (samples,) and (1, samples), else of the first one; -1
+            where samples are not contiguous.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
@@ -127,7 +127,7 @@ class Member:
         return values if self._width == 1 else values.reshape(count, *self._shape[1:])
 
     def whole(self) -> Array:
-        """All of it, in its own shape."""
+        """The whole array, in its own shape."""
         values = self._values(math.prod(self._shape)).copy()
         return values.reshape(self._shape, order="F" if self._fortran else "C")
 

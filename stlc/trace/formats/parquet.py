@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 MAX_COMPONENTS = 1000
 MAX_LETTERS = 64
-"""Longer texts are cut; no member of an enum has so long a name."""
+"""Longer texts are cut; names of enum members are shorter."""
 
 
 def read(path: Path) -> Recording:
@@ -143,7 +143,7 @@ def _even(lists: Any, size: int) -> bool:
 
 
 def _words(values: Any) -> NDArray[np.str_]:
-    """Texts, stored once each until they are laid out."""
+    """Texts, deduplicated before they are laid out."""
     encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
     array = encoded.unify_dictionaries().combine_chunks()
     texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
@@ -151,7 +151,7 @@ def _words(values: Any) -> NDArray[np.str_]:
 
 
 def _floats(values: Any) -> Floats:
-    """Numbers; durations in seconds, points in time in seconds since the first."""
+    """Numbers; durations in seconds, time stamps in seconds since the first."""
     arrow = needed("pyarrow")
     kind = values.type
     if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):

@@ -1,4 +1,4 @@
-"""The formats of trace files: one table, and what their readers share.
+"""Formats of trace files: one table, and helpers shared by their readers.
 
 A format is a module of this package and a line of `FORMATS`. The module holds
 
@@ -7,7 +7,7 @@ A format is a module of this package and a line of `FORMATS`. The module holds
 - if it is `chunked`: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in chunks), and
   `chunks(path, samples) -> Iterator[Recording]`.
 
-It imports libraries that not everybody has with `needed`.
+It imports optional libraries with `needed`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 4_000_000_000
 _ROOM = 500_000_000
 _RATIO = 200
-"""A packed file may unpack to `_ROOM` bytes, or to this multiple of its size; sensor records need a tenth."""
+"""A compressed file may expand to `_ROOM` bytes, or this multiple of its size; sensor logs need a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Format:
     Attributes:
         module: of this package.
         suffixes: of its files, in lower case; files are written with the first.
-        extra: of the package `stlc`, that installs what the format needs.
+        extra: of the package `stlc`, that installs the packages of the format.
         packages: modules of that extra.
         writes: traces can be written.
         chunked: files can be read a number of samples at a time.
@@ -73,7 +73,7 @@ _PACKAGES = {"google": "protobuf"}
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file, by its suffix; what is not known is taken for the first."""
+    """The format of a file, by its suffix; by default the first."""
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
@@ -94,7 +94,7 @@ def read_recording(path: Path) -> Recording:
     return found
 
 
-# ----------------------------------------------------------------------- what readers share
+# ------------------------------------------------------------------------ shared by readers
 
 
 def needed(module: str) -> Any:
@@ -121,7 +121,7 @@ def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
 
 @contextmanager
 def opened(path: Path) -> Iterator[None]:
-    """Errors of the system in opening a file, as UsageError (U102)."""
+    """Convert system errors in opening a file to UsageError (U102)."""
     try:
         yield
     except OSError as error:
@@ -131,7 +131,7 @@ def opened(path: Path) -> Iterator[None]:
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """Errors of a library in reading a file, as TraceError (E603)."""
+    """Convert library errors in reading a file to TraceError (E603)."""
     try:
         yield
     except StlcError:
@@ -143,5 +143,5 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def room_for(path: Path) -> int:
-    """Bytes that a packed file may unpack to."""
+    """Limit in bytes on the unpacked size of a packed file."""
     return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))

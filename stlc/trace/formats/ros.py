@@ -180,7 +180,7 @@ class _Cursor:
         if layout.least > len(self.data) - self.at:
             raise DamageError("a message that is shorter than its definition")
         if not layout.fields:
-            self.at += layout.least  # what has no fields takes a byte in CDR
+            self.at += layout.least  # a message without fields takes a byte in CDR
         for each in layout.fields:
             inner = f"{name}.{each.name}" if name else each.name
             found = self.field(inner, each, depth)

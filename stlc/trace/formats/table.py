@@ -1,4 +1,4 @@
-"""Recordings from tables with one line a sample; lines may belong to several traces."""
+"""Recordings from tables with one line per sample; lines may belong to several traces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stlc.units import parse_unit
 Array = NDArray[Any]
 
 GROUPS = ("trace", "agent")
-"""Columns of these names say to which of several traces a line belongs."""
+"""Names of columns that give the trace of each line."""
 
 _SPELLINGS = {
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
@@ -50,7 +50,7 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
     """A recording with one clock.
 
     Raises:
-        TraceError: E605, traces that differ in length or in their times, or a unit that is none.
+        TraceError: E605, traces that differ in length or in their times, or an invalid unit.
     """
     group = next((name for name in GROUPS if name in table.columns), None)
     columns = {name: values for name, values in table.columns.items() if name != group}
@@ -77,13 +77,13 @@ def is_unit(text: str) -> bool:
 
 
 def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
-    """The times of a column in seconds. Raises TraceError (E605) for a unit that is no time."""
+    """The times of a column in seconds. Raises TraceError (E605) for a unit that is not a time."""
     scale = clock_scale(f"`{path}`", name, unit)
     return clock if scale == 1 or clock.dtype.kind == "U" else clock * scale
 
 
 def clock_scale(trace: str, name: str, unit: str) -> float:
-    """Seconds of one unit of a clock. Raises TraceError (E605) for a unit that is no time."""
+    """Seconds of one unit of a clock. Raises TraceError (E605) for a unit that is not a time."""
     text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
     try:
         time = parse_unit(text)
