@@ -1,1 +1,1 @@
-"""A trained controller taken away: as a torch program, as ONNX graphs, or as C."""
+"""Export of a trained controller: as a torch program, as ONNX graphs, or as C."""

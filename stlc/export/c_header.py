@@ -1,7 +1,7 @@
 """A controller as one C header: policy, model, monitor and the paper's backup policy; for C99 and C++11.
 
-The passes are those of the native kernel, which stands alone and calls its functions `roll` and `check`. In a
-header such names would meet those of the program that includes it, so every name gets a prefix.
+The passes are those of the native kernel, whose functions have short names such as `roll` and `check`. These
+could collide with names of the program that includes the header, so every name gets a prefix.
 """
 
 from __future__ import annotations
@@ -83,11 +83,11 @@ _CLOSING = """
 
 
 def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
-    """Files of a header with every name of theirs prefixed, and with nothing that C++11 does not know.
+    """Texts of a header's files with every name prefixed, and without constructs unknown to C++11.
 
     Args:
-        texts: name of a file -> its text; what one declares the others may use.
-        guard: the macro that keeps the header from being read twice, by an `#endif` in its last line.
+        texts: name of a file -> its text; names that one declares are prefixed in all.
+        guard: the include guard, a macro; it is named in an `#endif` in the last line of a text.
     """
     names = dict(found for text in texts.values() for found in _renamed(text))
     names |= {"restrict": "STLC_RESTRICT", guard: guard}
@@ -96,7 +96,7 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
 
 
 def _renamed(text: str) -> Iterator[tuple[str, str]]:
-    """What a text declares, and what it is called from now on."""
+    """The names that a text declares, with their new names."""
     for pattern in _DECLARED:
         yield from ((name, PREFIX + name) for name in pattern.findall(text) if not name.startswith(OWN))
     for name in _DEFINED.findall(text):
@@ -111,7 +111,7 @@ def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
 
 
 def _framed(text: str, guard: str) -> str:
-    """The file with the guard, between what its compiler is told before and after; others as they are."""
+    """The file with include guard and compiler directives around it; other files unchanged."""
     if guard not in text:
         return text
     body, end = text.replace(guard, guard + _OPENING, 1).rsplit("#endif", 1)
@@ -122,7 +122,7 @@ def _framed(text: str, guard: str) -> str:
 
 
 def weights(network: PlanNetwork) -> str:
-    """`centre` and `scale` of what is observed, and a `weight_0` (in, out) and a `bias_0` per layer."""
+    """`centre` and `scale` of the observation, and a `weight_0` (in, out) and a `bias_0` per layer."""
     lines = ["/* float32, row by row; generated */"]
     lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
     lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
@@ -136,7 +136,7 @@ def weights(network: PlanNetwork) -> str:
 
 
 def forward(network: PlanNetwork) -> list[str]:
-    """Statements that take `seen` (double) to `raw` (float), through the buffers `h0`, `h1`."""
+    """Statements that compute `raw` (float) from `seen` (double), through the buffers `h0`, `h1`."""
     layers = list(_layers(network))
     lines = [
         f"for (int i = 0; i < {layers[0].in_features}; ++i) h0[i] = ((float)seen[i] - centre[i]) / spread[i];"
@@ -152,7 +152,7 @@ def forward(network: PlanNetwork) -> list[str]:
 
 
 def widest(network: PlanNetwork) -> int:
-    """Numbers that a layer takes at most."""
+    """Greatest number of inputs of a layer."""
     return max(layer.in_features for layer in _layers(network))
 
 
@@ -165,7 +165,7 @@ def _row(values: Tensor) -> str:
 
 
 def _float(value: float) -> str:
-    """A float32 that C reads back bit for bit."""
+    """A float32 as C text that is read back bit for bit."""
     text = f"{value:.9g}"
     return f"{text}f" if any(mark in text for mark in ".en") else f"{text}.0f"
 
@@ -183,7 +183,7 @@ def observed(task: Task) -> list[str]:
 
 
 def later(task: Task) -> list[str]:
-    """Statements that fill `later` with what clocks, statuses and timers are a step after the state `x`."""
+    """Statements that fill `later` with clocks, statuses and timers one step after the state `x`."""
     numbers = [timer.update for timer in task.system.timers]
     return _assigned("later", numbers, {name: f"x[{i}]" for i, name in enumerate(task.names)})
 
@@ -211,7 +211,7 @@ def image_of_action(task: Task) -> list[str]:
 
 
 def squashed(task: Task) -> list[str]:
-    """Statements that fill `u` from what the network gives for one step, `raw`."""
+    """Statements that fill `u` from the network's output for one step, `raw`."""
     lines, at = [], 0
     for i, each in enumerate(task.system.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
@@ -249,7 +249,7 @@ def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
 
 
 def cost(task: Task) -> list[str]:
-    """Statements that add what a plan costs to `cost`, of lane `j` with robustness `rho`."""
+    """Statements that add the cost of a plan to `cost`, of lane `j` with robustness `rho`."""
     at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.names)}
     at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.names)}
     at |= {"k": "(double)k", "t": f"(k * {literal(task.dt)})", "sat": "1.0", "rho": "rho"}
@@ -278,7 +278,7 @@ def _mean(number: ir.Num, places: Mapping[str, str], count: int) -> list[str]:
 
 
 def _promise(promise: PendingGoal, task: Task, places: Mapping[str, str]) -> list[str]:
-    """What is lacked of gamma where a promise is open."""
+    """The shortfall from gamma where a goal is pending."""
     writer = NumberWriter(_columns(places))
     margin = writer.number(margin_of(promise.body))
     clock = places[task.promises.clock]
@@ -314,7 +314,7 @@ def header(task: Task, network: PlanNetwork) -> str:
     """The text of `stlc_controller.h`, which includes `stlc_weights.h`.
 
     Raises:
-        Untranslatable: the task holds something that has no C form.
+        Untranslatable: a part of the task has no C form.
     """
     motion = motion_of(task.system)
     judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
@@ -333,7 +333,7 @@ def main_of(task: Task) -> str:
 
 
 def makefile() -> str:
-    """How the example is built."""
+    """Makefile of the example."""
     return _template("Makefile.txt").substitute()
 
 
@@ -396,7 +396,7 @@ def _in_its_unit(text: str, column: Column) -> str:
 
 
 def _added(task: Task) -> dict[str, object]:
-    """What the specification adds to states: what it holds, how it begins and how it goes on."""
+    """The states that the specification adds: contents, initial values and updates."""
     system, first = task.system, len(task.system.decl.signature.names)
     measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]
     tables = [
@@ -419,7 +419,7 @@ def _added(task: Task) -> dict[str, object]:
 
 
 def _holds(timer: Timer) -> str:
-    """What a state holds that the specification adds, in words."""
+    """Description of a state that the specification adds."""
     match timer.kind:
         case "status":
             about = timer.about.removeprefix("open | true | false").strip()
@@ -441,7 +441,7 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
-    """Statements that lower `least` to the weighed robustness of some requirements."""
+    """Statements that lower `least` to the weighted robustness of some requirements."""
     names = [rule.name for rule in among]
     return [
         f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"

@@ -1,6 +1,6 @@
 """The graphs of a controller as ONNX: rollout, policy, verdicts, and the length of safe prefixes.
 
-The paper's backup policy and the plans that are kept stand between the graphs, in `stlc.runtime`.
+The paper's backup policy and the previous plans are handled between the graphs, in `stlc.runtime`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def rolled(step: Step, start: Mapping[str, Value], controls: Mapping[str, Value]
 
 
 class _Film:
-    """What is known so far: the states that move, and numbers at all steps or, in one row, at each."""
+    """Values computed so far: moving states, and numbers at all steps or, in one row, constant ones."""
 
     def __init__(
         self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
@@ -77,7 +77,7 @@ class _Film:
         self.now |= controls
 
     def run(self, stage: RolloutStage) -> None:
-        """A stage whose inputs are known."""
+        """Execute a stage whose inputs are known."""
         if stage.early:
             self.now.update(Program(stage.early)(self.now, ONNX))
         for state, source in stage.follows.items():
@@ -99,7 +99,7 @@ class _Film:
         return value.spread(self.steps, value.shape[1])
 
     def _loop(self, stage: RolloutStage) -> None:
-        """Step what feeds back into itself."""
+        """Execute a stage with feedback, step by step."""
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         outside = sorted(read - inside)
@@ -132,7 +132,7 @@ class _Film:
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
-    """Numbers that follow from columns, which broadcast against them.
+    """Numbers computed from columns, with which they broadcast.
 
     Raises:
         Untranslatable: one calls a function of Python.
@@ -148,7 +148,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
     """All plans of a network.
 
     Args:
-        task: that it was trained for.
+        task: for which it was trained.
         network: in float32, as it was trained.
         state: (1, batch) each.
 
@@ -156,7 +156,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
         (batch, plans, T, m) float64.
 
     Raises:
-        Untranslatable: what is observed or mirrored calls a function of Python.
+        Untranslatable: an observation or a mirror image calls a function of Python.
     """
     folded, swapped = _folded(task, network, state)
     raw = _layers(network, _observed(task, folded))
@@ -173,7 +173,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
 def _folded(
     task: Task, network: PlanNetwork, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
-    """States on the side of the mirror that the network knows, and which of them are images."""
+    """States reflected to the side of the mirror that the network was trained on, and which are images."""
     if network.mirror is None:
         return state, None
     names = set(task.names)
@@ -186,7 +186,7 @@ def _folded(
 
 
 def _observed(task: Task, state: Mapping[str, Value]) -> Value:
-    """What the network sees, (batch, k) float32."""
+    """Observation of the network, (batch, k) float32."""
     system = task.system
     numbers: list[ir.Num] = [*system.decl.policy.observe, *(ir.Signal(each.name) for each in system.added)]
     if not system.decl.policy.observe:
@@ -214,7 +214,7 @@ def _weights(like: Value, tensor: Tensor) -> Value:
 
 
 def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
-    """One control in physical units, from one column of the network or two."""
+    """One control in physical units, from one or two columns of the network's output."""
     first = next(columns)
     match control.squash:
         case "tanh":
@@ -246,12 +246,12 @@ States: TypeAlias = Mapping[str, Value]
 
 @dataclass(frozen=True, slots=True)
 class Verdicts:
-    """What became of a batch of plans.
+    """Verdicts on a batch of plans.
 
     Attributes:
-        rho: (1, batch), -inf where a plan or what follows from it is no number.
-        safe: the same of phi_safe.
-        each: the same of every requirement, in order.
+        rho: (1, batch), -inf where a plan or a value computed from it is not a number.
+        safe: robustness of phi_safe, likewise.
+        each: robustness of every requirement, in order, likewise.
         cost: (1, batch).
         states: (T + 1, batch) each.
     """
@@ -264,12 +264,12 @@ class Verdicts:
 
 
 def columns_of(state: Value, names: Sequence[str]) -> dict[str, Value]:
-    """(batch, n) -> (1, batch) each."""
+    """Split (batch, n) into columns (1, batch)."""
     return dict(zip(names, state.T.rows(), strict=True))
 
 
 def inputs_of(plans: Value, task: Task) -> dict[str, Value]:
-    """(batch, T, m) -> (T, batch) each."""
+    """Split (batch, T, m) into columns (T, batch)."""
     rows = plans.transposed(2, 1, 0).rows()
     return {
         name: row.reshaped(task.horizon, BATCH)
@@ -281,7 +281,7 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
     """`Task.judge` and `Task.cost` of plans (batch, T, m) from states (1, batch) each.
 
     Raises:
-        Untranslatable: the task holds something that has no form as a graph.
+        Untranslatable: a part of the task has no ONNX form.
     """
     like = next(iter(start.values()))
     controls = inputs_of(plans, task)
@@ -297,7 +297,7 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
 
 
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
-    """The weighed minimum, (1, batch); +inf without rules."""
+    """The weighted minimum, (1, batch); +inf without rules."""
     if not rules:
         return like.sheet.constant([[math.inf]]).spread(1, BATCH, like=like)
     weighed = [
@@ -309,7 +309,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
 
 
 def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
-    """Where a plan holds what is no finite number, or something that follows from it is NaN, (1, batch)."""
+    """Whether a plan holds a number that is not finite, or a value computed from it is NaN, (1, batch)."""
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
@@ -371,7 +371,7 @@ def _mean(number: ir.Num, env: States, rows: int) -> Value:
 
 
 def _lacking(task: Task, spared: Value) -> Value:
-    """What something lacks of gamma."""
+    """The shortfall of a value from gamma."""
     gamma = task.system.decl.objective.gamma
     lack: Value = ONNX_OPS.clamp(gamma - spared, 0.0, gamma)
     return lack
@@ -434,13 +434,13 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 
 
 def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
-    """`state` (batch, n) -> the best of the policy's plans and its verdict, all float64.
+    """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
 
     `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), `requirements` (batch, R); where the
-    specification adds states, `added` (batch, k), what they are one step later.
+    specification adds states, `added` (batch, k), their values one step later.
 
     Raises:
-        Untranslatable: the task holds something that has no form as a graph.
+        Untranslatable: a part of the task has no ONNX form.
     """
     state = Sheet().input("state", (BATCH, len(task.names)))
     plans = proposed(task, network, columns_of(state, task.names))
@@ -449,14 +449,14 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
-    """`state` and `begun`, what is left of a plan, -> the plan to follow, as `Guard` chooses, in one pass.
+    """Graph from `state` and `begun`, the rest of the previous plan, to the plan that `Guard` chooses.
 
-    The outputs of `deciding` are those of `begun` where it is gone on with, which `kept` (batch,) says: it
-    satisfies the specification, and the policy's plan ranks no higher, or it keeps a promise better and
-    better. `policy_plan` and `policy_rho` are what the policy planned.
+    The outputs are those of `deciding`, for `begun` where `kept` (batch,) says that it is continued: it
+    satisfies the specification, and either the policy's plan ranks no higher, or `begun` increases the
+    margin of a goal that is being met. `policy_plan` and `policy_rho` are those of the policy.
 
     Raises:
-        Untranslatable: the task holds something that has no form as a graph.
+        Untranslatable: a part of the task has no ONNX form.
     """
     sheet = Sheet()
     state = sheet.input("state", (BATCH, len(task.names)))
@@ -491,7 +491,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
 
 
 def _best(score: Value) -> Value:
-    """Which plan ranks first, (batch, 1)."""
+    """Index of the plan that ranks first, (batch, 1)."""
     (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
     return best
 
@@ -531,12 +531,12 @@ def _added(task: Task, state: Value) -> dict[str, Value]:
 
 
 def judging(task: Task) -> dict[str, Value]:
-    """`state` (batch, n) and `plan` (batch, T, m) -> verdicts, and the states under the plan.
+    """Graph from `state` (batch, n) and `plan` (batch, T, m) to verdicts, and the states under the plan.
 
     `rho`, `safe` and `cost` (batch,), `requirements` (batch, R), `states` (batch, T + 1, n).
 
     Raises:
-        Untranslatable: the task holds something that has no form as a graph.
+        Untranslatable: a part of the task has no ONNX form.
     """
     start, plans = _asked(task)
     found = judged(task, start, plans)
@@ -552,10 +552,10 @@ def judging(task: Task) -> dict[str, Value]:
 
 
 def falling(task: Task) -> dict[str, Value]:
-    """`state` and `plan` as in `judging` -> `falls` (batch, T + 1): phi_safe's robustness on every prefix.
+    """Graph from `state` and `plan` to `falls` (batch, T + 1): phi_safe's robustness on every prefix.
 
     Raises:
-        Untranslatable: the task holds something that has no form as a graph.
+        Untranslatable: a part of the task has no ONNX form.
     """
     start, plans = _asked(task)
     return {"falls": falls(task, start, plans).T}

@@ -1,4 +1,4 @@
-"""Graphs as files of ONNX, and the facts of a controller beside them."""
+"""ONNX files of a controller, and the facts stored beside them."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 
 OPSET = 18
-"""The functions of ONNX 1.13 (2022), which every runtime since knows."""
+"""The operator set of ONNX 1.13 (2022), which all later runtimes support."""
 IR_VERSION = 8
-"""The file format of that time."""
+"""The file format version of that release."""
 
 
 def require_onnx() -> None:
@@ -53,7 +53,7 @@ def require_onnx() -> None:
 
 
 def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) -> bytes:
-    """The file of a graph; its inputs are those of the sheet.
+    """The ONNX file of a graph; its inputs are those of its values.
 
     Args:
         name: of the graph.
@@ -77,7 +77,7 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 
 
 def _graph(sheet: Sheet, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
-    """The part of a sheet that outputs depend on, under the names that they are shown by."""
+    """The nodes on which the outputs depend, under their public names."""
     from onnx import helper
 
     shown = list(outputs)
@@ -130,22 +130,22 @@ def _declared(value: Value, name: str) -> ValueInfoProto:
 
 
 TIMED = 200
-"""Decisions that are timed."""
+"""Number of decisions that are timed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Milliseconds that a decision of one agent takes on one thread: the policy's plan, and the begun one."""
+    """Milliseconds per decision of one agent on one thread: of the policy, and with a previous plan."""
 
     median: float
     p99: float
 
 
 def write_onnx(run: Run, folder: Path) -> None:
-    """`decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and `fall.onnx` where there is danger.
+    """Write `decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and with phi_safe `fall.onnx`.
 
     Raises:
-        UsageError: U101, the task holds something that has no form as a graph.
+        UsageError: U101, a part of the task has no ONNX form.
         MissingError: R301, `onnx` or `onnxruntime` is not installed.
     """
     require_onnx()
@@ -171,7 +171,7 @@ def write_onnx(run: Run, folder: Path) -> None:
 
 
 def _facts(run: Run) -> dict[str, object]:
-    """Names, units, ranges, hashes, and what the backup policy tries."""
+    """Names, units, ranges, hashes, and the grid of the backup policy."""
     task, grid = run.task, backup.grid_of(run.task)
     feedback = task.system.decl.feedback
     return {
@@ -209,7 +209,7 @@ def _states(task: Task) -> list[Quantity]:
 
 
 def timed(task: Task, folder: Path) -> Latency:
-    """How long the runtime takes in random states, the first ones apart."""
+    """Decision times of the runtime in random states, after a warm-up."""
     controller = Controller.load(folder)
     taken = []
     for state in task.sample(TIMED, seed=8, dtype=torch.float64).numpy():

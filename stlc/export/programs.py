@@ -1,7 +1,8 @@
-"""A controller and the paper's backup policy as modules that can be recorded for any number of agents.
+"""A controller and the paper's backup policy as modules that can be exported for any number of agents.
 
-`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. A recorded
-program has no such turns: it tries every T0, costs what its longest prefixes cost, and gives the same plans.
+`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. An exported
+program has no such branches: it tries every T0, costs what its longest prefixes cost, and gives the same
+plans.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Deciding(nn.Module):
-    """States (B, n) -> the plan to follow (B, T, m), rho and safe (B,), requirements (B, R); all float64."""
+    """Module from states (B, n) to plan (B, T, m), rho and safe (B,), requirements (B, R); all float64."""
 
     def __init__(self, task: Task, network: PlanNetwork) -> None:
         super().__init__()
@@ -56,7 +57,7 @@ class Deciding(nn.Module):
 
 
 def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
-    """`Task.judge` in torch's operations alone, which can be recorded."""
+    """`Task.judge` in torch operations only, which can be exported."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
     names = [rule.name for rule in task.rules]
@@ -69,7 +70,7 @@ def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
 
 @contextmanager
 def unmoved() -> Iterator[None]:
-    """Within it, what torch's own export says of torch's own future is not repeated."""
+    """Suppress the deprecation warnings that torch's export raises about torch itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -77,11 +78,11 @@ def unmoved() -> Iterator[None]:
 
 
 def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """The controller as a program for any number of agents; states are float64."""
+    """The controller as an exported program for any number of agents; states are float64."""
     module = Deciding(task, network).eval()
     x = task.sample(3, seed=0, dtype=torch.float64)
     with torch.no_grad(), unmoved():
-        module(x)  # constants that are remembered are made here, not while recording
+        module(x)  # cached constants are created here, not while exporting
         batch = torch.export.Dim("batch", min=1)
         return torch.export.export(module, (x,), strict=False, dynamic_shapes=({0: batch},))
 
@@ -90,14 +91,14 @@ def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
 
 
 AT_ONCE = 32_768
-"""Plans of one state that are judged at once."""
+"""Greatest number of plans of one state evaluated at once."""
 
 _NOTHING: tuple[Tensor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans of one T0: (states, choices, …); `falls` (states, choices, T+1) where the last T0 asks for it."""
+    """Plans of one T0: (states, choices, …); `falls` (states, choices, T+1) only for the last T0."""
 
     plans: Tensor
     rho: Tensor
@@ -108,7 +109,7 @@ class _Tried:
 
 
 class Guarding(nn.Module):
-    """States (B, n) and the policy's plans (B, T, m) -> what the backup policy does instead; float64.
+    """Module from states (B, n) and the policy's plans (B, T, m) to the backup policy's plans; float64.
 
     The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1 where phi or
     phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as
@@ -124,7 +125,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose as the stages of the paper's guard do where no plan was followed before."""
+        """Choose as the stages of the paper's guard do without a previous plan."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
@@ -146,7 +147,7 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans of one T0, judged; the first begins as the policy's own plan does."""
+        """All plans of one T0 with verdicts; the first begins as the policy's own plan does."""
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
         pieces = [self._finished(x, some, falls=falls) for some in torch.split(heads, size, 1)]
@@ -155,7 +156,7 @@ class Guarding(nn.Module):
         return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
-        """Plans that begin with `heads` (B, C, L, m) and go on as the policy plans; their verdicts."""
+        """Plans that begin with `heads` (B, C, L, m) and continue with the policy; their verdicts."""
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         head = heads.reshape(-1, *heads.shape[2:])
@@ -171,7 +172,7 @@ class Guarding(nn.Module):
 
 
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """The plan with the longest safe prefix; of several the most robust, the latest to fail."""
+    """The plan with the longest safe prefix; ties go to the most robust, the latest to fail."""
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)
     longest = samples == samples.amax(1, keepdim=True)
@@ -187,7 +188,7 @@ def _picked(tried: _Tried, pick: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """What a shorter prefix decided, and elsewhere what this one found."""
+    """The result of a shorter prefix where there is one, elsewhere the present one."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)
@@ -195,12 +196,12 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
 
 
 def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """The backup policy as a program for any number of states; they and the plans are float64."""
+    """The backup policy as an exported program for any number of states; they and the plans are float64."""
     module = Guarding(task, network).eval()
     x = task.sample(2, seed=0, dtype=torch.float64)
     plan = torch.zeros(2, task.horizon, len(task.system.controls), dtype=torch.float64)
     with torch.no_grad(), unmoved():
-        module(x, plan)  # constants that are remembered are made here, not while recording
+        module(x, plan)  # cached constants are created here, not while exporting
         batch = torch.export.Dim("batch", min=1)
         shapes = ({0: batch}, {0: batch})
         return torch.export.export(module, (x, plan), strict=False, dynamic_shapes=shapes)

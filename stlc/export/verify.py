@@ -1,4 +1,4 @@
-"""What was exported against the run that it came from, on random states."""
+"""Verification of an export against its run, on random states."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from stlc.runtime.graphs import Graphs, Judged
 
 PLAN = 1e-4
-"""How far a control may be from the original's, in parts of its range: the network is float32."""
+"""Greatest distance of a control from the original's, as a share of its range: the network is float32."""
 RHO = 1e-6
-"""How far a verdict may be from the exact monitor's on the same plan."""
+"""Greatest distance of a robustness from the exact monitor's on the same plan."""
 BUILT = ("-std=c99", "-O1", "-fno-math-errno")
 
 Answer: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -35,11 +35,11 @@ Answer: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well an export agrees with its run.
+    """Agreement of an export with its run.
 
     Attributes:
-        states: random states that were tried.
-        plan: largest distance of a control, in parts of its range, where the same plan was chosen.
+        states: number of random states.
+        plan: largest distance of a control, as a share of its range, where the same plan was chosen.
         rho: largest distance of a robustness from the exact monitor's.
         ties: states in which another plan of the same rank was chosen.
     """
@@ -53,7 +53,7 @@ class Agreement:
 def agreement(
     policy: BestOfKPolicy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7
 ) -> Agreement:
-    """Ask both in random states.
+    """Compare both in random states.
 
     Args:
         policy: the original.
@@ -70,7 +70,7 @@ def agreement(
 
 
 def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer) -> Agreement:
-    """An answer in states (B, n) in which the original follows `plan` (B, T, m)."""
+    """Agreement of an answer in states (B, n) in which the original chooses `plan` (B, T, m)."""
     mine, rho, safe, each = answer
     judged = task.judge(x, plan)
     width = (task.system.control_high - task.system.control_low).double()
@@ -115,7 +115,7 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
 
 
 def backup_agreement(policy: BestOfKPolicy, path: Path, *, states: int, seed: int = 11) -> Agreement:
-    """Ask the backup policy and the program in a file, in random states, whether they need it or not.
+    """Compare the backup policy and the program in a file in random states, whether they need it or not.
 
     Raises:
         RunError: R105, they disagree.
@@ -144,7 +144,7 @@ def _answer(judged: Judged) -> Answer:
 
 
 def kept_agreement(policy: BestOfKPolicy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Ask both a step later, with the plans that were begun.
+    """Compare both one step later, with the previous plans.
 
     Raises:
         RunError: R105, they disagree.
@@ -188,8 +188,8 @@ def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> 
     return off
 
 
-class Unchecked(Exception):  # noqa: N818 - an answer, caught by who asks
-    """Why an export was not checked; `why` follows "not checked: "."""
+class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
+    """An export could not be verified; `why` follows "not checked: "."""
 
     def __init__(self, why: str) -> None:
         super().__init__(why)
@@ -200,7 +200,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
     """The example program of a folder, compiled to `built`.
 
     Raises:
-        Unchecked: there is no compiler that works.
+        Unchecked: there is no working compiler.
         RunError: R105, it cannot be compiled.
     """
     using = toolchain.compiler()
@@ -228,7 +228,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
-    """What the example program prints for states: source, t0, rho, safe, requirements, plan.
+    """Output of the example program for states: source, t0, rho, safe, requirements, plan.
 
     Raises:
         RunError: R105, it fails or does not end.

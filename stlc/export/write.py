@@ -1,4 +1,4 @@
-"""A run -> a folder that can be taken away; what is in it has been checked against the run."""
+"""Export of a run to a self-contained folder, verified against the run."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ if TYPE_CHECKING:
 Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)
 STATES = 64
-"""Random states that an export is checked in."""
+"""Number of random states for the verification of an export."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written.
+    """Result of an export.
 
     Attributes:
         folder: where.
         files: names in it.
-        agreement: with the run; None where there is no compiler to check with.
+        agreement: with the run; None where there is no compiler to verify it with.
         latency: of a decision in the Python runtime, where it was measured.
-        unchecked: why there is no agreement.
+        unchecked: reason why there is no agreement.
     """
 
     folder: Path
@@ -61,7 +61,7 @@ class Exported:
 
 
 def target_of(word: str) -> Target:
-    """The target that is called `word`. Raises UsageError (U101) where there is none."""
+    """The target of name `word`. Raises UsageError (U101) for an unknown name."""
     for target in TARGETS:
         if target == word:
             return target
@@ -75,11 +75,11 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
 
     Args:
         run: with a checkpoint.
-        target: for whom.
+        target: the form of the export.
         folder: where to; files of the same names are replaced.
 
     Raises:
-        RunError: R105, the export does not do what the run does; nothing is written.
+        RunError: R105, the export disagrees with the run; nothing is written.
         MissingError: R301, the target needs packages that are not installed.
         UsageError: U101, the task has no form for the target.
     """
@@ -101,7 +101,7 @@ Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
 def _torch(run: Run, folder: Path) -> Checked:
-    """`decide.pt2`, `backup.pt2`, and `controller.json` that says what goes in and comes out."""
+    """Write `decide.pt2`, `backup.pt2`, and `controller.json` with their inputs and outputs."""
     path, backup = folder / "decide.pt2", folder / "backup.pt2"
     torch.export.save(recorded(run.task, run.network), path)
     torch.export.save(recorded_guard(run.task, run.network), backup)
@@ -113,7 +113,7 @@ def _torch(run: Run, folder: Path) -> Checked:
 
 
 def _onnx(run: Run, folder: Path) -> Checked:
-    """The graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
+    """Write the graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.network_policy, by_onnx(graphs), states=STATES)
@@ -124,7 +124,7 @@ def _onnx(run: Run, folder: Path) -> Checked:
 
 
 def _c(run: Run, folder: Path) -> Checked:
-    """A header, its weights, an example program and its Makefile."""
+    """Write a header, its weights, an example program and its Makefile."""
     try:
         text = c_header.header(run.task, run.network)
     except Untranslatable as error:
@@ -146,7 +146,7 @@ _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c
 
 
 def _facts(run: Run) -> dict[str, object]:
-    """Names and sizes of what goes in and comes out."""
+    """Names and sizes of inputs and outputs."""
     task = run.task
     feedback = task.system.decl.feedback
     return {
