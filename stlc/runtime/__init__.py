@@ -1,4 +1,4 @@
-"""An exported controller at work, with NumPy and onnxruntime alone.
+"""Runtime of an exported controller, with NumPy and onnxruntime alone.
 
 from stlc.runtime import Controller
 

@@ -1,4 +1,4 @@
-"""The paper's backup policy over the graphs of a controller, as `guard.stages` are over torch."""
+"""The paper's backup policy over the graphs of a controller; the counterpart of `guard.stages` in torch."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from stlc.runtime.facts import Quantity
 from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
 
 POLICY, BACKUP, SAFEST = range(3)
-"""Who decided: the policy, the backup policy, or the longest safe prefix."""
+"""Source of a plan: the policy, the backup policy, or the longest safe prefix."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One plan for a state: `source` says by which rule, `t0` after how many actions of the grid."""
+    """One plan for a state: `source` is the rule that chose it, `t0` the length of its prefix."""
 
     judged: Judged
     source: int
@@ -26,15 +26,15 @@ class Found:
 
 
 def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
-    """A better plan for a state whose own one was found wanting.
+    """A better plan for a state whose policy plan is violated.
 
-    T0 grows until a plan satisfies phi, or else phi_safe; where none does the longest safe prefix decides.
+    T0 grows until a plan satisfies phi, or else phi_safe; if none does, the longest safe prefix decides.
 
     Args:
         graphs: of the controller.
         x: (n,).
-        plan: (T, m), what the policy would do; entries that are not finite are replaced.
-        rest: (T, m), what is left of the plan that was followed until now.
+        plan: (T, m), of the policy; entries that are not finite are replaced.
+        rest: (T, m), the rest of the previous plan.
 
     Returns:
         The plan, in one row.
@@ -57,7 +57,7 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 
 
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged:
-    """All plans of one T0; the first begins as the policy's own plan does."""
+    """All plans of one T0 with verdicts; the first begins as the policy's own plan does."""
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))
     parts = []
@@ -74,7 +74,7 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
 
 
 def _safest(graphs: Graphs, x: Numbers, candidates: Judged) -> int:
-    """The plan with the longest safe prefix; of several the most robust, the latest to fail."""
+    """The plan with the longest safe prefix; ties go to the most robust, the latest to fail."""
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(
         [
@@ -88,7 +88,7 @@ def _safest(graphs: Graphs, x: Numbers, candidates: Judged) -> int:
 
 
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """The first allowed choice that is best by the keys in order."""
+    """The allowed choice that is best by the keys in order."""
     for key in keys:
         value = np.where(allowed & ~np.isnan(key), key, -np.inf)
         allowed = allowed & (value >= value.max() - TOLERANCE)
@@ -96,6 +96,6 @@ def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
 
 
 def finite(plans: Numbers, controls: Sequence[Quantity]) -> Numbers:
-    """Plans (…, m) with every entry that is no number replaced by the control's value nearest to 0."""
+    """Plans (…, m) with every entry that is not finite replaced by the control's value nearest to 0."""
     rest = [min(max(0.0, each.low or 0.0), each.high or 0.0) for each in controls]
     return np.where(np.isfinite(plans), plans, rest)

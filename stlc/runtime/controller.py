@@ -1,4 +1,4 @@
-"""One decision after the other, as `stlc simulate` takes them, without torch."""
+"""Closed-loop decisions of an exported controller, as in `stlc simulate`, without torch."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ KEPT = "kept"
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What to do now, and why: of one agent, or of a batch with an axis of agents in front.
+    """The decision for one agent, or for a batch with a leading axis of agents.
 
     Attributes:
         control: (m,), physical units.
-        rule: "policy", "kept" (a plan that was begun is gone on with), "backup" or "safest".
+        rule: "policy", "kept" (the previous plan is continued), "backup" or "safest".
         plan: (T, m) that the control begins.
         rho: robustness of the plan; satisfied from -1e-6 on.
-        safe: the same of the safety requirements alone.
-        robustness: the same of each requirement, by name.
-        source: who made the plan: `rule`, but for a kept one who made it when it was new.
+        safe: robustness of the safety requirements alone.
+        robustness: robustness of each requirement, by name.
+        source: origin of the plan: `rule`, or for a kept one its `source` when it was new.
         t0: length of the backup's prefix; 0 for the policy's own plan.
-        policy_rho: robustness of what the policy planned; -inf where that is no number.
+        policy_rho: robustness of the policy's plan; -inf where that is not a number.
     """
 
     control: Numbers
@@ -50,7 +50,7 @@ class Decision:
 
 @dataclass(slots=True)
 class _Followed:
-    """The plans that are followed: verdicts, who made them, and which of them were begun before."""
+    """The chosen plans: verdicts, sources, and which of them are previous plans."""
 
     judged: Judged
     source: NDArray[np.int64]
@@ -58,7 +58,7 @@ class _Followed:
     kept: NDArray[np.bool_]
 
     def put(self, row: int, found: Found) -> None:
-        """The backup's plan for one agent in place of its own."""
+        """Replace the plan of one agent by the backup's plan."""
         for name in ("plan", "rho", "safe", "cost", "each"):
             getattr(self.judged, name)[row] = getattr(found.judged, name)[0]
         self.source[row], self.t0[row], self.kept[row] = found.source, found.t0, False
@@ -67,11 +67,11 @@ class _Followed:
 class Controller:
     """Policy, model, monitor and backup policy of a run, exported with `stlc export RUN --to onnx`.
 
-    It remembers the plans that it began, and the states that the specification adds: `reset` forgets them.
+    It stores the previous plans, and the states that the specification adds: `reset` clears both.
 
     Attributes:
         facts: names, units, ranges, hashes.
-        guard: "paper" calls the paper's backup policy where a plan is found violated; "none" only says so.
+        guard: "paper" calls the paper's backup policy where a plan is violated; "none" only reports it.
     """
 
     def __init__(
@@ -102,13 +102,13 @@ class Controller:
         parameters: Mapping[str, float] | None = None,
         threads: int = 1,
     ) -> Controller:
-        """A controller from its folder, or a file in it.
+        """Load a controller from its folder, or a file in it.
 
         Args:
-            where: what `stlc export RUN --to onnx` wrote.
+            where: output of `stlc export RUN --to onnx`.
             guard: "paper" or "none".
             parameters: values of the specification's parameters, where states come without them.
-            threads: that one decision may use.
+            threads: limit for one decision.
 
         Raises:
             UsageError: U102, there is nothing; U101, there is no such guard.
@@ -128,24 +128,24 @@ class Controller:
         return tuple(each.name for each in self.facts.controls)
 
     def reset(self) -> None:
-        """Forget the plans that were begun, and begin the mission anew."""
+        """Forget the previous plans, and restart the mission."""
         self._begun = self._added = None
 
     def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> Decision:
-        """Decide.
+        """Return the decision for a state.
 
         Args:
             state: (n,), or (agents, n) for a batch, or columns by name; in the units of `facts`. Ranges
-                of states are nominal: beyond them the monitor judges as anywhere.
-            elapsed: steps since the decision before.
+                of states are nominal: the monitor evaluates states beyond them, too.
+            elapsed: steps since the previous decision.
 
         Returns:
-            The decision. A plan that was begun and still satisfies the specification is gone on with where
-            the new one is no better.
+            The decision. A previous plan that still satisfies the specification is continued unless the new
+            one is better.
 
         Raises:
-            RunError: R107, the state does not fit or is no number; R402, without a guard, the policy's plan
-                is no number.
+            RunError: R107, the state does not fit or is not a number; R402, without a guard, the policy's
+                plan is not a number.
         """
         x, single = self._read(state, elapsed)
         if self._begun is not None and len(self._begun.source) != len(x):
@@ -172,7 +172,7 @@ class Controller:
     # ---------------------------------------------------------------------- states
 
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
-        """(agents, n), and whether it is one agent."""
+        """The states (agents, n), and whether it is one agent."""
         if elapsed < 0:
             raise _misfit(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
         named = self._named(state) if isinstance(state, Mapping) else None
@@ -206,7 +206,7 @@ class Controller:
         return [state[name] for name in names]
 
     def _remembered(self, agents: int, elapsed: int) -> Numbers:
-        """What the specification adds to states: as the model said, or as at the start of a mission."""
+        """States that the specification adds: as predicted by the model, or as at the start of a mission."""
         if self._added is not None:
             if elapsed != 1 or len(self._added) != agents:
                 raise _misfit("timers follow from every step", "give them as the last columns of the state")
@@ -224,7 +224,7 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_Followed, Mapping[str, Numbers]]:
-        """The policy's plans, or what is left of those that were begun, and what the graph says besides."""
+        """The policy's plans, or the rest of the previous ones, and the graph's other outputs."""
         before = self._begun
         if before is None:
             judged, said = self._graphs.decided(x)
@@ -259,7 +259,7 @@ class Controller:
 
 
 def _later(plans: Numbers, steps: int) -> Numbers:
-    """What is left of plans after so many steps; their last actions are held on."""
+    """The rest of plans after so many steps, extended by their last actions."""
     last = plans.shape[1] - 1
     return np.ascontiguousarray(plans[:, np.minimum(np.arange(last + 1) + steps, last)])
 

@@ -1,4 +1,4 @@
-"""What an exported controller says of itself: `controller.json`."""
+"""Description of an exported controller: `controller.json`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Quantity:
         low: lower end of its range; None where it has none. Those of states are nominal.
         high: upper end.
         added: "parameter" or "timer" where the specification adds this state, else empty.
-        initial: of a timer, at the start of a mission.
+        initial: value of a timer at the start of a mission.
     """
 
     name: str
@@ -44,10 +44,10 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """The law beneath the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+    """Feedback law around the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
     Attributes:
-        gain: K, (m, n), without what the specification adds to states.
+        gain: K, (m, n), without states that the specification adds.
         state: x0, (n,).
         control: u0, (m,).
         low: lower ends of the actuators' ranges, (m,).
@@ -63,7 +63,7 @@ class Feedback:
     authority: Numbers
 
     def __call__(self, x: Numbers, planned: Numbers) -> Numbers:
-        """What actuators get: (rows, n), (rows, m) -> (rows, m)."""
+        """Actuator commands: (rows, n), (rows, m) -> (rows, m)."""
         back = (self.state - x[:, : len(self.state)]) @ self.gain.T
         total = self.control + planned + np.clip(back, -self.authority, self.authority)
         return np.clip(total, self.low, self.high)
@@ -71,19 +71,19 @@ class Feedback:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What a controller is.
+    """Description of a controller.
 
     Attributes:
         spec: name and hash of the specification.
-        system: the same of the system.
-        states: in order, what the specification adds last.
+        system: name and hash of the system.
+        states: in order, those that the specification adds last.
         controls: in order.
         requirements: names, in order.
-        dt: seconds of a step.
-        horizon: steps of a plan.
+        dt: seconds per step.
+        horizon: steps per plan.
         grid: of the backup policy.
         graphs: name of a file -> its bytes.
-        feedback: beneath the plans; None where actuators get what is planned.
+        feedback: around the plans; None where actuators get the planned controls.
     """
 
     spec: Mapping[str, str]
@@ -104,7 +104,7 @@ class Facts:
 
 
 def read_facts(where: Path | str) -> Facts:
-    """Read a controller.
+    """Read the description of a controller.
 
     Args:
         where: its folder, or a file in it.

@@ -18,12 +18,12 @@ Numbers: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Plans and what became of them, a row each.
+    """Plans and their verdicts, a row each.
 
     Attributes:
         plan: (rows, T, m), physical units.
-        rho: robustness of the specification, (rows,); -inf where a plan is no number.
-        safe: the same of the safety requirements alone; +inf where there are none.
+        rho: robustness of the specification, (rows,); -inf where a plan is not a number.
+        safe: robustness of the safety requirements alone; +inf where there are none.
         cost: performance terms.
         each: (rows, R), robustness per requirement.
     """
@@ -40,16 +40,16 @@ class Judged:
 
 
 def joined(parts: list[Judged]) -> Judged:
-    """The rows of all parts."""
+    """Concatenate the rows of all parts."""
     return Judged(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Judged)))
 
 
 class Graphs:
-    """What the files of a controller compute; states (rows, n) and plans (rows, T, m) are float64.
+    """The graphs of a controller; states (rows, n) and plans (rows, T, m) are float64.
 
     Args:
         facts: of the controller.
-        threads: that one call may use.
+        threads: limit for one call.
 
     Raises:
         MissingError: R301, `onnxruntime` is not installed.
@@ -61,21 +61,21 @@ class Graphs:
         self._decide, self._follow = self._session(DECIDE), self._session(FOLLOW)
 
     def prepare(self) -> None:
-        """Load now what only the backup policy needs, so that its first decision does not wait for it."""
+        """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
         _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
-        """The best of the policy's plans, and all that the graph says besides."""
+        """The best of the policy's plans, and all outputs of the graph."""
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
-        """The plans to follow where plans were begun; `kept` says where it is those."""
+        """The chosen plans, given previous ones; the output `kept` marks those that are continued."""
         found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
-        """Plans from states; `states` (rows, T + 1, n) is among what is said besides."""
+        """Verdicts of plans from states; `states` (rows, T + 1, n) is among the graph's outputs."""
         found = _run(self._judge, {"state": x, "plan": plans})
         return _judged(plans, found), found
 
@@ -104,7 +104,7 @@ class Graphs:
         options.inter_op_num_threads = 1
         options.graph_optimization_level = (
             onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        )  # nothing is left
+        )  # nothing is left to optimize
         options.log_severity_level = 3
         graph = self.facts.graphs[name]
         return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])

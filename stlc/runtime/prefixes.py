@@ -1,9 +1,9 @@
-"""What the backup policy tries: prefixes of actions, all of a grid, or a sample where those are too many.
+"""Prefixes of actions for the backup policy: all of a grid, or a sample where those are too many.
 
 A sample is made of 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. Entry d
 of the k-th word of a lattice is k sqrt(p_d) mod 1 with the d-th prime, in fixed point: Richtmyer's sequence,
 of low discrepancy (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS 84,
-1978). Random words are a hash of their place: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom
+1978). Random words are a hash of their index: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom
 number generators", OOPSLA 2014).
 """
 
@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 Sampling: TypeAlias = Literal["lattice", "random"]
 SAMPLINGS: tuple[Sampling, ...] = get_args(Sampling)
 SAMPLES = 16_384
-"""Prefixes of one length at most, where a system file does not say."""
+"""Greatest number of prefixes of one length, where a system file gives none."""
 GOLDEN, FIRST, SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 _WORD = 1 << 64
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is tried.
+    """Grid of action prefixes.
 
     Attributes:
         values: of each control.
         lengths: of prefixes, T0, in the order in which they are tried.
         batch: trajectories at a time.
-        samples: prefixes of one length at most.
-        sampling: which, where the grid has more.
+        samples: greatest number of prefixes of one length.
+        sampling: sampling sequence, where the grid has more.
     """
 
     values: tuple[tuple[float, ...], ...]
@@ -44,15 +44,15 @@ class Grid:
     sampling: Sampling = "lattice"
 
     def size(self, length: int) -> int:
-        """How many prefixes the grid has, M = L^(m T0)."""
+        """Number of prefixes of the grid, M = L^(m T0)."""
         return int(prod(len(values) for values in self.values) ** length)
 
     def count(self, length: int) -> int:
-        """How many of them are tried."""
+        """Number of prefixes that are tried."""
         return min(self.size(length), self.samples)
 
     def prefixes(self, length: int) -> NDArray[np.float64]:
-        """Those that are tried, (M, length, m)."""
+        """The prefixes that are tried, (M, length, m)."""
         if self.size(length) > self.samples:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
@@ -91,5 +91,5 @@ def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
 
 
 def below(word: NDArray[np.uint64], bounds: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Words as whole numbers from 0 up to `bounds`, exclusive, which are less than 2^32."""
+    """Words mapped to whole numbers from 0 up to `bounds`, exclusive, which are less than 2^32."""
     return (((word >> np.uint64(32)) * bounds) >> np.uint64(32)).astype(np.int64)
