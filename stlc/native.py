@@ -162,7 +162,7 @@ class Kernel:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ObjectiveSlopes:
     """Derivatives of an objective by robustness and states.
 
     Attributes:
@@ -187,7 +187,7 @@ class Adjoint:
         self,
         x0: NDArray[np.float64],
         u: NDArray[np.float64],
-        outcome: Outcome,
+        outcome: ObjectiveSlopes,
         *,
         threads: int = 1,
     ) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl
-from stlc.editor.symbols import Names, Symbol, names_of
+from stlc.editor.symbols import Symbol, SymbolNames, names_of
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
@@ -75,7 +75,7 @@ class Document:
     missing: tuple[Diagnostic, ...]
 
     @cached_property
-    def names(self) -> Names:
+    def names(self) -> SymbolNames:
         """Its symbols and their occurrences."""
         return names_of(self.spec)
 

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from fractions import Fraction
 
 from stlc.compile.frontend.modules import STD
-from stlc.compile.frontend.values import Number, Value, Vector, describe
+from stlc.compile.frontend.values import Number, Value, VectorValue, describe
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_words
 from stlc.compile.ir.nodes import Window
@@ -180,7 +180,7 @@ def _constant(value: Value) -> str:
     match value:
         case Number() if value.constant is not None:
             return f" = {_amount(value)}"
-        case Vector(items) if all(item.constant is not None for item in items):
+        case VectorValue(items) if all(item.constant is not None for item in items):
             return f" = [{', '.join(map(_amount, items))}]"
         case _:
             return ""

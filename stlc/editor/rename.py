@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Document
-from stlc.editor.symbols import Names, Occurrence, names_of
+from stlc.editor.symbols import Occurrence, SymbolNames, names_of
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.show.printer import own_name
@@ -89,12 +89,12 @@ def apply(text: str, edits: Sequence[Edit]) -> str:
     return text
 
 
-def _bindings(names: Names) -> list[int]:
+def _bindings(names: SymbolNames) -> list[int]:
     """For every occurrence, in order, the index of the first one of the same symbol."""
     first: dict[Span, int] = {}
     return [first.setdefault(one.symbol.span, index) for index, one in enumerate(names.occurrences)]
 
 
-def _declared(names: Names) -> tuple[int, int, int]:
+def _declared(names: SymbolNames) -> tuple[int, int, int]:
     """Numbers of distinct declared values, types and rules."""
     return len(names.values), len(names.types), len(names.rules)

@@ -62,7 +62,9 @@ class Server(LanguageServer):
 
     def offset(self, document: Document, position: lsp.Position) -> int:
         """Offset of a position of the client."""
-        return Layout(document.source.text, self.encoding).offset(Place(position.line, position.character))
+        return Layout(document.source.text, self.encoding).offset(
+            EditorPlace(position.line, position.character)
+        )
 
     def publish(self, uri: str) -> None:
         """Analyse a text and publish its diagnostics."""
@@ -273,7 +275,7 @@ _OFFERS: dict[OfferKind, lsp.CompletionItemKind] = {
 }
 
 
-def position(place: Place) -> lsp.Position:
+def position(place: EditorPlace) -> lsp.Position:
     """A place as an LSP position."""
     return lsp.Position(place.line, place.column)
 
@@ -347,7 +349,7 @@ Encoding: TypeAlias = Literal["utf-8", "utf-16", "utf-32"]
 _BREAK = re.compile(r"\r\n|\r|\n")
 
 
-class Place(NamedTuple):
+class EditorPlace(NamedTuple):
     """A line and a column, both counted from 0."""
 
     line: int
@@ -369,14 +371,14 @@ class Layout:
         ends = [*(start for start, _ in breaks), len(self.text)]
         return tuple(zip(starts, ends, strict=True))
 
-    def place(self, offset: int) -> Place:
+    def place(self, offset: int) -> EditorPlace:
         """Line and column of the character at `offset`."""
         offset = min(max(offset, 0), len(self.text))
         row = bisect_right(self._lines, offset, key=lambda line: line[0]) - 1
         start, end = self._lines[row]
-        return Place(row, self._units(self.text[start : min(offset, end)]))
+        return EditorPlace(row, self._units(self.text[start : min(offset, end)]))
 
-    def offset(self, place: Place) -> int:
+    def offset(self, place: EditorPlace) -> int:
         """The offset of a place; a column inside of a character means the character."""
         if place.line < 0:
             return 0
@@ -391,7 +393,7 @@ class Layout:
         return end
 
     @property
-    def end(self) -> Place:
+    def end(self) -> EditorPlace:
         """The place after the last character."""
         return self.place(len(self.text))
 

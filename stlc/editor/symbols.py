@@ -70,7 +70,7 @@ class Occurrence:
 
 
 @dataclass(frozen=True, slots=True)
-class Names:
+class SymbolNames:
     """The symbols of a specification, in three separate namespaces.
 
     Attributes:
@@ -98,7 +98,7 @@ class Names:
 Scope: TypeAlias = Mapping[str, Symbol]
 
 
-def names_of(spec: ast.Spec) -> Names:
+def names_of(spec: ast.Spec) -> SymbolNames:
     """Names of a specification and their occurrences. A duplicate refers to the first declaration."""
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}
@@ -113,7 +113,7 @@ def names_of(spec: ast.Spec) -> Names:
             for lexeme in _member_names(item):
                 member = _symbol(lexeme, "member", item.span, item)
                 values.setdefault(member.name, member)
-    names = Names(values, types, rules, ())
+    names = SymbolNames(values, types, rules, ())
     found = {one.span: one for one in _all(spec, names)}
     ordered = sorted(found.values(), key=lambda one: (one.span.start, one.span.end))
     return replace(names, occurrences=tuple(ordered))
@@ -192,7 +192,7 @@ def _bound(node: ast.Node) -> dict[str, Symbol]:
 # --------------------------------------------------------------------- occurrences
 
 
-def _all(spec: ast.Spec, names: Names) -> Iterator[Occurrence]:
+def _all(spec: ast.Spec, names: SymbolNames) -> Iterator[Occurrence]:
     for module in spec.imports:
         symbol = _module(module)
         yield Occurrence(symbol.span, symbol)
@@ -200,7 +200,7 @@ def _all(spec: ast.Spec, names: Names) -> Iterator[Occurrence]:
         yield from _of_item(item, names)
 
 
-def _of_item(item: ast.Item, names: Names) -> Iterator[Occurrence]:
+def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
     own = Symbol(item.name, _KINDS[type(item)], item.name_span, item)
     yield Occurrence(item.name_span, own)
     if isinstance(item, ast.Enum):
@@ -214,7 +214,7 @@ def _of_item(item: ast.Item, names: Names) -> Iterator[Occurrence]:
         yield from _uses(part, scope, names)
 
 
-def _uses(node: object, scope: Scope, names: Names) -> Iterator[Occurrence]:
+def _uses(node: object, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
     """Occurrences of bound names in a part of a declaration, without built-in names."""
     match node:
         case ast.Name(span, name, quoted):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from torch import nn
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.unrolled import Columns, require_numbers, written
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
@@ -26,7 +26,7 @@ from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.controls import EPS, raw_width
 from stlc.dynamics.model.schedule import RolloutStage, schedule
-from stlc.dynamics.model.step import Step
+from stlc.dynamics.model.step import ModelStep
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------- rollout
 
 
-def rolled(step: Step, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
+def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
     """The states under a plan, exact switching.
 
     Args:
@@ -79,7 +79,7 @@ class _Film:
     def run(self, stage: RolloutStage) -> None:
         """Execute a stage whose inputs are known."""
         if stage.early:
-            self.now.update(Program(stage.early)(self.now, ONNX))
+            self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
         for state, source in stage.follows.items():
             self._enter(state, ONNX.cat([self.start[state], self._full(source)]))
         for state, source in stage.sums.items():
@@ -105,7 +105,7 @@ class _Film:
         outside = sorted(read - inside)
         timed = [name for name in outside if len(self.now[name]) == self.steps]
         steady = [name for name in outside if name not in timed]
-        blocks = [Program(block) for block in stage.blocks]
+        blocks = [ArrayProgram(block) for block in stage.blocks]
         moving, sources = list(stage.stepped), list(stage.stepped.values())
         kept = list(dict.fromkeys((*sources, *stage.lets)))
 
@@ -138,7 +138,7 @@ def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Col
         Untranslatable: one calls a function of Python.
     """
     require_numbers(list(numbers.values()))
-    return Program(dict(numbers))(columns, ONNX) if numbers else {}
+    return ArrayProgram(dict(numbers))(columns, ONNX) if numbers else {}
 
 
 # ---------------------------------------------------------------------------------------------- policy

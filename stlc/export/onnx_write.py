@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.c.numbers import Untranslatable
-from stlc.compile.backends.onnx.sheet import BATCH, Body, Value
+from stlc.compile.backends.onnx.sheet import BATCH, GraphBody, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, MissingError, UsageError
@@ -20,7 +20,7 @@ from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.runtime import Controller
-from stlc.runtime.facts import DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, Quantity
+from stlc.runtime.facts import DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, ControllerQuantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from onnx import GraphProto, NodeProto, TensorProto, ValueInfoProto
 
-    from stlc.compile.backends.onnx.sheet import Node, Sheet
+    from stlc.compile.backends.onnx.sheet import GraphNode, Sheet
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
 
@@ -93,12 +93,12 @@ def _graph(sheet: Sheet, name: str, outputs: Iterable[tuple[str, Value]]) -> Gra
     )
 
 
-def _node(node: Node) -> NodeProto:
+def _node(node: GraphNode) -> NodeProto:
     from onnx import helper
 
     made = helper.make_node(node.op, list(node.inputs), list(node.outputs))
     for key, value in node.attributes:
-        if isinstance(value, Body):
+        if isinstance(value, GraphBody):
             prefix = value.sheet.prefix
             graph = _graph(value.sheet, key, [(f"{prefix}o{i}", out) for i, out in enumerate(value.outputs)])
             made.attribute.append(helper.make_attribute(key, graph))
@@ -182,7 +182,8 @@ def _facts(run: Run) -> dict[str, object]:
         "system": {"name": task.system.name, "sha256": system_hash(run.dir)},
         "states": [asdict(each) for each in _states(task)],
         "controls": [
-            asdict(Quantity(each.name, str(each.unit), each.low, each.high)) for each in task.system.controls
+            asdict(ControllerQuantity(each.name, str(each.unit), each.low, each.high))
+            for each in task.system.controls
         ],
         "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],
@@ -192,11 +193,11 @@ def _facts(run: Run) -> dict[str, object]:
     }
 
 
-def _states(task: Task) -> list[Quantity]:
+def _states(task: Task) -> list[ControllerQuantity]:
     timers = {timer.name: timer.initial for timer in task.system.timers}
     parameters = {each.column.name for each in task.system.parameters}
     return [
-        Quantity(
+        ControllerQuantity(
             each.name,
             str(each.unit),
             each.low,

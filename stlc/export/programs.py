@@ -21,7 +21,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import best, finite, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.problem.task import PlanVerdicts, Task, rank
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
@@ -116,7 +116,7 @@ class Guarding(nn.Module):
     `stlc.controller.guard.candidates.Candidates`.
     """
 
-    def __init__(self, task: Task, network: PlanNetwork, grid: Grid | None = None) -> None:
+    def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
         super().__init__()
         self.deciding = Deciding(task, network)
         self.grid = grid or grid_of(task)

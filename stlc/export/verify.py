@@ -21,7 +21,7 @@ from stlc.export.programs import unmoved
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import BestOfKPolicy
     from stlc.controller.problem.task import Task
-    from stlc.runtime.graphs import Graphs, Judged
+    from stlc.runtime.graphs import Graphs, JudgedPlans
 
 PLAN = 1e-4
 """Greatest distance of a control from the original's, as a share of its range: the network is float32."""
@@ -138,7 +138,7 @@ def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
-def _answer(judged: Judged) -> Answer:
+def _answer(judged: JudgedPlans) -> Answer:
     plan, rho, safe, each = map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each))
     return plan, rho, safe, each
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.runtime.facts import Quantity
-from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
+from stlc.runtime.facts import ControllerQuantity
+from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers, joined
 
 POLICY, BACKUP, SAFEST = range(3)
 """Source of a plan: the policy, the backup policy, or the longest safe prefix."""
@@ -20,7 +20,7 @@ POLICY, BACKUP, SAFEST = range(3)
 class Found:
     """One plan for a state: `source` is the rule that chose it, `t0` the length of its prefix."""
 
-    judged: Judged
+    judged: JudgedPlans
     source: int
     t0: int
 
@@ -52,11 +52,11 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
     if candidates is None:
         nothing = np.full(1, -np.inf)
         each = np.full((1, len(graphs.facts.requirements)), -np.inf)
-        return Found(Judged(own[None], nothing, nothing, -nothing, each), SAFEST, 0)
+        return Found(JudgedPlans(own[None], nothing, nothing, -nothing, each), SAFEST, 0)
     return Found(candidates.of([_safest(graphs, x, candidates)]), SAFEST, grid.lengths[-1])
 
 
-def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged:
+def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
     """All plans of one T0 with verdicts; the first begins as the policy's own plan does."""
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))
@@ -73,7 +73,7 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
     return joined(parts)
 
 
-def _safest(graphs: Graphs, x: Numbers, candidates: Judged) -> int:
+def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
     """The plan with the longest safe prefix; ties go to the most robust, the latest to fail."""
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(
@@ -95,7 +95,7 @@ def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
     return int(allowed.argmax())
 
 
-def finite(plans: Numbers, controls: Sequence[Quantity]) -> Numbers:
+def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:
     """Plans (…, m) with every entry that is not finite replaced by the control's value nearest to 0."""
     rest = [min(max(0.0, each.low or 0.0), each.high or 0.0) for each in controls]
     return np.where(np.isfinite(plans), plans, rest)

@@ -14,7 +14,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, RunError, UsageError
 from stlc.runtime.backup import POLICY, Found, search
 from stlc.runtime.facts import Facts, read_facts
-from stlc.runtime.graphs import Graphs, Judged, Numbers
+from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers
 
 Guard: TypeAlias = Literal["none", "paper"]
 RULES = ("policy", "backup", "safest")
@@ -52,7 +52,7 @@ class Decision:
 class _Followed:
     """The chosen plans: verdicts, sources, and which of them are previous plans."""
 
-    judged: Judged
+    judged: JudgedPlans
     source: NDArray[np.int64]
     t0: NDArray[np.int64]
     kept: NDArray[np.bool_]

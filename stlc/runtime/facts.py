@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, RunError, UsageError
-from stlc.runtime.prefixes import SAMPLINGS, Grid
+from stlc.runtime.prefixes import SAMPLINGS, PrefixGrid
 
 Numbers: TypeAlias = NDArray[np.float64]
 FACTS = "controller.json"
@@ -22,7 +22,7 @@ DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class ControllerQuantity:
     """A state or a control.
 
     Attributes:
@@ -43,7 +43,7 @@ class Quantity:
 
 
 @dataclass(frozen=True, slots=True)
-class Feedback:
+class FeedbackGains:
     """Feedback law around the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
     Attributes:
@@ -88,17 +88,17 @@ class Facts:
 
     spec: Mapping[str, str]
     system: Mapping[str, str]
-    states: tuple[Quantity, ...]
-    controls: tuple[Quantity, ...]
+    states: tuple[ControllerQuantity, ...]
+    controls: tuple[ControllerQuantity, ...]
     requirements: tuple[str, ...]
     dt: float
     horizon: int
-    grid: Grid
+    grid: PrefixGrid
     graphs: Mapping[str, bytes]
-    feedback: Feedback | None = None
+    feedback: FeedbackGains | None = None
 
     @property
-    def added(self) -> tuple[Quantity, ...]:
+    def added(self) -> tuple[ControllerQuantity, ...]:
         """The states that the specification adds."""
         return tuple(each for each in self.states if each.added)
 
@@ -135,8 +135,8 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     return Facts(
         read["spec"],
         read["system"],
-        tuple(Quantity(**each) for each in read["states"]),
-        tuple(Quantity(**each) for each in read["controls"]),
+        tuple(ControllerQuantity(**each) for each in read["states"]),
+        tuple(ControllerQuantity(**each) for each in read["controls"]),
         tuple(read["requirements"]),
         float(read["dt"]),
         int(read["horizon"]),
@@ -146,20 +146,20 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     )
 
 
-def _feedback(read: Mapping[str, Any] | None, controls: int) -> Feedback | None:
+def _feedback(read: Mapping[str, Any] | None, controls: int) -> FeedbackGains | None:
     if read is None:
         return None
-    found = {name: np.array(read[name], dtype=np.float64) for name in Feedback.__annotations__}
+    found = {name: np.array(read[name], dtype=np.float64) for name in FeedbackGains.__annotations__}
     if found["gain"].shape != (controls, len(found["state"])):
         raise ValueError(f"a gain of shape {found['gain'].shape}")
-    return Feedback(**found)
+    return FeedbackGains(**found)
 
 
-def _grid(read: Mapping[str, Any]) -> Grid:
+def _grid(read: Mapping[str, Any]) -> PrefixGrid:
     if read["sampling"] not in SAMPLINGS:
         raise ValueError(f"there is no sampling {read['sampling']!r}")
     values, lengths = tuple(map(tuple, read["values"])), tuple(read["lengths"])
-    return Grid(values, lengths, int(read["batch"]), int(read["samples"]), read["sampling"])
+    return PrefixGrid(values, lengths, int(read["batch"]), int(read["samples"]), read["sampling"])
 
 
 def _whole(path: Path, digest: str) -> bytes:

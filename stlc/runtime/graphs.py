@@ -17,7 +17,7 @@ Numbers: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class JudgedPlans:
     """Plans and their verdicts, a row each.
 
     Attributes:
@@ -34,14 +34,16 @@ class Judged:
     cost: Numbers
     each: Numbers
 
-    def of(self, rows: Any) -> Judged:
+    def of(self, rows: Any) -> JudgedPlans:
         """Some rows: indices or a mask."""
-        return Judged(*(getattr(self, each.name)[rows] for each in fields(self)))
+        return JudgedPlans(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
-def joined(parts: list[Judged]) -> Judged:
+def joined(parts: list[JudgedPlans]) -> JudgedPlans:
     """Concatenate the rows of all parts."""
-    return Judged(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Judged)))
+    return JudgedPlans(
+        *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(JudgedPlans))
+    )
 
 
 class Graphs:
@@ -64,17 +66,17 @@ class Graphs:
         """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
         _ = self._judge, self._fall
 
-    def decided(self, x: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+    def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """The best of the policy's plans, and all outputs of the graph."""
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
 
-    def followed(self, x: Numbers, begun: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+    def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """The chosen plans, given previous ones; the output `kept` marks those that are continued."""
         found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
-    def judged(self, x: Numbers, plans: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+    def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """Verdicts of plans from states; `states` (rows, T + 1, n) is among the graph's outputs."""
         found = _run(self._judge, {"state": x, "plan": plans})
         return _judged(plans, found), found
@@ -115,5 +117,5 @@ def _run(session: Any, feeds: Mapping[str, Numbers]) -> dict[str, Numbers]:
     return dict(zip(names, session.run(names, dict(feeds)), strict=True))
 
 
-def _judged(plan: Numbers, found: Mapping[str, Numbers]) -> Judged:
-    return Judged(plan, found["rho"], found["safe"], found["cost"], found["requirements"])
+def _judged(plan: Numbers, found: Mapping[str, Numbers]) -> JudgedPlans:
+    return JudgedPlans(plan, found["rho"], found["safe"], found["cost"], found["requirements"])

@@ -26,7 +26,7 @@ _WORD = 1 << 64
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class PrefixGrid:
     """Grid of action prefixes.
 
     Attributes:

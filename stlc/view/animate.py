@@ -20,7 +20,7 @@ from stlc.view import bullet
 from stlc.view.chart import Chart, chart_film, chart_of
 from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Taped, encoder, save_film, save_still
 from stlc.view.judged import Event, Judged, events_of, judged_in, marks, monitor_of, strip_of, trace_names
-from stlc.view.scene import Key, Scene, Staging, frames_of, keys_of, ratio_of, scene_film
+from stlc.view.scene import LegendKey, Scene, Staging, frames_of, keys_of, ratio_of, scene_film
 from stlc.view.signals import Strip, decisions_of, signal_film
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ class Shot:
     frames: int
     dt: float
     t0: float
-    keys: tuple[Key, ...]
+    keys: tuple[LegendKey, ...]
     strip: Strip | None
     events: tuple[Event, ...]
     names: tuple[str, ...]

@@ -77,14 +77,14 @@ class Chart:
         across, up = self.plane.axes
         return self.trace.data[across], self.trace.data[up]
 
-    def color(self, place: Place) -> str:
+    def color(self, place: ChartPlace) -> str:
         """Colour of a region: red if it must be avoided, else its own."""
         if place.role == "avoid":
             return RED
         others = [other for other in self.plane.places if other.role != "avoid"]
         return _TINTS[others.index(place) % len(_TINTS)]
 
-    def inside(self, place: Place) -> Mask:
+    def inside(self, place: ChartPlace) -> Mask:
         """Mask of the traces in a region over time, (traces, samples)."""
         return place.depth(self.trace) >= 0.0
 
@@ -242,7 +242,7 @@ def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
 
 
-def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
+def _draw_presence(axes: Axes, chart: Chart, place: ChartPlace) -> None:
     """Draw the share of traces in a region over time, with its active time shaded."""
     color, times = chart.color(place), chart.trace.times
     for low, high in place.windows:
@@ -271,7 +271,7 @@ def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
     )
 
 
-def _matters(place: Place, trace: Trace) -> Mask:
+def _matters(place: ChartPlace, trace: Trace) -> Mask:
     """Mask of the samples at which a region is active, (samples,)."""
     return np.array([place.active(float(seconds) - trace.t0) for seconds in trace.times])
 
@@ -330,7 +330,7 @@ class Use:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ChartPlace:
     """A region of the plane.
 
     Attributes:
@@ -385,7 +385,7 @@ class Plane:
     """
 
     axes: tuple[str, str]
-    places: tuple[Place, ...]
+    places: tuple[ChartPlace, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
         """Part of the plane to show: all paths, and the regions near them."""
@@ -408,7 +408,7 @@ class Plane:
 
     def sampled(
         self,
-        place: Place,
+        place: ChartPlace,
         like: Trace,
         window: tuple[Window, Window],
         *,
@@ -443,13 +443,13 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
                 if node.negated and _point(node) is not node.item:  # a complement, not a `not` around it
                     use = _turned(use)
                 uses.setdefault(_texts(node), []).append(use)
-    found: list[tuple[tuple[str, ...], Place]] = []
+    found: list[tuple[tuple[str, ...], ChartPlace]] = []
     shown = {_texts(node): node for node in members.values()}
     for key, its in uses.items():
         judge = _judge_of(spec, shown[key], trace)
         if judge is not None:
             columns = judge.compiled.signature.names
-            found.append((columns, Place(key[1], tuple(its), judge)))
+            found.append((columns, ChartPlace(key[1], tuple(its), judge)))
     flat = [columns for columns, _ in found if len(columns) == 2 and all(c in trace.data for c in columns)]
     if not flat:
         return None

@@ -32,7 +32,7 @@ _BESIDE = 3.8
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class LegendKey:
     """An entry of a legend.
 
     Attributes:
@@ -140,7 +140,7 @@ def ratio_of(draw: DrawScene, scene: Scene) -> float:
     return min(max(ratio, 0.15), 1.6)
 
 
-def _planned(ratio: float, rows: int, keys: list[Key]) -> _Plan:
+def _planned(ratio: float, rows: int, keys: list[LegendKey]) -> _Plan:
     head = _HEAD + (_KEYS if keys else 0.0)
     width = WIDTH - 2 * _EDGE
     high = rows * (_ROW + _GAP) + _FOOT + 0.2 if rows else 0.0
@@ -170,18 +170,18 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
     return figure.add_axes((left / width, bottom / height, wide / width, high / height))
 
 
-def keys_of(scene: Scene, own: Mapping[str, str]) -> list[Key]:
+def keys_of(scene: Scene, own: Mapping[str, str]) -> list[LegendKey]:
     """Legend: recorded sources of decisions, rejected plans, violations, and what the world adds."""
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
-    keys = [Key(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
+    keys = [LegendKey(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
     if "rejected" in scene and np.isfinite(scene["rejected"]).any():
-        keys.append(Key("rejected plan", VIOLATED, "dash"))
+        keys.append(LegendKey("rejected plan", VIOLATED, "dash"))
     if "violated" in scene and scene["violated"].any():
-        keys.append(Key("violated", VIOLATED, "ring"))
-    return keys + [Key(word, color) for word, color in own.items()]
+        keys.append(LegendKey("violated", VIOLATED, "ring"))
+    return keys + [LegendKey(word, color) for word, color in own.items()]
 
 
-def _handle(key: Key) -> Line2D:
+def _handle(key: LegendKey) -> Line2D:
     from matplotlib.lines import Line2D
 
     if key.kind in ("dash", "solid"):
@@ -191,7 +191,7 @@ def _handle(key: Key) -> Line2D:
     return Line2D([], [], marker="o", ls="", ms=7, mew=1.8 if face == "none" else 0, mfc=face, mec=key.color)
 
 
-def _head(figure: Figure, plan: _Plan, title: str, keys: list[Key]) -> Text:
+def _head(figure: Figure, plan: _Plan, title: str, keys: list[LegendKey]) -> Text:
     """Draw title, clock and legend; return the clock."""
     width, height = plan.size
     top = 1 - 0.5 * _HEAD / height

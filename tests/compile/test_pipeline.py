@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.mission_strategies import augmented
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.dump import dump
@@ -206,7 +206,7 @@ def test_what_recurs_for_ever_is_known_and_draws() -> None:
     )
     assert (spec.mission, spec.recurring) == (20, 21)
     assert spec.guidance_cost is not None
-    gap = Program({"gap": spec.guidance_cost})
+    gap = ArrayProgram({"gap": spec.guidance_cost})
 
     def drawn(clock: float, a: float, b: float) -> float:
         timers = {"clock": clock, "a_since": a, "b_since": b, "a": 0.0, "b": 0.0}

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from stlc.controller.guard.stages.sampled_shooting import SampledPrefixes
 from stlc.controller.problem.task import Task
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 from tests.controller.guard.test_prefix_shooting import F64, Constant, grid
 
 
@@ -45,7 +45,7 @@ def test_they_are_finished_from_where_they_end(car_task: Task) -> None:
 
 def test_a_large_grid_is_sampled(car_task: Task) -> None:
     policy = Constant(car_task, 0.0)
-    some = SampledPrefixes(car_task, policy, Grid(((-2.0, 0.0, 3.0, 4.0),), (1, 4), 64), 30)
+    some = SampledPrefixes(car_task, policy, PrefixGrid(((-2.0, 0.0, 3.0, 4.0),), (1, 4), 64), 30)
     assert some.lengths.tolist() == [1] * 4 + [4] * 30
     long = some.heads[4:, :, 0]
     assert set(long.flatten().tolist()) == {-2.0, 0.0, 3.0, 4.0}

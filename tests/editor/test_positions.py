@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.editor.server import Layout, Place
+from stlc.editor.server import EditorPlace, Layout
 
 TEXTS = st.text(alphabet="ab \t\r\né€😀\u2028", max_size=30)
 
@@ -25,14 +25,14 @@ def test_a_separator_of_unicode_is_no_line_break():
 
 def test_beyond_the_end():
     layout = Layout("ab\ncd")
-    assert layout.offset(Place(0, 99)) == 2
-    assert layout.offset(Place(9, 0)) == 5
-    assert layout.offset(Place(-1, 0)) == 0
+    assert layout.offset(EditorPlace(0, 99)) == 2
+    assert layout.offset(EditorPlace(9, 0)) == 5
+    assert layout.offset(EditorPlace(-1, 0)) == 0
     assert layout.end == (1, 2)
 
 
 def test_inside_of_a_character():
-    assert Layout("😀").offset(Place(0, 1)) == 0
+    assert Layout("😀").offset(EditorPlace(0, 1)) == 0
 
 
 @given(TEXTS, st.sampled_from(["utf-8", "utf-16", "utf-32"]))

@@ -12,7 +12,7 @@ from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.search import StagedSearch
 from stlc.export import programs
 from stlc.export.programs import Guarding
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 
 
 @pytest.mark.parametrize("at_once", [programs.AT_ONCE, 40], ids=["whole", "in pieces"])
@@ -39,7 +39,7 @@ def test_a_grid_without_lengths_hands_the_plan_back(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     x = run.task.sample(3, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
-    grid = Grid(grid_of(run.task).values, (), 10)
+    grid = PrefixGrid(grid_of(run.task).values, (), 10)
     wanted = StagedSearch(run.task, run.policy, "paper", grid=grid).search(x, plan)
     with torch.no_grad():
         mine, rho, *_, source, t0 = Guarding(run.task, run.network, grid)(x, plan)

@@ -17,7 +17,7 @@ from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.model.algebra import substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
-from stlc.dynamics.model.step import Step
+from stlc.dynamics.model.step import ModelStep
 from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled
 from stlc.export.verify import kept_agreement, same_verdicts
 from stlc.runtime.facts import read_facts
@@ -81,7 +81,7 @@ def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.
     monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
     x, y, z, u = (ir.Signal(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
-    step = Step(
+    step = ModelStep(
         (("gain", ir.Op("sin", (u,))), ("fed", feeds)),
         {
             "x": ir.Op("add", (x, ir.Signal("gain"))),
@@ -132,7 +132,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
         moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}
-    step = Step(tuple(lets), {name: state[name] for name in ("angle", "speed")})
+    step = ModelStep(tuple(lets), {name: state[name] for name in ("angle", "speed")})
     sheet = Sheet()
     start = {name: sheet.input(name, (1, BATCH)) for name in ("angle", "speed")}
     states = rolled(step, start, {"push": sheet.input("push", (40, BATCH))})

@@ -12,7 +12,7 @@ from helpers.reference import number
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.c.adjoint import emit_adjoint
@@ -25,7 +25,7 @@ from stlc.compile.ir.traverse import leaves, subexpressions
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.native import Adjoint, Kernel, Outcome, load
+from stlc.native import Adjoint, Kernel, ObjectiveSlopes, load
 
 T = TypeVar("T")
 
@@ -133,11 +133,11 @@ def slopes_agree(nums: Sequence[ir.Num], points: np.ndarray, slope: float = 4.0)
     for i, num in enumerate(nums):
         by_states = np.zeros((len(nums), 2, batch))
         by_states[i, 1] = 1.0
-        outcome = Outcome(np.zeros((batch, 1)), by_states, slope)
+        outcome = ObjectiveSlopes(np.zeros((batch, 1)), by_states, slope)
         found = adjoint.pull(np.zeros((batch, len(nums))), points[:, None].copy(), outcome)[:, 0]
         x = torch.from_numpy(points.copy()).requires_grad_()
         env = dict(zip(NAMES, x.unbind(1), strict=True))
-        value = Program({"out": num})(env, TORCH, StraightThrough(slope))["out"].expand(batch)
+        value = ArrayProgram({"out": num})(env, TORCH, StraightThrough(slope))["out"].expand(batch)
         exact = [number(num, dict(zip(NAMES, map(float, row), strict=True))) for row in points]
         np.testing.assert_allclose(value.detach(), exact, rtol=1e-9, atol=1e-9, err_msg=str(num))
         expected = np.zeros((batch, len(NAMES)))
@@ -173,7 +173,7 @@ def gradients_agree(rules: Sequence[ir.Formula], trace: np.ndarray, seed: int) -
     """The gradient of a weighted sum of robustness by the plan is that of torch."""
     weights = np.random.default_rng(seed).uniform(0.5, 1.5, (trace.shape[1], len(rules)))
     x0, u = trace[0].copy(), trace[1:].transpose(1, 0, 2).copy()
-    found = adjoint_of(follower(), rules).pull(x0, u, Outcome(weights, None, 5.0))
+    found = adjoint_of(follower(), rules).pull(x0, u, ObjectiveSlopes(weights, None, 5.0))
     np.testing.assert_allclose(found, _expected(rules, trace, weights), rtol=1e-9, atol=1e-9)
 
 

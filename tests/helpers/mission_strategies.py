@@ -10,7 +10,7 @@ from helpers.formula_strategies import NAMES, SPAN
 from hypothesis import strategies as st
 
 from stlc.compile.augment.timers import Timer
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -192,7 +192,7 @@ def augmented(timers: Sequence[Timer], columns: Mapping[str, np.ndarray]) -> dic
     state = {timer.name: np.full(batch, timer.initial) for timer in timers}
     if not timers:
         return dict(columns)
-    program = Program({timer.name: timer.update for timer in timers})
+    program = ArrayProgram({timer.name: timer.update for timer in timers})
     rows = [state]
     for k in range(samples - 1):
         env = {name: column[k] for name, column in columns.items()} | rows[-1]

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.runtime.prefixes import GOLDEN, SAMPLINGS, Grid, Sampling, below, generators, words
+from stlc.runtime.prefixes import GOLDEN, SAMPLINGS, PrefixGrid, Sampling, below, generators, words
 
 MASK = (1 << 64) - 1
 
 
-def grid(sizes: list[int], **changed: object) -> Grid:
+def grid(sizes: list[int], **changed: object) -> PrefixGrid:
     values = tuple(tuple(10.0 * i + np.linspace(0, 1, size)) for i, size in enumerate(sizes))
-    return Grid(values, (1, 2), 100, **changed)  # type: ignore[arg-type]
+    return PrefixGrid(values, (1, 2), 100, **changed)  # type: ignore[arg-type]
 
 
 def splitmix(number: int) -> int:

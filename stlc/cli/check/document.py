@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.cli.check.outcome import Checked, Outcome, Row, overall
+from stlc.cli.check.outcome import Checked, Outcome, VerdictRow, overall
 from stlc.escape import xml
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import Judgement
@@ -143,7 +143,7 @@ def _suite(outcome: Outcome) -> Iterator[str]:
     yield "  </testsuite>"
 
 
-def _case(outcome: Outcome, row: Row) -> Iterator[str]:
+def _case(outcome: Outcome, row: VerdictRow) -> Iterator[str]:
     head = f"    <testcase classname={_attribute(outcome.name)} name={_attribute(row.name)}"
     if row.status == "satisfied":
         yield f"{head}/>"

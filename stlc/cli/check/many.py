@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from stlc.cli.check.judge import Work, found, judged, taken
-from stlc.cli.check.outcome import WORDS, Outcome, Row, overall
+from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
 from stlc.cli.framework.output import COLOR, table
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.stopping import leaving
@@ -126,7 +126,7 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
     return (outcome.name, WORDS[outcome.status], worst.robustness, worst.name, worst.where)
 
 
-def _worst(rows: Sequence[Row]) -> Row:
+def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
     """The most important requirement: a violated one, else an inconclusive one, else the least robust."""
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
     return min(rows, key=lambda row: (order[row.status], _number(row.robustness)))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from stlc.cli.check.document import cause_entry, gap_entry
 from stlc.cli.check.judge import Question, Work, instant_of, laid_reading, monitor_of, specification, usage
-from stlc.cli.check.outcome import WORDS, Outcome, Row
+from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow
 from stlc.cli.check.text import in_unit, percent, signed
 from stlc.cli.framework.output import emit, table, wants_color
 from stlc.cli.framework.render import render_place
@@ -102,23 +102,23 @@ def robustness_text(tally: Tally, unit: str) -> str:
     return "boundary" if near else in_unit(signed(tally.robustness), unit)
 
 
-def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
+def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> VerdictRow:
     where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
     unit = online.rule(name).unit or ("" if cause is None else cause.unit)
     value = robustness_text(tally, unit)
     if cause is not None:
         start = online.time(tally.worst) if tally.instants > 1 else cause.time
         where = beside(f"t = {cause.time:.10g} s", f"t = {start:.10g} s")
-        return Row(name, tally.status, value, where, cause.because)
+        return VerdictRow(name, tally.status, value, where, cause.because)
     if tally.status == "satisfied":
-        return Row(name, tally.status, value, where)
+        return VerdictRow(name, tally.status, value, where)
     if tally.status == "violated":
         why = f"violated at {tally.fails:,} of {tally.instants:,} starts"
     else:
         read = columns(online.rule(name).formula)
         gaps = [text for signal, text in _gap_texts(online).items() if signal in read]
         why = ", ".join(gaps) or "the trace is too short to say"
-    return Row(name, tally.status, value, where, why)
+    return VerdictRow(name, tally.status, value, where, why)
 
 
 def _gap_texts(online: Online) -> dict[str, str]:
@@ -136,7 +136,7 @@ def _moment(online: Online, sample: int) -> str:
 def _text(
     told: Told,
     online: Online,
-    rows: tuple[Row, ...],
+    rows: tuple[VerdictRow, ...],
     tallies: Mapping[str, Tally],
     causes: Mapping[str, Cause],
 ) -> Iterator[str]:

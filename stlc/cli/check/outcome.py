@@ -31,7 +31,7 @@ EXIT_CODES: dict[Status, int] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class VerdictRow:
     """One requirement on all traces of a file.
 
     Attributes:
@@ -71,7 +71,7 @@ class Outcome:
 
     name: str
     status: Status = "inconclusive"
-    rows: tuple[Row, ...] = ()
+    rows: tuple[VerdictRow, ...] = ()
     text: str = ""
     entry: dict[str, Any] = field(default_factory=dict)
     traces: int = 0

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stlc.cli.check.outcome import WORDS, Checked, Row
+from stlc.cli.check.outcome import WORDS, Checked, VerdictRow
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
@@ -116,10 +116,10 @@ def _where(judged: Judgement, result: Checked) -> str:
     return ", ".join(words)
 
 
-def rows_of(result: Checked) -> tuple[Row, ...]:
+def rows_of(result: Checked) -> tuple[VerdictRow, ...]:
     """The rows of the table, with a reason for each unsatisfied requirement."""
     return tuple(
-        Row(
+        VerdictRow(
             judged.name,
             judged.overall,
             _robustness(judged, result),

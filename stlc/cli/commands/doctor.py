@@ -24,7 +24,7 @@ _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class HealthFinding:
     """One checked item.
 
     Attributes:
@@ -59,22 +59,24 @@ def doctor(
     raise typer.Exit(code)
 
 
-def _python() -> Iterator[Finding]:
+def _python() -> Iterator[HealthFinding]:
     from stlc.version import __version__
 
-    yield Finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}")
+    yield HealthFinding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}")
     found = ".".join(map(str, sys.version_info[:3]))
     enough = sys.version_info >= (3, 11)
-    yield Finding("python", "ok" if enough else "missing", found if enough else f"{found}; 3.11 is needed")
+    yield HealthFinding(
+        "python", "ok" if enough else "missing", found if enough else f"{found}; 3.11 is needed"
+    )
 
 
-def _packages() -> Iterator[Finding]:
+def _packages() -> Iterator[HealthFinding]:
     for name in _NEEDED:
         found = _version(name)
-        yield Finding(name, "ok" if found else "missing", found or f"pip install {name}")
+        yield HealthFinding(name, "ok" if found else "missing", found or f"pip install {name}")
     for package, extra in _optional().items():
         found = _version(package)
-        yield Finding(package, "ok" if found else "off", found or f"pip install 'stlc[{extra}]'")
+        yield HealthFinding(package, "ok" if found else "off", found or f"pip install 'stlc[{extra}]'")
 
 
 def _optional() -> dict[str, str]:
@@ -104,62 +106,64 @@ def _version(package: str) -> str:
         return ""
 
 
-def _devices(*, quick: bool) -> Iterator[Finding]:
+def _devices(*, quick: bool) -> Iterator[HealthFinding]:
     from stlc.provenance import hardware
 
     machine = hardware()
     memory = machine.get("memory_gib")
     detail = f"{machine.get('processor') or machine.get('machine')}, {machine.get('cores')} cores"
-    yield Finding("cpu", "ok", detail + (f", {memory} GiB" if memory else ""))
+    yield HealthFinding("cpu", "ok", detail + (f", {memory} GiB" if memory else ""))
     if quick or find_spec("torch") is None:
         return
     import torch
 
     if torch.cuda.is_available():
         names = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
-        yield Finding("cuda", "ok", names)
+        yield HealthFinding("cuda", "ok", names)
     else:
-        yield Finding("cuda", "off", "no device; everything runs on the processor")
+        yield HealthFinding("cuda", "off", "no device; everything runs on the processor")
 
 
-def _tools() -> Iterator[Finding]:
+def _tools() -> Iterator[HealthFinding]:
     yield _cache()
     yield _compiler()
     installed = _completion()
-    yield Finding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
+    yield HealthFinding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
 
 
-def _cache() -> Finding:
+def _cache() -> HealthFinding:
     """The cache folder of kernels and parser tables."""
     from stlc.cache import Unusable, opened, why_not
 
     try:
         kept = opened()
     except Unusable:
-        return Finding("cache", "off", f"{why_not()}; starting takes 0.1 s longer, kernels are built anew")
+        return HealthFinding(
+            "cache", "off", f"{why_not()}; starting takes 0.1 s longer, kernels are built anew"
+        )
     count, size = kept.size()
     if not os.access(kept.folder, os.W_OK):
-        return Finding("cache", "off", f"{kept.shown} cannot be written to; new kernels are not kept")
-    return Finding(
+        return HealthFinding("cache", "off", f"{kept.shown} cannot be written to; new kernels are not kept")
+    return HealthFinding(
         "cache", "ok", f"{kept.shown}: {count} file{'' if count == 1 else 's'}, {size / 1e6:.1f} MB"
     )
 
 
-def _compiler() -> Finding:
+def _compiler() -> HealthFinding:
     """Whether plans are evaluated by C kernels or by torch, and remembered failures of the compiler."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()
     if found is None:
-        return Finding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
+        return HealthFinding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
     before = remembered()
     why = works(found)
     if why:
-        return Finding("compiler", "off", f"{found} {why}; {_SLOWER}")
+        return HealthFinding("compiler", "off", f"{found} {why}; {_SLOWER}")
     detail = f"{found}; training, search and backup run as C"
     if before:
         detail += f" (a short while ago it {before[0]}; it is tried again from now on)"
-    return Finding("compiler", "ok", detail)
+    return HealthFinding("compiler", "ok", detail)
 
 
 def _completion() -> str:

@@ -148,7 +148,7 @@ _VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class RunRow:
     """One run.
 
     Attributes:
@@ -191,7 +191,7 @@ class Row:
         return {"run": self.run, "path": self.path, "status": self.status, "accuracy": self.accuracy, **kept}
 
 
-def overview(root: Path, sort: str) -> list[Row]:
+def overview(root: Path, sort: str) -> list[RunRow]:
     """All runs below a folder; a damaged one is listed instead of raising an error."""
     rows = [_row(run) for run in every_run(root)]
     if sort == "acc":
@@ -199,13 +199,13 @@ def overview(root: Path, sort: str) -> list[Row]:
     return sorted(rows, key=lambda row: str(row.record.get("started", ""))) if sort == "time" else rows
 
 
-def _row(run: RunDir) -> Row:
+def _row(run: RunDir) -> RunRow:
     name = f"{run.path.parent.name}/{run.name}"
     try:
         record = run.record()
     except StlcError:
-        return Row(name, run.shown, {}, "damaged")
-    return Row(name, run.shown, record, str(record.get("status", "running")))
+        return RunRow(name, run.shown, {}, "damaged")
+    return RunRow(name, run.shown, record, str(record.get("status", "running")))
 
 
 def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:

@@ -55,10 +55,10 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.dynamics.declaration.load import system_schema
 
         return {"$schema": _DIALECT, "title": wanted, **system_schema()}
-    from stlc.cli.framework.documents import LINES, RESULTS, Document, schema_of
+    from stlc.cli.framework.documents import LINES, RESULTS, DocumentRecord, schema_of
 
     if command in LINES:
         return {"$schema": _DIALECT, "title": wanted, **schema_of(LINES[command])}
-    frame = schema_of(Document)
+    frame = schema_of(DocumentRecord)
     frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(RESULTS[command] | None)}
     return {"$schema": _DIALECT, "title": wanted, **frame}

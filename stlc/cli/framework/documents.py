@@ -52,29 +52,29 @@ class Robustness(TypedDict):
     unit: str
 
 
-class Reading(TypedDict):
+class ReadingRecord(TypedDict):
     signal: str
     value: Num
     text: str
     unit: str
 
 
-class Place(TypedDict):
+class PlaceRecord(TypedDict):
     line: int
     column: int
 
 
-class Cause(TypedDict):
+class CauseRecord(TypedDict):
     signal: str | None
     value: Num | None
     predicate: str
-    readings: list[Reading]
+    readings: list[ReadingRecord]
     trace: int
     start: int
     sample: int
     time: Num
-    span: Place
-    requirement: Place
+    span: PlaceRecord
+    requirement: PlaceRecord
     because: str
 
 
@@ -87,7 +87,7 @@ class CheckedRequirement(TypedDict):
     starts: int
     satisfied_share: Num
     violated_traces: int
-    cause: Cause | None
+    cause: CauseRecord | None
 
 
 class CheckedTrace(TypedDict):
@@ -208,7 +208,7 @@ class SpecInWords(TypedDict):
     requirements: list[RequirementInWords]
 
 
-class CauseNode(TypedDict):
+class CauseNodeRecord(TypedDict):
     depth: int
     text: str
     line: int
@@ -225,7 +225,7 @@ class ViolationCause(TypedDict):
     trace: int
     start: Num
     because: str
-    tree: list[CauseNode]
+    tree: list[CauseNodeRecord]
 
 
 class Explanation(TypedDict):
@@ -286,11 +286,11 @@ class FormattedFiles(TypedDict):
 
 
 class Range(TypedDict):
-    start: Place
-    end: Place
+    start: PlaceRecord
+    end: PlaceRecord
 
 
-class Label(TypedDict):
+class LabelRecord(TypedDict):
     file: str | None
     range: Range | None
     text: str
@@ -302,30 +302,30 @@ class Edit(TypedDict):
     replacement: str
 
 
-class Fix(TypedDict):
+class FixRecord(TypedDict):
     text: str
     edits: list[Edit]
 
 
-class Diagnostic(TypedDict):
+class DiagnosticRecord(TypedDict):
     code: str
     severity: Literal["error", "warning"]
     message: str
     file: str | None
     range: Range | None
     label: str
-    labels: list[Label]
+    labels: list[LabelRecord]
     help: list[str]
     note: list[str]
-    fix: Fix | None
+    fix: FixRecord | None
 
 
-class Document(TypedDict):
+class DocumentRecord(TypedDict):
     stlc: str
     schema: str
     ok: bool
     exit_code: int
-    diagnostics: list[Diagnostic]
+    diagnostics: list[DiagnosticRecord]
     result: Any
 
 
@@ -400,7 +400,7 @@ class UnsafeStart(TypedDict):
     savable: bool
 
 
-class DecisionLatency(TypedDict):
+class DecisionLatencyRecord(TypedDict):
     median: Num
     p99: Num
     samples: int
@@ -440,7 +440,7 @@ class GuardedRuns(TypedDict):
     units: dict[str, str]
     decisions: dict[str, Num]
     unsafe: NotRequired[list[UnsafeStart]]
-    latency: DecisionLatency
+    latency: DecisionLatencyRecord
     drives: NotRequired[JudgedRuns]
 
 
@@ -572,7 +572,7 @@ class GuardResult(TypedDict):
     lost: int
 
 
-class ClosedLoop(TypedDict):
+class ClosedLoopRecord(TypedDict):
     recommended: Literal["none", "paper", "full", None]
     share: Num | None
     interval: list[Num] | None
@@ -590,7 +590,7 @@ class Training(TypedDict):
     requirements: NotRequired[dict[str, Num]]
     feasible: NotRequired[Num]
     searched: NotRequired[int]
-    closed_loop: NotRequired[ClosedLoop]
+    closed_loop: NotRequired[ClosedLoopRecord]
     verdict: NotRequired[TrainingVerdict]
     steps: NotRequired[int | None]
     schedule: NotRequired[str | None]

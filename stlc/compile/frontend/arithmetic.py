@@ -17,7 +17,7 @@ from typing import Literal
 
 from stlc.compile.analysis.ranges import bounds
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.values import Number, Vector, literal, unit_text
+from stlc.compile.frontend.values import Number, VectorValue, literal, unit_text
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Function
 from stlc.diagnostics import Diagnostic, Label
@@ -577,15 +577,17 @@ def half(span: Span) -> Number:
     return literal(Fraction(1, 2), span)
 
 
-def broadcast(name: str, args: Sequence[Number | Vector], span: Span, scope: Scope) -> Number | Vector:
+def broadcast(
+    name: str, args: Sequence[Number | VectorValue], span: Span, scope: Scope
+) -> Number | VectorValue:
     """Apply `name` component by component; numbers broadcast to vectors."""
-    lengths = {len(arg.items) for arg in args if isinstance(arg, Vector)}
+    lengths = {len(arg.items) for arg in args if isinstance(arg, VectorValue)}
     if not lengths:
         return apply(name, [arg for arg in args if isinstance(arg, Number)], span, scope)
     check_lengths(lengths, span, scope)
     size = lengths.pop()
-    rows = [arg.items if isinstance(arg, Vector) else (arg,) * size for arg in args]
-    return Vector(tuple(apply(name, row, span, scope) for row in zip(*rows, strict=True)), span)
+    rows = [arg.items if isinstance(arg, VectorValue) else (arg,) * size for arg in args]
+    return VectorValue(tuple(apply(name, row, span, scope) for row in zip(*rows, strict=True)), span)
 
 
 def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
@@ -595,21 +597,21 @@ def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
         scope.fail(Diagnostic("E205", f"vectors of {short} and {long} components do not go together", span))
 
 
-def negate(value: Number | Vector, span: Span) -> Number | Vector:
+def negate(value: Number | VectorValue, span: Span) -> Number | VectorValue:
     """`-value`."""
     if isinstance(value, Number):
         return negated(value, span)
-    return Vector(tuple(negated(item, span) for item in value.items), span)
+    return VectorValue(tuple(negated(item, span) for item in value.items), span)
 
 
-def minus(left: Vector, right: Vector, span: Span, scope: Scope) -> Vector:
+def minus(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> VectorValue:
     """Return the difference of two points of equal dimension. Raises Failed (E203, E205)."""
     check_lengths({len(left.items), len(right.items)}, span, scope)
     pairs = zip(left.items, right.items, strict=True)
-    return Vector(tuple(gap(a, b, span, scope) for a, b in pairs), span)
+    return VectorValue(tuple(gap(a, b, span, scope) for a, b in pairs), span)
 
 
-def norm(vector: Vector, span: Span, scope: Scope) -> Number:
+def norm(vector: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the Euclidean length."""
     return apply("norm", vector.items, span, scope)
 
@@ -619,14 +621,14 @@ def total(items: Sequence[Number], span: Span, scope: Scope) -> Number:
     return reduce(lambda a, b: apply("add", (a, b), span, scope), items)
 
 
-def dot(left: Vector, right: Vector, span: Span, scope: Scope) -> Number:
+def dot(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the inner product."""
     products = broadcast("mul", (left, right), span, scope)
-    assert isinstance(products, Vector)
+    assert isinstance(products, VectorValue)
     return total(products.items, span, scope)
 
 
-def cross(left: Vector, right: Vector, span: Span, scope: Scope) -> Number | Vector:
+def cross(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Number | VectorValue:
     """Return the cross product: a number in 2D, a vector in 3D."""
 
     def minor(i: int, j: int) -> Number:
@@ -638,7 +640,7 @@ def cross(left: Vector, right: Vector, span: Span, scope: Scope) -> Number | Vec
         case 2, 2:
             return minor(0, 1)
         case 3, 3:
-            return Vector((minor(1, 2), minor(2, 0), minor(0, 1)), span)
+            return VectorValue((minor(1, 2), minor(2, 0), minor(0, 1)), span)
         case m, n:
             message = f"`cross` takes two vectors of 2 or of 3 components, these have {m} and {n}"
             return scope.fail(Diagnostic("E205", message, span))

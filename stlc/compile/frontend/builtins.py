@@ -22,19 +22,19 @@ from stlc.compile.frontend.regions import area, dimension, points, signed_distan
 from stlc.compile.frontend.scope import External, Scope
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Ball,
     Box,
     Combined,
     Complement,
     Dilated,
     HalfSpace,
+    NormBall,
     Number,
     Polygon,
     Region,
     Swept,
     TimeExpr,
     Value,
-    Vector,
+    VectorValue,
     literal,
     noun,
 )
@@ -114,7 +114,7 @@ def _as_region(name: str, expr: ast.Expr, value: Value, scope: Scope) -> Region:
     return scope.fail(Diagnostic("E205", f"`{name}` takes regions, this is {noun(value)}", expr.span))
 
 
-def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Ball:
+def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> NormBall:
     center = as_vector(given[0][1], given[0][0], Expectation(f"the center of a {name} is a vector"), scope)
     radius = as_number(given[1][1], given[1][0], Expectation(f"the radius of a {name} is a number"), scope)
     if name == "circle" and len(center.items) != 2:
@@ -124,7 +124,7 @@ def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]],
         )
     if radius.constant is not None and radius.constant < 0:
         scope.fail(Diagnostic("E205", "a radius is not negative", given[1][0].span))
-    return Ball(center, radius, call.span)
+    return NormBall(center, radius, call.span)
 
 
 def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Box:
@@ -199,8 +199,8 @@ def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: 
     match value:
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
-        case Vector(items):
-            return Vector(tuple(_later(item, delay, span) for item in items), span)
+        case VectorValue(items):
+            return VectorValue(tuple(_later(item, delay, span) for item in items), span)
         case _:
             return _delayed_formula(as_formula(value, expr, Expectation(name), scope), delay, span)
 
@@ -227,18 +227,18 @@ def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
     """Return the difference from the previous sample."""
     now = (
         value
-        if isinstance(value, Vector)
+        if isinstance(value, VectorValue)
         else as_number(value, expr, Expectation("`delta` takes numbers"), scope)
     )
     before = _shifted(now, typed.Time(steps=Fraction(-1)), expr, span, "`delta`", scope)
-    assert isinstance(before, Number | Vector)
+    assert isinstance(before, Number | VectorValue)
     return broadcast("sub", (now, before), span, scope)
 
 
-def _swept_point(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Vector:
-    if isinstance(value, Vector):
+def _swept_point(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> VectorValue:
+    if isinstance(value, VectorValue):
         return value
-    return Vector((as_number(value, expr, need, scope),), expr.span)
+    return VectorValue((as_number(value, expr, need, scope),), expr.span)
 
 
 def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
@@ -284,7 +284,7 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     numbers = [_output(entry, index, tuple(flat)) for index in range(entry.result or 1)]
     if entry.result is None:
         return replace(numbers[0], span=call.span)
-    return Vector(tuple(numbers), call.span)
+    return VectorValue(tuple(numbers), call.span)
 
 
 def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
@@ -365,10 +365,10 @@ def _no_samplers(name: str, call: ast.Call, scope: Scope) -> Diagnostic:
 
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Apply a function of the table component by component, or over all components at once."""
-    items: list[Number | Vector] = []
+    items: list[Number | VectorValue] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
         need = Expectation(f"`{name}` takes numbers", f"argument {index}")
-        if isinstance(value, Vector):
+        if isinstance(value, VectorValue):
             items.append(value)
         elif name == "choice":
             items.append(loose_number(value, arg.value, need, scope))
@@ -376,7 +376,7 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
             items.append(as_number(value, arg.value, need, scope))
     function = FUNCTIONS[name]
     if function.most is None and function.kind == "function" and items:
-        flat = [n for item in items for n in (item.items if isinstance(item, Vector) else (item,))]
+        flat = [n for item in items for n in (item.items if isinstance(item, VectorValue) else (item,))]
         return apply(name, flat, call.span, scope) if flat else Number(ir.Const(0.0), span=call.span)
     count_arguments(name, call, function.least, function.most, scope)
     return broadcast(name, items, call.span, scope)

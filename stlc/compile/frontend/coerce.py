@@ -8,7 +8,7 @@ from stlc.compile.frontend.arithmetic import apply, half
 from stlc.compile.frontend.intervals import out_of_place
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import EnumMember as Member
-from stlc.compile.frontend.values import Number, TimeExpr, Value, Vector, describe, noun
+from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue, describe, noun
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
@@ -88,9 +88,9 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
     return condition(formula)
 
 
-def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Vector:
+def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> VectorValue:
     """Return the value as a vector of numbers. Raises Failed (E205)."""
-    if isinstance(value, Vector):
+    if isinstance(value, VectorValue):
         return value
     message = f"{need.who}; {need.which} is {noun(value)}"
     return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
@@ -121,7 +121,7 @@ def _as_comparison(value: Value, expr: ast.Expr) -> tuple[str, ...]:
             return (f"did you mean `{text} > 0` or `{left.span.text} > {right.span.text}`?",)
         case Number(), _:
             return (f"did you mean `{text} > 0`?",)
-        case Vector(), _:
+        case VectorValue(), _:
             return ("compare one component, its `norm`, or use `in` with a region",)
         case _:
             return ()

@@ -19,7 +19,7 @@ from stlc.compile.frontend.values import (
     Region,
     Swept,
     Value,
-    Vector,
+    VectorValue,
     is_formula,
     noun,
 )
@@ -113,7 +113,7 @@ def _compared(*sides: Number) -> Unit:
 
 def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> None:
     for expr, value in (left, right):
-        if isinstance(value, Vector):
+        if isinstance(value, VectorValue):
             help_ = (f"`norm({expr.span.text})`, one component, or `in` with a region",)
             scope.fail(
                 Diagnostic("E205", f"`{op}` does not compare vectors", expr.span, noun(value)[2:], help=help_)
@@ -226,7 +226,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
             as_number(value, end, Expectation("`in [lo, hi]` compares numbers", "a bound"), scope)
             for end, value in region
         ]
-        place: Region = Box(Vector((ends[0],)), Vector((ends[1],)), expr.region.span)
+        place: Region = Box(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
     elif isinstance(region[0].value, REGION_TYPES):
         place = region[0].value
     else:
@@ -244,7 +244,7 @@ def in_region(item: Operand, region: Operand, span: Span, scope: Scope) -> typed
         scope.fail(
             Diagnostic("E205", f"`in` needs a region, this is {noun(place)}", region_expr.span, help=help_)
         )
-    if not isinstance(point, Vector):
+    if not isinstance(point, VectorValue):
         message = f"`in` asks where a point is, this is {noun(point)}"
         scope.fail(
             Diagnostic("E205", message, point_expr.span, help=("write the point as a vector: `[x, y]`",))

@@ -23,7 +23,7 @@ from stlc.compile.frontend.scope import (
     member_entries,
 )
 from stlc.compile.frontend.tags import refuse_tags
-from stlc.compile.frontend.values import Number, TimeExpr, Value, Vector
+from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
@@ -463,7 +463,7 @@ def _column_entry(
 
 def _read_in(value: Value, unit: Unit) -> Value:
     """Return a signal with the unit that the file declares, independent of the system's stored unit."""
-    if isinstance(value, Vector):
+    if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value
 

@@ -29,7 +29,7 @@ from stlc.compile.frontend.values import (
     Swept,
     TimeExpr,
     Value,
-    Vector,
+    VectorValue,
     at,
     is_formula,
     literal,
@@ -90,13 +90,13 @@ def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
         return _choice_of_formulas(expr, cond, (yes, no), scope)
     if _is_bool(yes) and _is_bool(no) and not is_state(cond):
         return _choice_of_formulas(expr, cond, (yes, no), scope)
-    if not (isinstance(yes, Vector) and isinstance(no, Vector)):
+    if not (isinstance(yes, VectorValue) and isinstance(no, VectorValue)):
         return _choose(expr, cond, (yes, no), scope)
     if len(yes.items) != len(no.items):
         message = f"vectors of {len(yes.items)} and {len(no.items)} components do not go together"
         scope.fail(Diagnostic("E205", message, expr.span))
     pairs = zip(yes.items, no.items, strict=True)
-    return Vector(tuple(_choose(expr, cond, pair, scope) for pair in pairs), expr.span)
+    return VectorValue(tuple(_choose(expr, cond, pair, scope) for pair in pairs), expr.span)
 
 
 def _is_bool(value: Value) -> bool:
@@ -183,12 +183,12 @@ def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
     need = Expectation("a vector holds numbers", "this component")
     pairs = zip(values, expr.items, strict=True)
-    return Vector(tuple(as_number(value, item, need, scope) for value, item in pairs), expr.span)
+    return VectorValue(tuple(as_number(value, item, need, scope) for value, item in pairs), expr.span)
 
 
 def _index(expr: ast.Index, values: Sequence[Value], scope: Scope) -> Value:
     base, index = values
-    if not isinstance(base, Vector):
+    if not isinstance(base, VectorValue):
         scope.fail(Diagnostic("E205", "only a vector has components", expr.base.span))
     number = as_number(index, expr.index, Expectation("an index is a whole number"), scope)
     value = number.constant
@@ -206,10 +206,10 @@ def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
     (value,) = values
     if isinstance(value, TimeExpr):
         return moments.negative(value, expr.span, scope)
-    if not isinstance(value, Vector):
+    if not isinstance(value, VectorValue):
         value = as_number(value, expr.operand, Expectation("`-` takes a number"), scope)
     if not isinstance(expr.operand, ast.Quantity):  # -5 degC is a literal: a temperature cannot be negated
-        for item in value.items if isinstance(value, Vector) else (value,):
+        for item in value.items if isinstance(value, VectorValue) else (value,):
             refuse_point("`-`", item, expr.operand.span, scope)
     return negate(value, expr.span)
 
@@ -221,9 +221,9 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
             expr.op, Operand(expr.left, left), Operand(expr.right, right), expr.span, scope
         )
     who = f"`{expr.op}` {_VERBS[expr.op]} numbers"
-    sides: list[Number | Vector] = []
+    sides: list[Number | VectorValue] = []
     for value, side, which in ((left, expr.left, "left"), (right, expr.right, "right")):
-        if isinstance(value, Vector):
+        if isinstance(value, VectorValue):
             sides.append(value)
         else:
             sides.append(as_number(value, side, Expectation(who, f"the {which} side"), scope))
@@ -232,9 +232,11 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
     return broadcast(OPERATORS[expr.op], sides, place if expr.op in "+-%" else expr.span, scope)
 
 
-def _refuse_products(expr: ast.Binary, sides: Sequence[Number | Vector], place: Span, scope: Scope) -> None:
+def _refuse_products(
+    expr: ast.Binary, sides: Sequence[Number | VectorValue], place: Span, scope: Scope
+) -> None:
     """Reject sums of a vector and a number, and products of two vectors."""
-    vectors = [isinstance(side, Vector) for side in sides]
+    vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
         scope.fail(Diagnostic("E205", f"`{expr.op}` does not mix a vector and a number", place))
     if expr.op == "*" and all(vectors):
@@ -603,9 +605,9 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
     bound: dict[str, tuple[Value, Cost]] = {}
     values = evaluate_all([value for _, value in expr.bindings], scope)
     for (name, written), value in zip(expr.bindings, values, strict=True):
-        if isinstance(value, Vector):
+        if isinstance(value, VectorValue):
             items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
-            bound[name] = (Vector(tuple(items), written.span), Cost(1, 1))
+            bound[name] = (VectorValue(tuple(items), written.span), Cost(1, 1))
         else:
             number = loose_number(value, written, Expectation("`freeze` binds numbers and vectors"), scope)
             bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))

@@ -14,7 +14,7 @@ from stlc.compile.frontend.values import (
     Number,
     Region,
     Value,
-    Vector,
+    VectorValue,
     describe,
     noun,
 )
@@ -121,7 +121,7 @@ def resolve_numbers(
     try:
         with scope.meter.fresh():
             value = evaluate(expr, scope)
-            items: tuple[Value, ...] = value.items if isinstance(value, Vector) else (value,)
+            items: tuple[Value, ...] = value.items if isinstance(value, VectorValue) else (value,)
             return tuple(_stored_value(item, expr, expected, what, scope) for item in items)
     except Failed:
         raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None

@@ -12,7 +12,7 @@ from stlc.source import Span
 from stlc.units import Unit
 
 
-class Function(Protocol):
+class InterfaceFunction(Protocol):
     """Function of the system, such as forward kinematics."""
 
     def bound(
@@ -48,7 +48,7 @@ class Interface:
     signature: Signature
     constants: Mapping[str, tuple[float, Unit]] = field(default_factory=dict)
     externs: frozenset[str] = frozenset()
-    functions: Mapping[str, Function] = field(default_factory=dict)
+    functions: Mapping[str, InterfaceFunction] = field(default_factory=dict)
     path: str = ""
     places: Mapping[str, Span] = field(default_factory=dict)
 

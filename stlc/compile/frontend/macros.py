@@ -7,7 +7,7 @@ from dataclasses import replace
 from stlc.compile.frontend.arithmetic import in_unit, on_scale
 from stlc.compile.frontend.coerce import Expectation, as_formula, as_number
 from stlc.compile.frontend.scope import MAX_LEVELS, MAX_NODES, Definition, Meter, Scope
-from stlc.compile.frontend.values import REGION_TYPES, Number, TimeExpr, Value, Vector, noun, unit_text
+from stlc.compile.frontend.values import REGION_TYPES, Number, TimeExpr, Value, VectorValue, noun, unit_text
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import REGIONS
 from stlc.diagnostics import Diagnostic
@@ -56,7 +56,7 @@ def finished(entry: Definition, value: Value, scope: Scope) -> Value:
 
 
 def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
-    items = value.items if isinstance(value, Vector) else (value,)
+    items = value.items if isinstance(value, VectorValue) else (value,)
     for item in items:
         known = isinstance(item, Number) and item.constant is not None
         if known or isinstance(item, typed.Truth) or (isinstance(item, TimeExpr) and not item.end):
@@ -68,7 +68,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
     """Convert to the declared unit: a bare number takes it, any other must agree."""
-    if isinstance(value, Vector):
+    if isinstance(value, VectorValue):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)
     return _number_in(value, unit, span, scope) if isinstance(value, Number) else value

@@ -13,7 +13,7 @@ from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.expressions import resolve_numbers, stored
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.support import columns_of
@@ -133,7 +133,7 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
     here = scope.extended({}, samplers=True)
     values = [evaluate(expr, here) for _ in columns]
     first = values[0]
-    if isinstance(first, Vector):
+    if isinstance(first, VectorValue):
         if len(first.items) != len(columns):
             message = f"this has {len(first.items)} components, not {len(columns)}"
             scope.fail(Diagnostic("E205", message, expr.span))

@@ -12,16 +12,16 @@ from itertools import combinations
 from stlc.compile.frontend.arithmetic import agree, apply, cross, dot, gap, minus, negated, norm
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
-    Ball,
     Box,
     Combined,
     Complement,
     Dilated,
     HalfSpace,
+    NormBall,
     Number,
     Polygon,
     Region,
-    Vector,
+    VectorValue,
     literal,
 )
 from stlc.compile.ir import nodes as ir
@@ -31,7 +31,7 @@ from stlc.source import Span
 PlanePoint = tuple[float, float]
 
 
-def points(corners: Sequence[Vector]) -> tuple[PlanePoint, ...] | None:
+def points(corners: Sequence[VectorValue]) -> tuple[PlanePoint, ...] | None:
     """Return the corners as floats in SI units, or None unless all are constant points in 2D."""
     found: list[PlanePoint] = []
     for corner in corners:
@@ -66,14 +66,14 @@ def _crossing(first: tuple[PlanePoint, PlanePoint], second: tuple[PlanePoint, Pl
     return turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
 
 
-def convex(corners: Sequence[Vector]) -> bool:
+def convex(corners: Sequence[VectorValue]) -> bool:
     """True if a simple polygon with known, counter-clockwise corners is convex."""
     plain = points(corners)
     assert plain is not None
     return all(turn(plain[i - 2], plain[i - 1], plain[i]) >= 0 for i in range(len(plain)))
 
 
-def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
+def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
     """Decompose a polygon into triangles by ear clipping; a convex one is returned whole.
 
     Args:
@@ -84,7 +84,7 @@ def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
     left = list(range(len(corners)))
     if convex(corners):
         return [tuple(corners)]
-    cut: list[tuple[Vector, ...]] = []
+    cut: list[tuple[VectorValue, ...]] = []
     while len(left) > 3:
         ear = next((k for k in range(len(left)) if _is_ear(plain, left, k)), 0)
         a, b, c = left[ear - 1], left[ear], left[(ear + 1) % len(left)]
@@ -107,7 +107,7 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
 def dimension(region: Region) -> int | None:
     """Return the dimension of a region; None if it fits any."""
     match region:
-        case Ball(center):
+        case NormBall(center):
             return len(center.items)
         case Box(lower):
             return len(lower.items)
@@ -121,7 +121,7 @@ def dimension(region: Region) -> int | None:
             return dimension(inner)
 
 
-def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> Number:
+def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
     """Return the signed distance of `point` to the boundary of `region`, in SI units; positive inside.
 
     Raises:
@@ -132,7 +132,7 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
         message = f"a point of {len(point.items)} components and a region of {size} do not go together"
         scope.fail(Diagnostic("E205", message, span))
     match region:
-        case Ball(center, radius):
+        case NormBall(center, radius):
             away = norm(minus(point, center, span, scope), span, scope)
             return apply("sub", (radius, away), span, scope)
         case Box(lower, upper):
@@ -151,7 +151,7 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
             return negated(signed_distance(point, inside, span, scope), span)
 
 
-def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) -> Number:
+def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
     """Signed distance to a box: min distance to a face inside; minus the Euclidean distance outside."""
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
@@ -169,7 +169,7 @@ def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) 
     return apply("sub", (inside, apply("norm", beyond, span, scope)), span, scope)
 
 
-def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope) -> Number:
+def _polygon(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> Number:
     """Signed distance to a polygon: distance to the nearest edge, positive inside one of its triangles."""
     edges = zip(corners, (*corners[1:], corners[0]), strict=True)
     nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
@@ -180,16 +180,16 @@ def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope)
     )
 
 
-def to_segment(point: Vector, start: Vector, end: Vector, span: Span, scope: Scope) -> Number:
+def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the distance of a point to a segment."""
     along, ahead = minus(end, start, span, scope), minus(point, start, span, scope)
     share = apply("div", (dot(ahead, along, span, scope), dot(along, along, span, scope)), span, scope)
     share = apply("clip", (share, literal(0, span), literal(1, span)), span, scope)
-    foot = Vector(tuple(apply("mul", (share, item), span, scope) for item in along.items), span)
+    foot = VectorValue(tuple(apply("mul", (share, item), span, scope) for item in along.items), span)
     return norm(minus(ahead, foot, span, scope), span, scope)
 
 
-def _left_of_all(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope) -> ir.Formula:
+def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
     """True if the point lies left of every edge of a convex, counter-clockwise polygon."""
     atoms = []
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):

@@ -25,7 +25,7 @@ from stlc.compile.frontend.modules import Module, load_modules
 from stlc.compile.frontend.parameters import parameters, read_overrides
 from stlc.compile.frontend.scope import Definition, Failed, Scope, enforced
 from stlc.compile.frontend.tags import Tags, nominal, reach_of_formula, reach_of_number, read_tags
-from stlc.compile.frontend.values import Number, Value, Vector
+from stlc.compile.frontend.values import Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
@@ -255,7 +255,7 @@ def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
     match value:
         case Number() if value.constant is not None:
             return [(name, absolute(value).constant or 0.0)]
-        case Vector(items):
+        case VectorValue(items):
             return [(f"{name}[{i}]", absolute(item).constant or 0.0) for i, item in enumerate(items)]
         case typed.Truth(_, truth):
             return [(name, float(truth))]

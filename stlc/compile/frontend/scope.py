@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, NoReturn, TypeAlias
 
-from stlc.compile.frontend.values import EnumMember, Number, Origin, Value, Vector
+from stlc.compile.frontend.values import EnumMember, Number, Origin, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
@@ -272,8 +272,8 @@ def column_entries(
             entries[column.name] = Known(value, about, span)
             continue
         before = entries.get(match["name"])
-        items = before.value.items if before is not None and isinstance(before.value, Vector) else ()
-        entries[match["name"]] = Known(Vector((*items, value)), about, span)
+        items = before.value.items if before is not None and isinstance(before.value, VectorValue) else ()
+        entries[match["name"]] = Known(VectorValue((*items, value)), about, span)
     return entries
 
 

@@ -18,16 +18,16 @@ from stlc.compile.frontend.arithmetic import apply, cross, dot, gap, minus, nega
 from stlc.compile.frontend.regions import convex, dimension, signed_distance, to_segment
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
-    Ball,
     Box,
     Combined,
     Complement,
     Dilated,
     HalfSpace,
+    NormBall,
     Number,
     Polygon,
     Region,
-    Vector,
+    VectorValue,
     literal,
 )
 from stlc.compile.ir import nodes as ir
@@ -44,7 +44,7 @@ Pair = tuple[Number, Number]
 """A number at both ends of the segment; linear in between."""
 
 
-def swept_distance(point: Vector, region: Region, span: Span, scope: Scope) -> Number:
+def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
     """Return the least signed distance along the segment that starts at `point` now.
 
     Raises:
@@ -60,7 +60,7 @@ def swept_distance(point: Vector, region: Region, span: Span, scope: Scope) -> N
 class _Sweep:
     """Distance computations along one segment."""
 
-    def __init__(self, point: Vector, span: Span, scope: Scope) -> None:
+    def __init__(self, point: VectorValue, span: Span, scope: Scope) -> None:
         self.ends = (point, _vector_later(point))
         self.span, self.scope = span, scope
 
@@ -89,7 +89,7 @@ class _Sweep:
                 return self.apply("add", self.greatest(inside), self.apply("max", *_both(margin)))
             case Complement(inside):
                 return self.negative(self.least(inside))
-            case Ball(center, radius):
+            case NormBall(center, radius):
                 return self.apply("sub", self.apply("max", *_both(radius)), self.past(center))
             case HalfSpace():
                 return self.apply("max", *self.at_ends(region))
@@ -117,7 +117,7 @@ class _Sweep:
         outside: list[Number] = []
         if size == 2:
             corners = product(*zip(box.lower.items, box.upper.items, strict=True))
-            outside = [self.negative(self.past(Vector(corner))) for corner in corners]
+            outside = [self.negative(self.past(VectorValue(corner))) for corner in corners]
         elif size > 2:
             outside = self._approaches(faces)
         return self._over(faces, (*self.at_ends(box), *outside))
@@ -187,7 +187,7 @@ class _Sweep:
 
     # ------------------------------------------------------------------------ polygons
 
-    def _edges(self, corners: Sequence[Vector]) -> list[Pair]:
+    def _edges(self, corners: Sequence[VectorValue]) -> list[Pair]:
         """Signed distances of both ends of the segment to every edge, positive on the left."""
         found = []
         for start, stop in _cycle(corners):
@@ -201,7 +201,7 @@ class _Sweep:
             found.append((sides[0], sides[1]))
         return found
 
-    def _clearances(self, corners: Sequence[Vector]) -> list[Number]:
+    def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
         """Distance of the segment to every edge; negative crossing depth where they cross."""
         past = [self.past(corner) for corner in corners]
         turns = [self._turn(corner) for corner in corners]
@@ -218,7 +218,7 @@ class _Sweep:
             found.append(self._choose(crossing, self.negative(gap), gap))
         return found
 
-    def _turn(self, corner: Vector) -> Number:
+    def _turn(self, corner: VectorValue) -> Number:
         """Side of the segment on which a corner lies, as the sign of a cross product."""
         now, then = self.ends
         along, ahead = minus(then, now, self.span, self.scope), minus(corner, now, self.span, self.scope)
@@ -236,7 +236,7 @@ class _Sweep:
             signed_distance(then, _region_later(region), self.span, self.scope),
         )
 
-    def past(self, place: Vector) -> Number:
+    def past(self, place: VectorValue) -> Number:
         """Least distance of the segment to a point that may move in a straight line."""
         now, then = (
             minus(end, there, self.span, self.scope)
@@ -249,7 +249,7 @@ class _Sweep:
             self.apply("add", a, self.apply("mul", share, b))
             for a, b in zip(now.items, along.items, strict=True)
         )
-        return norm(Vector(moved), self.span, self.scope)
+        return norm(VectorValue(moved), self.span, self.scope)
 
     def _ratio(self, upper: Number, lower: Number) -> Number:
         """Quotient of squares, kept finite for a segment of length 0, where its value does not matter."""
@@ -277,7 +277,7 @@ class _Sweep:
         return negated(number, self.span)
 
 
-def _cycle(corners: Sequence[Vector]) -> list[tuple[Vector, Vector]]:
+def _cycle(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, VectorValue]]:
     return list(zip(corners, (*corners[1:], corners[0]), strict=True))
 
 
@@ -290,14 +290,14 @@ def _number_later(number: Number) -> Number:
     return replace(number, num=shifted(number.num, 1, clamped=True))
 
 
-def _vector_later(vector: Vector) -> Vector:
+def _vector_later(vector: VectorValue) -> VectorValue:
     return replace(vector, items=tuple(map(_number_later, vector.items)))
 
 
 def _region_later(region: Region) -> Region:
     """Return the region at the next sample; at the last sample, the region there."""
     match region:
-        case Ball(center, radius):
+        case NormBall(center, radius):
             return replace(region, center=_vector_later(center), radius=_number_later(radius))
         case Box(lower, upper):
             return replace(region, lower=_vector_later(lower), upper=_vector_later(upper))

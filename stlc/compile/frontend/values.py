@@ -63,7 +63,7 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class Vector:
+class VectorValue:
     """Scalars in order."""
 
     items: tuple[Number, ...]
@@ -101,15 +101,15 @@ class Operand(NamedTuple):
 class Swept:
     """`sweep(p)`: segment from a point to its position at the next sample."""
 
-    point: Vector
+    point: VectorValue
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Ball:
+class NormBall:
     """Points at most `radius` from `center`; a disc in 2D."""
 
-    center: Vector
+    center: VectorValue
     radius: Number
     span: Span | None = field(default=None, compare=False, repr=False)
 
@@ -118,8 +118,8 @@ class Ball:
 class Box:
     """Points between two corners, component by component."""
 
-    lower: Vector
-    upper: Vector
+    lower: VectorValue
+    upper: VectorValue
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
@@ -127,7 +127,7 @@ class Box:
 class Polygon:
     """Simple polygon in 2D with constant corners in counter-clockwise order."""
 
-    corners: tuple[Vector, ...]
+    corners: tuple[VectorValue, ...]
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
@@ -135,7 +135,7 @@ class Polygon:
 class HalfSpace:
     """Points with `normal . p <= offset`."""
 
-    normal: Vector
+    normal: VectorValue
     offset: Number
     span: Span | None = field(default=None, compare=False, repr=False)
 
@@ -166,9 +166,9 @@ class Complement:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
-Region: TypeAlias = Ball | Box | Polygon | HalfSpace | Combined | Dilated | Complement
-REGION_TYPES = (Ball, Box, Polygon, HalfSpace, Combined, Dilated, Complement)
-Value: TypeAlias = Number | Vector | Swept | EnumMember | TimeExpr | Region | typed.Formula
+Region: TypeAlias = NormBall | Box | Polygon | HalfSpace | Combined | Dilated | Complement
+REGION_TYPES = (NormBall, Box, Polygon, HalfSpace, Combined, Dilated, Complement)
+Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region | typed.Formula
 
 
 def is_formula(value: Value) -> bool:
@@ -198,7 +198,7 @@ def describe(value: Value) -> str:
     match value:
         case Number():
             return f"{value.kind} {unit_text(value)}".rstrip()
-        case Vector():
+        case VectorValue():
             unit = unit_text(value.items[0]) if value.items else ""
             return f"vector of {len(value.items)} {unit}".rstrip()
         case Swept():

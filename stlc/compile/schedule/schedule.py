@@ -319,7 +319,7 @@ class Schedule:
 
 
 @dataclass(slots=True)
-class Scope:
+class StepScope:
     """Steps of one loop level, with an index of the values that they compute."""
 
     steps: list[Step] = field(default_factory=list)
@@ -331,7 +331,7 @@ class Scheduler:
 
     def __init__(self, domain: TraceDomain) -> None:
         self.domain = domain
-        self.scope = Scope()
+        self.scope = StepScope()
         self._count = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:

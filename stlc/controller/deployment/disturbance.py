@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
@@ -170,7 +170,7 @@ class _Event:
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
         self.draws = [Drawing(assign) for assign in decl.sets]
-        self.when = Program({_CONDITION: ir.Indicator(decl.when)}) if decl.when is not None else None
+        self.when = ArrayProgram({_CONDITION: ir.Indicator(decl.when)}) if decl.when is not None else None
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:

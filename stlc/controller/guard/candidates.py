@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -199,7 +199,7 @@ class Limits:
     paper: float | None = None
 
 
-def grid_of(task: Task) -> Grid:
+def grid_of(task: Task) -> PrefixGrid:
     """Control grid of a system: `levels` of its backup or of a control, else evenly spaced values."""
     decl = task.system.decl
     values = tuple(
@@ -209,4 +209,4 @@ def grid_of(task: Task) -> Grid:
         for control in decl.controls
     )
     lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)
-    return Grid(values, lengths, decl.backup.batch, decl.backup.samples, decl.backup.sampling)
+    return PrefixGrid(values, lengths, decl.backup.batch, decl.backup.samples, decl.backup.sampling)

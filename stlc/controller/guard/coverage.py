@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.controller.problem.task import Task
-    from stlc.runtime.prefixes import Grid
+    from stlc.runtime.prefixes import PrefixGrid
 
 RADII = (0.01, 0.02, 0.05, 0.1, 0.2, 0.25)
 """Radii as shares of the control ranges."""
@@ -75,7 +75,7 @@ class Chance:
     sampled: bool = False
 
 
-def axes_of(task: Task, grid: Grid) -> tuple[Axis, ...]:
+def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
     """The controls of a task with their grid values."""
     controls = zip(task.system.controls, grid.values, strict=True)
     return tuple(Axis(each.name, each.low, each.high, tuple(sorted(values))) for each, values in controls)
@@ -105,7 +105,7 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
     )
 
 
-def chances(task: Task, grid: Grid, radii: Sequence[float] = RADII) -> list[Chance]:
+def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
     """Probabilities for all radii and all prefix lengths of the grid."""
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

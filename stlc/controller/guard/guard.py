@@ -15,7 +15,7 @@ from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import rank
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
@@ -92,7 +92,7 @@ class Guard:
         policy: Policy,
         mode: Mode = "paper",
         *,
-        grid: Grid | None = None,
+        grid: PrefixGrid | None = None,
         limits: Limits | None = None,
     ) -> None:
         self.task, self.mode = task, mode

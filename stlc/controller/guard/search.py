@@ -19,7 +19,7 @@ from stlc.controller.training.local_search import Searcher
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
-    from stlc.runtime.prefixes import Grid
+    from stlc.runtime.prefixes import PrefixGrid
 
 
 class StagedSearch:
@@ -39,7 +39,7 @@ class StagedSearch:
         policy: Policy,
         guard: str,
         *,
-        grid: Grid | None = None,
+        grid: PrefixGrid | None = None,
         limits: Limits | None = None,
     ) -> None:
         self.task, self.limits = task, limits or Limits()
@@ -90,7 +90,7 @@ class RelaxedSearch:
     """
 
     def __init__(
-        self, task: Task, strict: Task, policy: Policy, *, grid: Grid | None = None, limits: Limits
+        self, task: Task, strict: Task, policy: Policy, *, grid: PrefixGrid | None = None, limits: Limits
     ) -> None:
         seconds = None if limits.seconds is None else limits.seconds / 2
         half = replace(limits, seconds=seconds)

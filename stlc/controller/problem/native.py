@@ -18,7 +18,7 @@ from torch import Tensor
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.c.numbers import Untranslatable
-from stlc.native import Adjoint, Climb, Kernel, Outcome, Stop, load, never, why_none
+from stlc.native import Adjoint, Climb, Kernel, ObjectiveSlopes, Stop, load, never, why_none
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ class _Judged(torch.autograd.Function):
             by_each = u.new_zeros(len(u), ctx.native.judge.rules)
         gradient = ctx.native.adjoint.pull(
             *(part.detach().double().numpy() for part in (x0, u)),
-            Outcome(
+            ObjectiveSlopes(
                 by_each.double().numpy(),
                 None if by_columns is None else by_columns.double().numpy(),
                 ctx.slope,

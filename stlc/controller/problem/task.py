@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
@@ -301,9 +301,13 @@ class Task:
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
-    def _pull(self) -> Program | None:
+    def _pull(self) -> ArrayProgram | None:
         """Guidance cost: distance to the next goal of the mission, per sample."""
-        return None if self.compiled.guidance_cost is None else Program({"gap": self.compiled.guidance_cost})
+        return (
+            None
+            if self.compiled.guidance_cost is None
+            else ArrayProgram({"gap": self.compiled.guidance_cost})
+        )
 
     def alive(self, x: Tensor) -> Tensor:
         """States from which the mission can still satisfy every requirement: (B, n) -> (B,) booleans."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stlc.compile.frontend.scope import Entry as Name
 from stlc.compile.frontend.scope import Known
-from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, column_assign, shared_draws, state_assigns, states_of
 from stlc.dynamics.schema.expressions import written
@@ -136,7 +136,7 @@ class _Drawn:
     """States and local names that have a value so far in a situation."""
 
     states: frozenset[str] = frozenset()
-    locals: tuple[tuple[str, Number | Vector], ...] = ()
+    locals: tuple[tuple[str, Number | VectorValue], ...] = ()
 
     def drawing(self, cx: Context) -> Context:
         """Context for expressions that may draw, and read names with a value."""
@@ -145,8 +145,8 @@ class _Drawn:
         return cx.drawing(entries, ready)
 
 
-def _columns_of(name: str, value: Number | Vector) -> tuple[str, ...]:
-    return component_names(name, len(value.items) if isinstance(value, Vector) else None)
+def _columns_of(name: str, value: Number | VectorValue) -> tuple[str, ...]:
+    return component_names(name, len(value.items) if isinstance(value, VectorValue) else None)
 
 
 def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
@@ -263,7 +263,7 @@ class _Draws:
         node = self.lets.pop(name)
         self._needed(node)
         numbers = self.drawn.drawing(self.cx).here.numbers(node, f"`{name}`")
-        known: Number | Vector = Number(ir.Const(0.0), flexible=True)
+        known: Number | VectorValue = Number(ir.Const(0.0), flexible=True)
         if numbers is not None:
             vector = len(numbers) > 1 or isinstance(node, Sequence)
             called = component_names(name, len(numbers) if vector else None)
@@ -275,7 +275,7 @@ class _Draws:
                 replace(number, num=ir.Signal(each), exact=None, span=None, origin=None)
                 for each, number in zip(called, numbers, strict=True)
             )
-            known = Vector(items) if vector else items[0]
+            known = VectorValue(items) if vector else items[0]
         self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))
 
 

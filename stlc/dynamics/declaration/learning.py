@@ -8,7 +8,7 @@ from typing import Any
 
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
-from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
 from stlc.dynamics.model.algebra import names_in, substitute
@@ -100,7 +100,7 @@ def _first(state: Entry) -> Known:
     match state.value:
         case Number() as number:
             return Known(_at_start(number), about)
-        case Vector(items) as vector:
+        case VectorValue(items) as vector:
             return Known(replace(vector, items=tuple(map(_at_start, items))), about)
         case _:
             return state

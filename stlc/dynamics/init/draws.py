@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import sampler_names
@@ -56,7 +56,7 @@ class _Call:
 
     name: str
     sampler: str
-    args: Program
+    args: ArrayProgram
     arity: int
 
 
@@ -67,7 +67,7 @@ class Drawing:
         self.name = assign.name
         self._calls: list[_Call] = []
         self._seen: dict[int, ir.Num] = {}
-        self._program = Program({assign.name: self._extract(assign.value)})
+        self._program = ArrayProgram({assign.name: self._extract(assign.value)})
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
@@ -87,7 +87,7 @@ class Drawing:
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:
             args = {str(i): self._extract(arg) for i, arg in enumerate(num.args)}
             name = f"draw#{len(self._calls)}"
-            self._calls.append(_Call(name, num.name, Program(args), len(args)))
+            self._calls.append(_Call(name, num.name, ArrayProgram(args), len(args)))
             found: ir.Num = ir.Signal(name)
         else:
             found = map_parts(num, self._extract)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
@@ -89,7 +89,9 @@ class InitialStates:
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
         self._where = (
-            Program({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)}) if decl.where else None
+            ArrayProgram({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)})
+            if decl.where
+            else None
         )
 
     @property

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import Hard
 
@@ -38,8 +38,8 @@ class Mirror:
         self._names = tuple(names)
         self._controls = tuple(controls)
         known = {control.name for control in controls}
-        self._states = Program({each.name: each.value for each in images if each.name not in known})
-        self._inputs = Program({each.name: each.value for each in images if each.name in known})
+        self._states = ArrayProgram({each.name: each.value for each in images if each.name not in known})
+        self._inputs = ArrayProgram({each.name: each.value for each in images if each.name in known})
         self.side = self._names.index(images[0].name)
 
     def states(self, x: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ class Mirror:
         return torch.where(swapped[..., None], image, x), swapped
 
 
-def _applied(program: Program, x: Tensor, names: Sequence[str]) -> Tensor:
+def _applied(program: ArrayProgram, x: Tensor, names: Sequence[str]) -> Tensor:
     """`x` with the columns that the program computes replaced: (…, k) -> (…, k)."""
     columns = dict(zip(names, x.unbind(-1), strict=True))
     images = program(columns, TORCH, HARD) if program.columns else {}

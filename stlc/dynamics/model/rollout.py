@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import Switch
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
-from stlc.dynamics.model.step import Step
+from stlc.dynamics.model.step import ModelStep
 
 Columns = dict[str, Tensor]
 
@@ -33,7 +33,7 @@ class _Columns:
     batch: int
     switch: Switch
 
-    def run(self, program: Program) -> Columns:
+    def run(self, program: ArrayProgram) -> Columns:
         """All outputs of a program, as tensors."""
         like = next(iter(self.states.values()))
         outputs = program(self.now, TORCH, self.switch)
@@ -98,8 +98,8 @@ class _StageRunner:
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
-        self.early = Program(stage.early) if stage.early else None
-        self.blocks = tuple(Program(block) for block in stage.blocks)
+        self.early = ArrayProgram(stage.early) if stage.early else None
+        self.blocks = tuple(ArrayProgram(block) for block in stage.blocks)
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         self.outside = tuple(sorted(read - inside))
@@ -141,10 +141,10 @@ class _StageRunner:
 class Stepper:
     """A compiled step: run once on (B,) columns, or over time on (T, B) controls."""
 
-    def __init__(self, step: Step) -> None:
+    def __init__(self, step: ModelStep) -> None:
         self.next = dict(step.next)
         numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
-        self.once = tuple(Program(block) for block in blocks(numbers))
+        self.once = tuple(ArrayProgram(block) for block in blocks(numbers))
         self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:

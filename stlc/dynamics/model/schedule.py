@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import add, map_parts, multiply, names_in
-from stlc.dynamics.model.step import Step
+from stlc.dynamics.model.step import ModelStep
 
 Lets: TypeAlias = Mapping[str, ir.Num]
 
@@ -39,7 +39,7 @@ class RolloutStage:
     lets: tuple[str, ...]
 
 
-def schedule(step: Step) -> tuple[RolloutStage, ...]:
+def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
     """Stages of a step, ordered so that each reads only states and numbers of earlier ones."""
     numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}

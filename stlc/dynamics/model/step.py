@@ -14,7 +14,7 @@ from stlc.dynamics.model.integrators._tableau import State
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ModelStep:
     """Straight-line code: each assignment reads states, controls and earlier assignments.
 
     Attributes:
@@ -45,7 +45,7 @@ class _Writer:
         return {name: self.name(name, num) for name, num in state.items()}
 
 
-def build_step(decl: SystemDecl, *, soft: bool) -> Step:
+def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.
 
     `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice. Guards and resets
@@ -63,7 +63,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
     ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
-    return Step(tuple(writer.lets), {name: state[name] for name in ordered})
+    return ModelStep(tuple(writer.lets), {name: state[name] for name in ordered})
 
 
 def commands(decl: SystemDecl) -> dict[str, ir.Num]:

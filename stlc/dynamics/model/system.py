@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.augment.timers import Timer
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
@@ -30,7 +30,7 @@ from stlc.dynamics.model.algebra import add, multiply, names_in, substitute
 from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
 from stlc.dynamics.model.rollout import Columns, Stepper
-from stlc.dynamics.model.step import Step, build_step, commands
+from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
 from stlc.files import find_system
@@ -208,9 +208,9 @@ class System:
         return command - x.new_tensor(feedback.control) - back
 
     @cached_property
-    def _commands(self) -> Program | None:
+    def _commands(self) -> ArrayProgram | None:
         found = commands(self.decl)
-        return Program(found) if found else None
+        return ArrayProgram(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """Roll out: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
@@ -252,13 +252,13 @@ class System:
     @cached_property
     def _keeper(self) -> Stepper:
         """Compiled dynamics of the timers."""
-        return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
+        return Stepper(ModelStep((), {timer.name: timer.update for timer in self.timers}))
 
     @cached_property
-    def exact_step(self) -> Step:
+    def exact_step(self) -> ModelStep:
         """One exact step in the IR, timers included, for code generators."""
         step = build_step(self.decl, soft=False)
-        return Step(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
+        return ModelStep(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
 
     def _stepper(self, switch: Switch) -> Stepper:
         soft = not switch.exact
@@ -308,10 +308,10 @@ class System:
         return torch.stack([seen[str(i)].expand(x.shape[:-1]) for i in range(self.observed_count)], -1)
 
     @cached_property
-    def _observation(self) -> Program | None:
+    def _observation(self) -> ArrayProgram | None:
         observe = self.decl.policy.observe
         seen = (*observe, *(ir.Signal(column.name) for column in self.added))
-        return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
+        return ArrayProgram({str(i): num for i, num in enumerate(seen)}) if observe else None
 
     @cached_property
     def mirror(self) -> Mirror | None:
@@ -350,7 +350,12 @@ class System:
         return total + self._mean(controlled, {**before, **inputs}, sat, rho, switch)
 
     def _mean(
-        self, program: Program | None, columns: Mapping[str, Tensor], sat: Tensor, rho: Tensor, switch: Switch
+        self,
+        program: ArrayProgram | None,
+        columns: Mapping[str, Tensor],
+        sat: Tensor,
+        rho: Tensor,
+        switch: Switch,
     ) -> Tensor:
         """Mean over time of a program's output, (B,)."""
         if program is None:
@@ -369,9 +374,11 @@ class System:
         return tuple(name for name in self.names if name + START in read)
 
     @cached_property
-    def _terms(self) -> tuple[Program | None, Program | None]:
+    def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
         """Terms of the objective as programs."""
-        states, controlled = (None if total is None else Program({"cost": total}) for total in self.objective)
+        states, controlled = (
+            None if total is None else ArrayProgram({"cost": total}) for total in self.objective
+        )
         return states, controlled
 
     @cached_property

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, SystemFileError
@@ -91,7 +91,7 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
     """Values of the function, (n, joints) -> (n, 3) m."""
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
-    program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
+    program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)
 

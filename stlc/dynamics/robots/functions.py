@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 
 from stlc.compile.backends.array.namespace import Array
-from stlc.compile.frontend.interface import Function
+from stlc.compile.frontend.interface import InterfaceFunction
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
@@ -21,7 +21,7 @@ from stlc.dynamics.declaration.init import FileDecl
 from stlc.registry import closest
 
 
-def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
+def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
     """Load the functions of a system, by name; their modules are imported, which runs their code.
 
     Raises:
@@ -92,7 +92,7 @@ class PythonFunction:
     call: Callable[..., Array]
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Bound:
-        """The function on components; see `stlc.compile.frontend.interface.Function`."""
+        """The function on components; see `stlc.compile.frontend.interface.InterfaceFunction`."""
         return Bound(self.decl, self.call, arguments, result)
 
 

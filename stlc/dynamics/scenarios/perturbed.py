@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from stlc.compile.frontend.scope import Definition, Entry, Known
-from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import moving_parts
@@ -131,7 +131,7 @@ def _times(entry: Entry, factor: ir.Num) -> Entry:
     match entry.value:
         case Number() as number:
             return replace(entry, value=_scaled(number, factor))
-        case Vector(items=items) as vector:
+        case VectorValue(items=items) as vector:
             return replace(entry, value=replace(vector, items=tuple(_scaled(item, factor) for item in items)))
         case _:
             return entry

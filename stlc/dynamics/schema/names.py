@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Definition, Entry, Known, Scope, constant_value, enforced
-from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Label, SystemFileError
 from stlc.dynamics.model.integrators import INTEGRATORS
@@ -189,7 +189,7 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
             known = absolute(number).constant or 0.0
             names.constants[component] = (known, Unit() if number.bare else number.unit)
         names.place_components(name, called)
-        value = Vector(numbers) if vector else numbers[0]
+        value = VectorValue(numbers) if vector else numbers[0]
         names.entries[name] = Known(value, "constant", entry.key.span)
 
 

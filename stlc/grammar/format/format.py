@@ -23,7 +23,7 @@ from stlc.grammar.format.layout import (
     BLANK,
     LINE,
     SOFT,
-    Column,
+    AlignedColumn,
     Doc,
     Group,
     Nest,
@@ -34,7 +34,7 @@ from stlc.grammar.format.layout import (
 )
 from stlc.grammar.format.tokens import Text, behind, gap, prepare
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.parse.tokens import Comment, Item, Layout, Token, tokenize
+from stlc.grammar.parse.tokens import Comment, Item, Token, TokenLayout, tokenize
 from stlc.source import Source
 
 # Operators at which an expression may break, loosest first; those of one row break together.
@@ -205,14 +205,14 @@ _REQUIRED = frozenset({"require_decl", "assume_decl"})
 class _Page:
     """Collected lines, each with its alignable parts."""
 
-    columns: list[Column] = field(default_factory=list)
+    columns: list[AlignedColumn] = field(default_factory=list)
 
     def add(self, text: str, *, apart: bool = False, **more: object) -> None:
         first = not self.columns
-        self.columns.append(Column(text, apart=apart and not first, **more))  # type: ignore[arg-type]
+        self.columns.append(AlignedColumn(text, apart=apart and not first, **more))  # type: ignore[arg-type]
 
 
-def lay_out(layout: Layout, unclear: Sequence[Ambiguity], *, width: int) -> str:
+def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) -> str:
     """Return the text of a layout; `unclear` parts get parentheses."""
     page = _Page()
     spans = sorted((part.span.start, part.span.end) for part in unclear)

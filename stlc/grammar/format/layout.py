@@ -179,7 +179,7 @@ _COMMENT_SPREAD = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class AlignedColumn:
     """Line with alignable columns.
 
     Attributes:
@@ -197,7 +197,7 @@ class Column:
     comment: str = ""
 
 
-def align(lines: Sequence[Column]) -> Iterator[str]:
+def align(lines: Sequence[AlignedColumn]) -> Iterator[str]:
     """Yield the aligned lines as text, including empty lines."""
     padded = _pad_heads(lines)
     for line, text in zip(padded, _with_comments(padded), strict=True):
@@ -206,7 +206,7 @@ def align(lines: Sequence[Column]) -> Iterator[str]:
         yield text.rstrip()
 
 
-def _pad_heads(lines: Sequence[Column]) -> list[Column]:
+def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
     """Pad heads to equal width among adjacent declarations of one kind."""
     result = list(lines)
     for group in _groups(lines, by_kind=True):
@@ -219,7 +219,7 @@ def _pad_heads(lines: Sequence[Column]) -> list[Column]:
     return result
 
 
-def _with_comments(lines: Sequence[Column]) -> list[str]:
+def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
     """Align the trailing comments of adjacent lines."""
     texts = [line.text for line in lines]
     for group in _groups(lines, by_kind=False):
@@ -231,7 +231,7 @@ def _with_comments(lines: Sequence[Column]) -> list[str]:
     return texts
 
 
-def _groups(lines: Sequence[Column], *, by_kind: bool) -> Iterator[list[int]]:
+def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[int]]:
     """Yield groups of adjacent whole lines; tags belong to the declaration below them."""
     group: list[int] = []
     kind = ""

@@ -38,7 +38,7 @@ class TerminalToken:
 
 
 @dataclass(slots=True)
-class Context:
+class BuildContext:
     """Context of a rule besides its children.
 
     Attributes:
@@ -57,7 +57,7 @@ def name_of(leaf: TerminalToken) -> str:
     return leaf.text[1:-1] if leaf.text.startswith("`") else leaf.text
 
 
-def own_name(context: Context, leaf: TerminalToken) -> str:
+def own_name(context: BuildContext, leaf: TerminalToken) -> str:
     """Return the declared name; `T`, `end` and `dt` need backticks."""
     if leaf.text in BUILT_IN:
         context.findings.append(
@@ -72,7 +72,7 @@ def own_name(context: Context, leaf: TerminalToken) -> str:
     return name_of(leaf)
 
 
-def unit_of(context: Context, leaf: TerminalToken | None) -> str:
+def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
     """Return the unit in a UNIT or UNIT_BRACKET token; "" without one."""
     if leaf is None:
         return ""
@@ -110,7 +110,7 @@ def near_unit(word: str) -> str | None:
     )
 
 
-def number_of(context: Context, leaf: TerminalToken) -> Fraction:
+def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:
     """Return the exact value of a NUMBER token; 0 and E005 beyond double precision."""
     match = _MANTISSA.fullmatch(leaf.text)
     assert match is not None
@@ -132,92 +132,92 @@ def number_of(context: Context, leaf: TerminalToken) -> Fraction:
 
 _WORD = re.compile(r"[A-Za-z]+")
 
-BuildRule: TypeAlias = Callable[[Context, Span, Sequence[Any]], Any]
+BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
 # -------------------------------------------------------------------------- atoms
 
 
-def _quantity(context: Context, span: Span, children: Sequence[Any]) -> ast.Quantity:
+def _quantity(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Quantity:
     number, unit = children
     return ast.Quantity(span, number_of(context, number), unit_of(context, unit))
 
 
-def _string(_: Context, span: Span, children: Sequence[Any]) -> ast.String:
+def _string(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.String:
     return ast.String(span, children[0].text[1:-1])
 
 
-def _true(_: Context, span: Span, __: Sequence[Any]) -> ast.Bool:
+def _true(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Bool:
     return ast.Bool(span, True)
 
 
-def _false(_: Context, span: Span, __: Sequence[Any]) -> ast.Bool:
+def _false(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Bool:
     return ast.Bool(span, False)
 
 
-def _inf(_: Context, span: Span, __: Sequence[Any]) -> ast.Inf:
+def _inf(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Inf:
     return ast.Inf(span)
 
 
-def _name(_: Context, span: Span, children: Sequence[Any]) -> ast.Name:
+def _name(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Name:
     (leaf,) = children
     return ast.Name(span, name_of(leaf), quoted=leaf.text.startswith("`"))
 
 
-def _vector(_: Context, span: Span, children: Sequence[Any]) -> ast.Vector:
+def _vector(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Vector:
     return ast.Vector(span, tuple(item for item in children if item is not None))
 
 
-def _set_literal(_: Context, span: Span, children: Sequence[Any]) -> ast.SetLiteral:
+def _set_literal(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.SetLiteral:
     return ast.SetLiteral(span, tuple(children))
 
 
 # ------------------------------------------------------------ postfix, arithmetic
 
 
-def _index(_: Context, span: Span, children: Sequence[Any]) -> ast.Index:
+def _index(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Index:
     base, index = children
     return ast.Index(span, base, index)
 
 
-def _attr(_: Context, span: Span, children: Sequence[Any]) -> ast.Attr:
+def _attr(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Attr:
     base, leaf = children
     return ast.Attr(span, base, name_of(leaf))
 
 
-def _call(_: Context, span: Span, children: Sequence[Any]) -> ast.Call:
+def _call(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Call:
     func, args = children
     return ast.Call(span, func, args or ())
 
 
-def _args(_: Context, __: Span, children: Sequence[Any]) -> tuple[ast.Arg, ...]:
+def _args(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[ast.Arg, ...]:
     return tuple(children)
 
 
-def _arg(_: Context, span: Span, children: Sequence[Any]) -> ast.Arg:
+def _arg(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Arg:
     leaf, value = children
     return ast.Arg(span, None if leaf is None else name_of(leaf), value)
 
 
-def _negative(_: Context, span: Span, children: Sequence[Any]) -> ast.Neg:
+def _negative(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Neg:
     return ast.Neg(span, children[-1])
 
 
-def _binary(_: Context, span: Span, children: Sequence[Any]) -> ast.Binary:
+def _binary(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Binary:
     left, op, right = children
     return ast.Binary(span, op.text, left, right)
 
 
-def _compare(_: Context, span: Span, children: Sequence[Any]) -> ast.Compare:
+def _compare(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Compare:
     return ast.Compare(span, tuple(children[::2]), tuple(op.text for op in children[1::2]))
 
 
-def _member_of(_: Context, span: Span, children: Sequence[Any]) -> ast.Member:
+def _member_of(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Member:
     item, region = children
     return ast.Member(span, item, region)
 
 
-def _not_member_of(_: Context, span: Span, children: Sequence[Any]) -> ast.Member:
+def _not_member_of(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Member:
     item, region = children
     return ast.Member(span, item, region, negated=True)
 
@@ -232,17 +232,17 @@ _LOGIC: Mapping[str, Any] = MappingProxyType(
 )
 
 
-def _logic(_: Context, span: Span, children: Sequence[Any]) -> ast.Logic:
+def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
     left, op, right = children
     return ast.Logic(span, _LOGIC[op.text], left, right)
 
 
-def _not(_: Context, span: Span, children: Sequence[Any]) -> ast.Not:
+def _not(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Not:
     return ast.Not(span, children[0])
 
 
 def _interval(*, lo_open: bool, hi_open: bool) -> BuildRule:
-    def build(_: Context, span: Span, children: Sequence[Any]) -> ast.Interval:
+    def build(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Interval:
         lo, hi = children
         return ast.Interval(span, lo, hi, lo_open, hi_open)
 
@@ -263,25 +263,25 @@ def _spelled(operator: TerminalToken, table: Mapping[str, str]) -> tuple[Any, st
     return table[word], "" if table[word] == word else word
 
 
-def _temporal(_: Context, span: Span, children: Sequence[Any]) -> ast.Temporal:
+def _temporal(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Temporal:
     operator, interval, body = children
     op, alias = _spelled(operator, UNARY_TEMPORAL)
     return ast.Temporal(span, op, _clocked(operator, interval), body, alias)
 
 
-def _temporal_unbounded(_: Context, span: Span, children: Sequence[Any]) -> ast.Temporal:
+def _temporal_unbounded(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Temporal:
     operator, body = children
     op, alias = _spelled(operator, UNARY_TEMPORAL)
     return ast.Temporal(span, op, None, body, alias)
 
 
-def _until(_: Context, span: Span, children: Sequence[Any]) -> ast.Until:
+def _until(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Until:
     left, operator, interval, right = children
     op, alias = _spelled(operator, BINARY_TEMPORAL)
     return ast.Until(span, op, _clocked(operator, interval), left, right, alias)
 
 
-def _until_unbounded(_: Context, span: Span, children: Sequence[Any]) -> ast.Until:
+def _until_unbounded(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Until:
     left, operator, right = children
     op, alias = _spelled(operator, BINARY_TEMPORAL)
     return ast.Until(span, op, None, left, right, alias)
@@ -290,27 +290,27 @@ def _until_unbounded(_: Context, span: Span, children: Sequence[Any]) -> ast.Unt
 # ------------------------------------------------------------------------ binders
 
 
-def _quantifier(context: Context, span: Span, children: Sequence[Any]) -> ast.Quantifier:
+def _quantifier(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Quantifier:
     kind, name, domain, body = children
     return ast.Quantifier(span, kind.text, own_name(context, name), domain, body)
 
 
-def _pair(_: Context, __: Span, children: Sequence[Any]) -> tuple[ast.Expr, ast.Expr]:
+def _pair(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[ast.Expr, ast.Expr]:
     low, high = children
     return low, high
 
 
-def _freeze(_: Context, span: Span, children: Sequence[Any]) -> ast.Freeze:
+def _freeze(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Freeze:
     *bindings, body = children
     return ast.Freeze(span, tuple(bindings), body)
 
 
-def _binding(context: Context, _: Span, children: Sequence[Any]) -> tuple[str, ast.Expr]:
+def _binding(context: BuildContext, _: Span, children: Sequence[Any]) -> tuple[str, ast.Expr]:
     name, value = children
     return own_name(context, name), value
 
 
-def _if_then_else(_: Context, span: Span, children: Sequence[Any]) -> ast.IfThenElse:
+def _if_then_else(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.IfThenElse:
     cond, yes, no = children
     return ast.IfThenElse(span, cond, yes, no)
 

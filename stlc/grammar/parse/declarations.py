@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.grammar.parse.builder import (
+    BuildContext,
     BuildRule,
-    Context,
     TerminalToken,
     name_of,
     number_of,
@@ -39,21 +39,21 @@ Item: TypeAlias = Pragma | ast.Import | ast.Item | tuple[ast.Item, ...]
 # ------------------------------------------------------------------------ pragmas
 
 
-def _spec_name(_: Context, span: Span, children: Sequence[Any]) -> Pragma:
+def _spec_name(_: BuildContext, span: Span, children: Sequence[Any]) -> Pragma:
     return Pragma("spec", name_of(children[0]), span)
 
 
-def _system_ref(_: Context, __: Span, children: Sequence[Any]) -> Pragma:
+def _system_ref(_: BuildContext, __: Span, children: Sequence[Any]) -> Pragma:
     (leaf,) = children
     return Pragma("system", leaf.text[1:-1], leaf.span)
 
 
-def _time_unit(_: Context, span: Span, children: Sequence[Any]) -> Pragma:
+def _time_unit(_: BuildContext, span: Span, children: Sequence[Any]) -> Pragma:
     text = children[0].text
     return Pragma("time", "steps" if text == "step" else text, span)
 
 
-def _import(context: Context, span: Span, children: Sequence[Any]) -> ast.Import:
+def _import(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Import:
     target, alias = children
     is_file = target.kind == "STRING"
     path = target.text[1:-1] if is_file else name_of(target)
@@ -63,21 +63,21 @@ def _import(context: Context, span: Span, children: Sequence[Any]) -> ast.Import
 # ---------------------------------------------------------------- parts of several
 
 
-def _several(_: Context, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
+def _several(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(children)
 
 
-def _tag(_: Context, span: Span, children: Sequence[Any]) -> ast.Tag:
+def _tag(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Tag:
     leaf, args = children
     return ast.Tag(span, name_of(leaf), args or ())
 
 
-def _type(context: Context, span: Span, children: Sequence[Any]) -> ast.TypeRef:
+def _type(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.TypeRef:
     leaf, size = children
     return ast.TypeRef(span, name_of(leaf), None if size is None else _size(context, size))
 
 
-def _size(context: Context, leaf: TerminalToken) -> int:
+def _size(context: BuildContext, leaf: TerminalToken) -> int:
     digits = leaf.text.strip("[] \t\r\n")
     if len(digits) <= _SIZE_DIGITS:
         return int(digits)
@@ -85,30 +85,32 @@ def _size(context: Context, leaf: TerminalToken) -> int:
     return 1
 
 
-def _sort(context: Context, _: Span, children: Sequence[Any]) -> tuple[ast.TypeRef | None, str]:
+def _sort(context: BuildContext, _: Span, children: Sequence[Any]) -> tuple[ast.TypeRef | None, str]:
     written, unit = children
     return written, unit_of(context, unit)
 
 
-def _formal(context: Context, span: Span, children: Sequence[Any]) -> ast.Formal:
+def _formal(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Formal:
     leaf, written = children
     return ast.Formal(span, own_name(context, leaf), written)
 
 
-def _doc(context: Context, end: int) -> str:
+def _doc(context: BuildContext, end: int) -> str:
     """Return the `##` lines from the last declaration up to `end`."""
     lines = [match[1] for match in _DOC.finditer(context.source.text, context.documented, end)]
     return "\n".join(lines)
 
 
-def _head(context: Context, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag, ...]) -> dict[str, Any]:
+def _head(
+    context: BuildContext, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag, ...]
+) -> dict[str, Any]:
     """Return the fields common to all declarations."""
     (head,) = _heads(context, span, (leaf,), tags)
     return head
 
 
 def _heads(
-    context: Context, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
+    context: BuildContext, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
     """Return the common fields for each name of a declaration."""
     shared = {"span": span, "tags": tags, "doc": _doc(context, names[0].span.start)}
@@ -118,7 +120,7 @@ def _heads(
 # ------------------------------------------------------------------- declarations
 
 
-def _signals(context: Context, span: Span, children: Sequence[Any]) -> tuple[ast.Signal, ...]:
+def _signals(context: BuildContext, span: Span, children: Sequence[Any]) -> tuple[ast.Signal, ...]:
     tags, role, names, (written, unit), domain, column = children
     if column is not None and len(names) > 1:
         context.findings.append(
@@ -140,18 +142,18 @@ def _signals(context: Context, span: Span, children: Sequence[Any]) -> tuple[ast
     return tuple(ast.Signal(**head, **own) for head in _heads(context, span, names, tags))
 
 
-def _const(context: Context, span: Span, children: Sequence[Any]) -> ast.Const:
+def _const(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Const:
     tags, leaf, (written, unit), value = children
     return ast.Const(**_head(context, span, leaf, tags), type=written, unit=unit, value=value)
 
 
-def _params(context: Context, span: Span, children: Sequence[Any]) -> tuple[ast.Param, ...]:
+def _params(context: BuildContext, span: Span, children: Sequence[Any]) -> tuple[ast.Param, ...]:
     tags, names, (written, unit), domain = children
     own = {"type": written, "unit": unit, "domain": domain}
     return tuple(ast.Param(**head, **own) for head in _heads(context, span, names, tags))
 
 
-def _whole(context: Context, span: Span, children: Sequence[Any]) -> int:
+def _whole(context: BuildContext, span: Span, children: Sequence[Any]) -> int:
     minus, leaf = children
     value = number_of(context, leaf)
     if value.denominator != 1:
@@ -159,12 +161,12 @@ def _whole(context: Context, span: Span, children: Sequence[Any]) -> int:
     return -int(value) if minus is not None else int(value)
 
 
-def _member(_: Context, __: Span, children: Sequence[Any]) -> tuple[TerminalToken, int | None]:
+def _member(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[TerminalToken, int | None]:
     leaf, value = children
     return leaf, value
 
 
-def _enum(context: Context, span: Span, children: Sequence[Any]) -> ast.Enum:
+def _enum(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Enum:
     tags, leaf, *written = children
     members: list[tuple[str, int]] = []
     for name, value in written:
@@ -173,28 +175,28 @@ def _enum(context: Context, span: Span, children: Sequence[Any]) -> ast.Enum:
     return ast.Enum(**_head(context, span, leaf, tags), members=tuple(members))
 
 
-def _region(context: Context, span: Span, children: Sequence[Any]) -> ast.Region:
+def _region(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Region:
     tags, leaf, value = children
     return ast.Region(**_head(context, span, leaf, tags), value=value)
 
 
-def _def(context: Context, span: Span, children: Sequence[Any]) -> ast.Def:
+def _def(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Def:
     tags, leaf, formals, written, value = children
     return ast.Def(**_head(context, span, leaf, tags), formals=formals or (), type=written, value=value)
 
 
-def _extern(context: Context, span: Span, children: Sequence[Any]) -> ast.Extern:
+def _extern(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Extern:
     tags, leaf, formals, written, unit = children
     head = _head(context, span, leaf, tags)
     return ast.Extern(**head, formals=formals or (), type=written, unit=unit_of(context, unit))
 
 
-def _require(context: Context, span: Span, children: Sequence[Any]) -> ast.Require:
+def _require(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Require:
     tags, leaf, formula = children
     return ast.Require(**_head(context, span, leaf, tags), formula=formula)
 
 
-def _assume(context: Context, span: Span, children: Sequence[Any]) -> ast.Assume:
+def _assume(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Assume:
     tags, leaf, formula = children
     return ast.Assume(**_head(context, span, leaf, tags), formula=formula)
 

@@ -17,7 +17,7 @@ from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.grammar.errors import hints
 from stlc.grammar.errors.failure import Piece
-from stlc.grammar.parse.builder import EXPRESSIONS, BuildRule, Context, TerminalToken
+from stlc.grammar.parse.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
 from stlc.grammar.parse.declarations import DECLARATIONS, Item, assemble
 from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.scan import declaration_starts, lexemes
@@ -38,7 +38,7 @@ def parse(source: Source) -> ast.Spec:
         SpecError: all independent errors, at most `MAX_ERRORS`.
     """
     _check_size(source, 0, len(source.text))
-    context = Context(source)
+    context = BuildContext(source)
     items: list[Item] = []
     starts = declaration_starts(source.text)
     skip_line = 0
@@ -67,7 +67,7 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
     """
     end = len(source.text) if end is None else end
     _check_size(source, start, end)
-    context = Context(source)
+    context = BuildContext(source)
     piece = Piece(source, start, end, "expr", accepts=_accepts, parses=_parses)
     try:
         expr: ast.Expr = _build(piece, context)
@@ -94,7 +94,7 @@ def _check_size(source: Source, start: int, end: int) -> None:
         raise SpecError(Diagnostic("E005", message))
 
 
-def _build(piece: Piece, context: Context) -> Any:
+def _build(piece: Piece, context: BuildContext) -> Any:
     try:
         tree = load_parser().parse(piece.text, start=piece.rule)
     except UnexpectedInput as error:
@@ -111,7 +111,7 @@ def _offset(error: UnexpectedInput, piece: Piece) -> int:
     return piece.start + (error.pos_in_stream or 0)
 
 
-def _fold(tree: Tree[Token], context: Context, base: int) -> Any:
+def _fold(tree: Tree[Token], context: BuildContext, base: int) -> Any:
     """Return the value of a tree, bottom-up, without recursion."""
     values: dict[int, Any] = {}
     depths: dict[int, int] = {}
@@ -130,7 +130,9 @@ def _fold(tree: Tree[Token], context: Context, base: int) -> Any:
     return values[id(tree)]
 
 
-def _child(child: Tree[Token] | Token | None, values: Mapping[int, Any], context: Context, base: int) -> Any:
+def _child(
+    child: Tree[Token] | Token | None, values: Mapping[int, Any], context: BuildContext, base: int
+) -> Any:
     match child:
         case None:
             return None

@@ -68,14 +68,14 @@ class Item:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class TokenLayout:
     """Whole text: items in order, and the comments after the last one."""
 
     items: tuple[Item, ...]
     rest: tuple[Comment, ...]
 
 
-def tokenize(source: Source) -> Layout:
+def tokenize(source: Source) -> TokenLayout:
     """Return the tokens of a text that `parser.parse` accepts.
 
     Raises:
@@ -90,7 +90,7 @@ def tokenize(source: Source) -> Layout:
     items = tuple(_items(tokens, places))
     last = items[-1].tokens[-1].end if items else 0
     dropped = (comment for token in tokens if token.start >= last for comment in _own(token))
-    return Layout(items, (*dropped, *rest))
+    return TokenLayout(items, (*dropped, *rest))
 
 
 def _read_piece(

@@ -49,7 +49,7 @@ _REMEMBERED = 256
 _EXACT = Windows(Exact(), NUMPY)
 
 
-class Reader:
+class ColumnReader:
     """Repeated evaluator of the same formulas; the schedule of each extent is cached.
 
     Args:
@@ -65,7 +65,7 @@ class Reader:
         self.formulas = tuple(formulas)
         self.end = end
         self.back = back
-        self._unsure: dict[tuple[frozenset[str], bool], Reader] = {}
+        self._unsure: dict[tuple[frozenset[str], bool], ColumnReader] = {}
         self._stop = FAR if going_on else None
         self.names = frozenset().union(*map(names_of_columns, self.formulas))
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
@@ -104,12 +104,12 @@ class Reader:
         both = (self._sides(holes, least=end)(known, start, count) for end in (True, False))
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
-    def _sides(self, holes: frozenset[str], *, least: bool) -> Reader:
+    def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
         """The reader of the formulas at their least or greatest value."""
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
-            self._unsure[key] = Reader(formulas, self.end, going_on=self._stop is not None)
+            self._unsure[key] = ColumnReader(formulas, self.end, going_on=self._stop is not None)
         return self._unsure[key]
 
 
@@ -139,8 +139,8 @@ class Side:
     _seen: tuple[Mapping[str, Floats], int, int] | None = None
     _settled: dict[str, int] = field(default_factory=dict)
     _pads: dict[str, int] = field(default_factory=dict)
-    _leaves: list[tuple[list[PredicateColumn], Reader]] = field(default_factory=list)
-    _latched: list[tuple[RecursiveColumn, Reader]] = field(default_factory=list)
+    _leaves: list[tuple[list[PredicateColumn], ColumnReader]] = field(default_factory=list)
+    _latched: list[tuple[RecursiveColumn, ColumnReader]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         leaves = [stream for stream in self.plan.streams if isinstance(stream, PredicateColumn)]
@@ -149,9 +149,9 @@ class Side:
             alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
             formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
             going_on = self.end != "truncate" and not self._over
-            self._leaves.append((alike, Reader(formulas, self.end, going_on=going_on, back=reads[0])))
+            self._leaves.append((alike, ColumnReader(formulas, self.end, going_on=going_on, back=reads[0])))
         latched = [stream for stream in self.plan.streams if isinstance(stream, RecursiveColumn)]
-        self._latched = [(stream, Reader(stream.parts, self.end)) for stream in latched]
+        self._latched = [(stream, ColumnReader(stream.parts, self.end)) for stream in latched]
         if self.end == "truncate":
             self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), 0)
             return
@@ -188,7 +188,7 @@ class Side:
         last.grow(*self._seen)
         return last
 
-    def values(self, reader: Reader, start: int, count: int) -> list[Floats]:
+    def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
         """Values (count, traces) of formulas over the columns, from sample `start` on."""
         return reader(self.rows, start - self.base, count)
 
@@ -203,7 +203,7 @@ class Side:
     def _grow_leaves(
         self,
         leaves: Sequence[PredicateColumn],
-        reader: Reader,
+        reader: ColumnReader,
         env: Mapping[str, Floats],
         first: int,
         samples: int,
@@ -215,7 +215,7 @@ class Side:
             self._put(leaf.name, start, values[: samples + self._pads[leaf.name] - start])
             self._settled[leaf.name] = max(samples - ahead, start)
 
-    def _grow_latched(self, stream: RecursiveColumn, reader: Reader, samples: int) -> None:
+    def _grow_latched(self, stream: RecursiveColumn, reader: ColumnReader, samples: int) -> None:
         start = self._settled.get(stream.name, 0)
         count = samples + self._pads[stream.name] - start
         parts = self.values(reader, start, count)
@@ -246,7 +246,7 @@ def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> 
     assert_never(op)
 
 
-_SINCE = Reader([ir.Since("since", ir.Window(0, None), column("left"), column("right"))], "truncate")
+_SINCE = ColumnReader([ir.Since("since", ir.Window(0, None), column("left"), column("right"))], "truncate")
 
 
 def _since(left: Floats, right: Floats, last: Floats | None) -> Floats:

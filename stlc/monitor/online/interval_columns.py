@@ -15,7 +15,7 @@ import numpy as np
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.bounds import Bounds, Floats
-from stlc.monitor.online.columns import NOTHING, ColumnPlans, Reader, continued
+from stlc.monitor.online.columns import NOTHING, ColumnPlans, ColumnReader, continued
 from stlc.monitor.online.streams import ColumnPlan, PredicateColumn, RecursiveColumn, plan
 from stlc.monitor.values import by_truth
 
@@ -51,9 +51,9 @@ class IntervalColumns:
     _formulas: list[ir.Formula] = field(default_factory=list)
     _starts: list[int] = field(default_factory=list)
     _plan: ColumnPlan | None = None
-    _leaves: tuple[list[str], Reader] | None = None
-    _latched: list[tuple[RecursiveColumn, Reader]] = field(default_factory=list)
-    _reader: Reader = field(init=False)
+    _leaves: tuple[list[str], ColumnReader] | None = None
+    _latched: list[tuple[RecursiveColumn, ColumnReader]] = field(default_factory=list)
+    _reader: ColumnReader = field(init=False)
     _beyond: int = 0
     _back: int = 0
     _latch_back: int = 0
@@ -117,7 +117,7 @@ class IntervalColumns:
         self._plan = whole
         self._beyond = max(reach(formula).future for formula in formulas)
         self._latched = [
-            (stream, Reader(stream.parts, "both"))
+            (stream, ColumnReader(stream.parts, "both"))
             for stream in whole.streams
             if isinstance(stream, RecursiveColumn)
         ]
@@ -126,8 +126,8 @@ class IntervalColumns:
         leaves = [stream for stream in whole.streams if isinstance(stream, PredicateColumn)]
         judged = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in leaves]
         if leaves:
-            self._leaves = [leaf.name for leaf in leaves], Reader(judged, "truncate")
-        self._reader = Reader(formulas, "both")
+            self._leaves = [leaf.name for leaf in leaves], ColumnReader(judged, "truncate")
+        self._reader = ColumnReader(formulas, "both")
         self._rows = {
             name: np.empty((0, 2)) for name in (NOTHING, *(stream.name for stream in whole.streams))
         }

@@ -20,7 +20,7 @@ from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.online.bounds import Bounds, Tracker, TrackingOptions
 from stlc.monitor.online.history import SampleHistory
 from stlc.monitor.online.paced import PacedTracker
-from stlc.monitor.online.tally import Flags, Judged, Tally
+from stlc.monitor.online.tally import Flags, JudgedInstants, Tally
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.signals import Gap, arrange, not_finite
@@ -107,21 +107,21 @@ class Watched:
         """Whether its only instant is settled."""
         return not self.everywhere and self.tally.instants > 0
 
-    def judged(self, start: int, stop: int) -> Judged:
+    def judged(self, start: int, stop: int) -> JudgedInstants:
         """Bounds and verdicts at instants while the trace continues."""
         truths = None if self.truths is None else self.truths.live(start, stop)
         return self._judged(self.values.live(start, stop), truths)
 
-    def ended(self, starts: range) -> Judged:
+    def ended(self, starts: range) -> JudgedInstants:
         """Bounds and verdicts at instants once the trace has ended."""
         truths = None if self.truths is None else self.truths.ended(starts)
         return self._judged(self.values.ended(starts), truths)
 
-    def _judged(self, bounds: Bounds, truths: Bounds | None) -> Judged:
+    def _judged(self, bounds: Bounds, truths: Bounds | None) -> JudgedInstants:
         low, high = bounds
         if truths is None:
-            return Judged(low, high, low >= -self.tolerance, high < -self.tolerance)
-        return Judged(low, high, truths.low > 0, truths.high < 0)
+            return JudgedInstants(low, high, low >= -self.tolerance, high < -self.tolerance)
+        return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
         """Forget settled instants; returns the first sample that is still needed."""
@@ -261,12 +261,12 @@ class Online:
         count = self._count(watched, judged)
         watched.decided = known[count:]
 
-    def _decision(self, rule: CompiledRequirement, judged: Judged, start: int, i: int) -> Decision:
+    def _decision(self, rule: CompiledRequirement, judged: JudgedInstants, start: int, i: int) -> Decision:
         status: Status = "violated" if judged.fails[i] else "satisfied"
         low, high = float(judged.low[i]), float(judged.high[i])
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
 
-    def _settled(self, watched: Watched) -> Judged:
+    def _settled(self, watched: Watched) -> JudgedInstants:
         start, stop = self._pending(watched)
         return watched.judged(start, min(stop, self._countable(watched)))
 
@@ -277,7 +277,7 @@ class Online:
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
-    def _count(self, watched: Watched, judged: Judged) -> int:
+    def _count(self, watched: Watched, judged: JudgedInstants) -> int:
         """Count the settled ones of the pending instants; returns how many."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)

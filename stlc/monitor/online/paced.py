@@ -71,7 +71,7 @@ def _width(window: ir.Window) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class PacedWork:
     """Number of rows computed for one evaluation of a formula.
 
     Attributes:
@@ -84,13 +84,13 @@ class Work:
     own: int = 0
     heaviest: ir.Formula | None = None
 
-    def and_(self, other: Work) -> Work:
+    def and_(self, other: PacedWork) -> PacedWork:
         """The sum of both."""
         heaviest = self.heaviest if self.own >= other.own else other.heaviest
-        return Work(self.rows + other.rows, self.own + other.own, heaviest)
+        return PacedWork(self.rows + other.rows, self.own + other.own, heaviest)
 
 
-def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
+def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
     """The work of evaluating a formula at several instants.
 
     Args:
@@ -102,7 +102,7 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
         case ir.Freeze(body=body):
             looks = sum(span(body)) + (samples if _endless(body) else 0)
             own = instants * (_FROZEN + looks + work(body, 1, samples).rows)
-            return Work(own, own, formula)
+            return PacedWork(own, own, formula)
         case ir.AtStart():
             instants = 1
         case ir.Temporal(window=window) | ir.PastTemporal(window=window):
@@ -110,7 +110,7 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
         case ir.Until(window=window) | ir.Since(window=window):
             instants += samples if window.hi is None else window.hi
     windows = isinstance(formula, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since))
-    found = Work(instants if windows else 0)
+    found = PacedWork(instants if windows else 0)
     for part in operands(formula):
         found = found.and_(work(part, instants, samples))
     return found
@@ -179,14 +179,14 @@ class Asking(Protocol):
     window: int | None
 
 
-def effort(formula: ir.Formula, looks: int, asking: Asking) -> Work:
+def effort(formula: ir.Formula, looks: int, asking: Asking) -> PacedWork:
     """The work of evaluating once a requirement that spans so many samples."""
     many = asking.everywhere or endless(formula) or any(map(_unbounded, nodes(formula)))
     found = work(formula, looks if many else 1, looks if asking.all_kept else 0)
     if asking.window is None:
         return found
     own = asking.window * (looks if asking.everywhere else 1)
-    return found.and_(Work(own, own, formula))
+    return found.and_(PacedWork(own, own, formula))
 
 
 def _unbounded(node: ir.Formula) -> bool:

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
-class Judged(NamedTuple):
+class JudgedInstants(NamedTuple):
     """Bounds and verdicts at consecutive instants, each (instants,).
 
     Attributes:
@@ -55,7 +55,7 @@ class Tally:
     high_at: int = 0
     first: int = 0
 
-    def add(self, judged: Judged, count: int) -> None:
+    def add(self, judged: JudgedInstants, count: int) -> None:
         """Count the first `count` of the next instants."""
         if count == 1:
             self._add_one(float(judged.low[0]), float(judged.high[0]))
@@ -79,7 +79,7 @@ class Tally:
         """The instant after the last counted one."""
         return self.first + self.instants
 
-    def with_more(self, judged: Judged) -> Tally:
+    def with_more(self, judged: JudgedInstants) -> Tally:
         """A copy with more instants."""
         more = replace(self)
         more.add(judged, len(judged.low))

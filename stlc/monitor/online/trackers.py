@@ -17,9 +17,9 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
-from stlc.monitor.online.columns import FAR, ColumnPlans, End, Reader, Side
+from stlc.monitor.online.columns import FAR, ColumnPlans, ColumnReader, End, Side
 from stlc.monitor.online.interval_columns import IntervalColumns, fits
-from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, Work, effort, span
+from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, effort, span
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, RecursiveColumn, endless, looks_on, plan
 from stlc.monitor.online.unbounded import UnboundedState, skeleton
 from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
@@ -150,14 +150,14 @@ def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPla
 class BoundedTracker(_ColumnTracker):
     """Tracker of a formula with bounded windows, at consecutive instants."""
 
-    _readers: list[Reader] = field(default_factory=list, init=False)
+    _readers: list[ColumnReader] = field(default_factory=list, init=False)
     _ahead: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         formula = self.planned.formula
         self._ahead, self._back = reach(formula).future, history(formula)
         self._sides = sides_of(self.plans, self._ahead, self.options)
-        self._readers = [Reader([side.plan.formula], side.end) for side in self._sides]
+        self._readers = [ColumnReader([side.plan.formula], side.end) for side in self._sides]
 
     @property
     def settled(self) -> int:
@@ -500,7 +500,7 @@ def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
             return formula
 
 
-def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
+def _too_much(rule: CompiledRequirement, found: PacedWork) -> Diagnostic:
     """E313 for a formula whose instants are evaluated separately, on too many samples."""
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"

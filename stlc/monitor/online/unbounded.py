@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
-from stlc.monitor.online.columns import NOTHING, Reader, Side
+from stlc.monitor.online.columns import NOTHING, ColumnReader, Side
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, column, endless
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -186,18 +186,18 @@ class UnboundedState:
     begin: int = 0
     at: int = 0
     coefficients: Floats | None = None
-    _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict, init=False)
-    _root: Reader = field(init=False)
-    _operators: Reader = field(init=False)
+    _parts: dict[int, tuple[list[str], ColumnReader]] = field(default_factory=dict, init=False)
+    _root: ColumnReader = field(init=False)
+    _operators: ColumnReader = field(init=False)
     _chosen: NDArray[np.bool_] = field(init=False)
     _unsure: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         for steps in dict.fromkeys(part.steps for part in self.bones.parts.values()):
             alike = {name: part.formula for name, part in self.bones.parts.items() if part.steps == steps}
-            self._parts[steps] = (list(alike), Reader(list(alike.values()), self.side.end))
-        self._root = Reader([self.bones.root], "truncate")
-        self._operators = Reader(list(self.bones.operators.values()), "truncate")
+            self._parts[steps] = (list(alike), ColumnReader(list(alike.values()), self.side.end))
+        self._root = ColumnReader([self.bones.root], "truncate")
+        self._operators = ColumnReader(list(self.bones.operators.values()), "truncate")
         operators = len(self.bones.operators)
         self._chosen = np.arange(1 << operators)[:, None] >> np.arange(operators) & 1 == 1
         self._unsure = self.bones.unsure(self.side.plan)
@@ -243,11 +243,11 @@ class UnboundedState:
         parts: dict[str, DelayedFormula] = {}
         plain = _outlined(formula, parts)
         first = min(self.at, at)
-        reader = Reader([part.formula for part in parts.values()], self.side.end)
+        reader = ColumnReader([part.formula for part in parts.values()], self.side.end)
         found = self.side.values(reader, first, samples - first) if parts else []
         env = dict(zip(parts, found, strict=True))
         env[NOTHING] = np.zeros((samples - first, self.side.rows[NOTHING].shape[1]))
-        return Reader([plain], self.side.end)(env, at - first, 1)[0]
+        return ColumnReader([plain], self.side.end)(env, at - first, 1)[0]
 
     def _columns(self, count: int) -> dict[str, Floats]:
         """The parts at the next `count` samples."""

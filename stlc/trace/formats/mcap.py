@@ -26,7 +26,7 @@ from stlc.trace.formats.messages import (
     DamageError,
     Decode,
     Log,
-    Number,
+    MessageNumber,
     Room,
     mapped,
     numbers_of,
@@ -143,7 +143,7 @@ def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
 # ------------------------------------------------------------------------------ encodings
 
 
-def _of_json(data: bytes) -> Iterable[Number]:
+def _of_json(data: bytes) -> Iterable[MessageNumber]:
     return numbers_of(json.loads(data))
 
 
@@ -160,7 +160,7 @@ def _protobuf(schema: Any) -> Decode:
             pool.Add(left.pop(each.name))
     kind = needed("google.protobuf.message_factory").GetMessageClass(pool.FindMessageTypeByName(schema.name))
 
-    def decode(data: bytes) -> Iterator[Number]:
+    def decode(data: bytes) -> Iterator[MessageNumber]:
         message = kind.FromString(data)
         fields = message.DESCRIPTOR.fields
         if [each.name for each in fields] == ["data"]:
@@ -170,18 +170,18 @@ def _protobuf(schema: Any) -> Decode:
     return decode
 
 
-def _proto_fields(name: str, message: Any, depth: int) -> Iterator[Number]:
+def _proto_fields(name: str, message: Any, depth: int) -> Iterator[MessageNumber]:
     fields = message.DESCRIPTOR.fields
     if {each.name for each in fields} in STAMPS:
         seconds, parts = (getattr(message, each.name) for each in fields)
-        yield Number(name, seconds + 1e-9 * parts)
+        yield MessageNumber(name, seconds + 1e-9 * parts)
         return
     for each in fields:
         if each.name != HEADER:
             yield from _proto_field(f"{name}.{each.name}" if name else each.name, message, each, depth)
 
 
-def _proto_field(name: str, message: Any, each: Any, depth: int) -> Iterator[Number]:
+def _proto_field(name: str, message: Any, each: Any, depth: int) -> Iterator[MessageNumber]:
     value = getattr(message, each.name)
     if each.is_repeated:
         is_map = each.message_type is not None and each.message_type.GetOptions().map_entry
@@ -192,12 +192,12 @@ def _proto_field(name: str, message: Any, each: Any, depth: int) -> Iterator[Num
         yield from _proto_value(name, value, each, depth)
 
 
-def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[Number]:
+def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[MessageNumber]:
     if each.message_type is not None:
         if depth <= DEEPEST:
             yield from _proto_fields(name, value, depth + 1)
     elif isinstance(value, (int, float)):
-        yield Number(name, float(value), isinstance(value, int))
+        yield MessageNumber(name, float(value), isinstance(value, int))
 
 
 # ---------------------------------------------------------------------------- stlc's own

@@ -43,7 +43,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class MessageNumber:
     """One number of a message: its path, value, and whether it is an integer or a truth value."""
 
     name: str
@@ -51,7 +51,7 @@ class Number:
     whole: bool = False
 
 
-Decode = Callable[[bytes], Iterable[Number]]
+Decode = Callable[[bytes], Iterable[MessageNumber]]
 """A message as bytes -> its numbers; names are relative to the topic, "" is the topic itself."""
 
 
@@ -108,7 +108,7 @@ class Log:
         self._topics: dict[str, _Topic] = {}
         self._values = 0
 
-    def add(self, topic: str, time: int, numbers: Iterable[Number]) -> None:
+    def add(self, topic: str, time: int, numbers: Iterable[MessageNumber]) -> None:
         """Add a message, logged at `time` in ns. Raises TraceError (E603) for an invalid time."""
         if not -_LATEST <= time <= _LATEST:
             raise unreadable(
@@ -167,7 +167,7 @@ def _called(topic: str, name: str) -> str:
 # ----------------------------------------------------------------------- JSON-like content
 
 
-def numbers_of(content: object) -> Iterator[Number]:
+def numbers_of(content: object) -> Iterator[MessageNumber]:
     """All numbers of a JSON message, by path.
 
     Raises:
@@ -178,11 +178,11 @@ def numbers_of(content: object) -> Iterator[Number]:
     yield from _walk("", content, 0)
 
 
-def _walk(name: str, value: object, depth: int) -> Iterator[Number]:
+def _walk(name: str, value: object, depth: int) -> Iterator[MessageNumber]:
     if isinstance(value, (int, float)):
-        yield Number(name, float(value), isinstance(value, int))
+        yield MessageNumber(name, float(value), isinstance(value, int))
     elif value is None:
-        yield Number(name, math.nan)
+        yield MessageNumber(name, math.nan)
     elif depth > DEEPEST:
         return
     elif isinstance(value, (list, tuple)):
@@ -193,10 +193,10 @@ def _walk(name: str, value: object, depth: int) -> Iterator[Number]:
         yield from _entries(name, value, depth)
 
 
-def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Number]:
+def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[MessageNumber]:
     if set(value) in STAMPS:
         seconds, parts = (v if isinstance(v, (int, float)) else math.nan for v in value.values())
-        yield Number(name, seconds + 1e-9 * parts)
+        yield MessageNumber(name, seconds + 1e-9 * parts)
         return
     for key, item in value.items():
         if key != HEADER:

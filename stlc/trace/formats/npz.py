@@ -103,7 +103,7 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
     raise unreadable(path, "it is empty" if not start else "it is not an `.npz` archive")
 
 
-class Member:
+class ArchiveMember:
     """One array of an open archive: read as a whole, or from its start on, so many samples at a time.
 
     Attributes:
@@ -163,7 +163,7 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
     arrays: dict[str, Array] = {}
     for name, info in infos.items():
         with ExitStack() as stack:
-            arrays[name] = Member(path, archive, info, stack).whole()
+            arrays[name] = ArchiveMember(path, archive, info, stack).whole()
     return arrays
 
 
@@ -231,7 +231,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
     """The trace of a file, so many samples at a time. Raises TraceError as `read`."""
     with ExitStack() as stack, damage(path):
         archive = stack.enter_context(zipfile.ZipFile(path))
-        members = {name: Member(path, archive, i, stack) for name, i in _infos(path, archive).items()}
+        members = {name: ArchiveMember(path, archive, i, stack) for name, i in _infos(path, archive).items()}
         described = members.pop("meta", None)
         meta, columns = read_meta(path, None if described is None else described.whole())
         signals = {name: m for name, m in members.items() if not name.startswith(EXTRA)}

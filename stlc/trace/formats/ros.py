@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from stlc.trace.formats.messages import DEEPEST, HEADER, LONGEST, STAMPS, DamageError, Number
+from stlc.trace.formats.messages import DEEPEST, HEADER, LONGEST, STAMPS, DamageError, MessageNumber
 
 Form = Literal["ros1", "cdr"]
 
@@ -152,7 +152,7 @@ class Decoder:
     layout: _Layout
     form: Form
 
-    def __call__(self, data: bytes) -> Iterator[Number]:
+    def __call__(self, data: bytes) -> Iterator[MessageNumber]:
         """All numbers of a message, by path; stamps of headers are left to the clock.
 
         Raises:
@@ -176,7 +176,7 @@ class _Cursor:
     def __init__(self, data: bytes, start: int, order: str, form: Form) -> None:
         self.data, self.at, self.start, self.order, self.form = data, start, start, order, form
 
-    def fields(self, name: str, layout: _Layout, depth: int) -> Iterator[Number]:
+    def fields(self, name: str, layout: _Layout, depth: int) -> Iterator[MessageNumber]:
         if layout.least > len(self.data) - self.at:
             raise DamageError("a message that is shorter than its definition")
         if not layout.fields:
@@ -190,7 +190,7 @@ class _Cursor:
             else:
                 yield from found
 
-    def field(self, name: str, each: _Field, depth: int) -> Iterator[Number]:
+    def field(self, name: str, each: _Field, depth: int) -> Iterator[MessageNumber]:
         if each.count is None:
             yield from self.value(name, each, depth)
             return
@@ -213,7 +213,7 @@ class _Cursor:
                 for _ in found:
                     pass
 
-    def numbers(self, name: str, kind: str, count: int, *, told: bool) -> Iterator[Number]:
+    def numbers(self, name: str, kind: str, count: int, *, told: bool) -> Iterator[MessageNumber]:
         """The numbers of an array; long arrays are data and are skipped."""
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
@@ -224,10 +224,10 @@ class _Cursor:
             values = struct.unpack_from(f"{self.order}{count}{_CODES[kind]}", self.data, self.at)
             whole = not kind.startswith("float")
             for i, value in enumerate(values):
-                yield Number(f"{name}[{i}]", float(value), whole)
+                yield MessageNumber(f"{name}[{i}]", float(value), whole)
         self.at += count * size
 
-    def value(self, name: str, each: _Field, depth: int) -> Iterator[Number]:
+    def value(self, name: str, each: _Field, depth: int) -> Iterator[MessageNumber]:
         if each.inner is not None:
             if each.inner.stamp:
                 yield self.stamp(name, each.inner)
@@ -240,14 +240,14 @@ class _Cursor:
             self.text(each.kind)
         elif each.kind in _CODES:
             (value,) = self.take(_CODES[each.kind])
-            yield Number(name, float(value), not each.kind.startswith("float"))
+            yield MessageNumber(name, float(value), not each.kind.startswith("float"))
         else:
             seconds, parts = self.take(_STAMPS[each.kind])
-            yield Number(name, seconds + 1e-9 * parts)
+            yield MessageNumber(name, seconds + 1e-9 * parts)
 
-    def stamp(self, name: str, layout: _Layout) -> Number:
+    def stamp(self, name: str, layout: _Layout) -> MessageNumber:
         seconds, parts = (number.value for number in self.fields("", layout, 0))
-        return Number(name, seconds + 1e-9 * parts)
+        return MessageNumber(name, seconds + 1e-9 * parts)
 
     def text(self, kind: str) -> None:
         (length,) = self.take("I")

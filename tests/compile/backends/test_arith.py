@@ -10,7 +10,7 @@ from helpers.formula_strategies import NAMES, numbers, state_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
@@ -42,7 +42,7 @@ def slow(num: ir.Num, env: dict[str, np.ndarray]) -> np.ndarray:
 @given(numbers, st.integers(0, 2**32 - 1))
 def test_programs_compute_what_is_written(num: ir.Num, seed: int) -> None:
     env = environment(seed)
-    program, wanted = Program({"out": num}), slow(num, env)
+    program, wanted = ArrayProgram({"out": num}), slow(num, env)
     np.testing.assert_allclose(program(env, NUMPY)["out"], wanted, atol=1e-9, rtol=1e-9)
     out = program(tensors(env), TORCH)["out"]
     assert out.dtype == torch.float64
@@ -53,7 +53,7 @@ def test_programs_compute_what_is_written(num: ir.Num, seed: int) -> None:
 @given(state_formulas(numbers), numbers, numbers, st.integers(0, 2**32 - 1))
 def test_straight_through_steps_like_hard(cond: ir.Formula, yes: ir.Num, no: ir.Num, seed: int) -> None:
     env = tensors(environment(seed))
-    program = Program({"ind": ir.Indicator(cond), "where": ir.Where(cond, yes, no)})
+    program = ArrayProgram({"ind": ir.Indicator(cond), "where": ir.Where(cond, yes, no)})
     hard, soft = program(env, TORCH, Hard()), program(env, TORCH, StraightThrough(5.0))
     plain = program({name: value.numpy() for name, value in env.items()}, NUMPY, StraightThrough(5.0))
     for name in ("ind", "where"):
@@ -73,15 +73,15 @@ def test_every_function_of_the_table(name: str) -> None:
     fold = FUNCTIONS[name].fold
     assert fold is not None
     np.testing.assert_allclose(wanted, [fold(*row) for row in zip(*values, strict=True)], rtol=1e-12)
-    np.testing.assert_allclose(Program({"out": num})(env, NUMPY)["out"], wanted, rtol=1e-12)
+    np.testing.assert_allclose(ArrayProgram({"out": num})(env, NUMPY)["out"], wanted, rtol=1e-12)
     columns = tensors(env, grad=True)
-    out = Program({"out": num})(columns, TORCH)["out"]
+    out = ArrayProgram({"out": num})(columns, TORCH)["out"]
     np.testing.assert_allclose(out.detach(), wanted, rtol=1e-12)
-    constant = Program({"out": ir.Op(name, tuple(ir.Const(float(value[0])) for value in values))})
+    constant = ArrayProgram({"out": ir.Op(name, tuple(ir.Const(float(value[0])) for value in values))})
     np.testing.assert_allclose(constant(env, NUMPY)["out"], np.full(6, wanted[0]), rtol=1e-12)
     mixed = ir.Op(name, (ir.Const(float(values[0][0])), *num.args[1:]))
     np.testing.assert_allclose(
-        Program({"out": mixed})(columns, TORCH)["out"][0].detach(), wanted[0], rtol=1e-12
+        ArrayProgram({"out": mixed})(columns, TORCH)["out"][0].detach(), wanted[0], rtol=1e-12
     )
     out.sum().backward()
     for column, value in env.items():
@@ -119,17 +119,18 @@ X_PLUS = op("add", X, op("mul", Y, 0.1))
 )
 def test_few_operations(num: ir.Num, operations: int) -> None:
     """An `Ind` that is multiplied still converts its mask for others; a `where` needs the mask alone."""
-    found = Program({"out": num}).operations()
+    found = ArrayProgram({"out": num}).operations()
     assert found <= operations
     env = environment(7)
-    np.testing.assert_allclose(Program({"out": num})(env, NUMPY)["out"], slow(num, env), atol=1e-12)
+    np.testing.assert_allclose(ArrayProgram({"out": num})(env, NUMPY)["out"], slow(num, env), atol=1e-12)
 
 
 def test_common_parts_are_computed_once() -> None:
     root = op("sqrt", op("add", op("square", X), op("square", Y)))
     twin = op("sqrt", op("add", op("square", ir.Signal("x")), op("square", ir.Signal("y"))))
     assert (
-        Program({"a": root, "b": op("add", twin, 1.0)}).operations() == Program({"a": root}).operations() + 1
+        ArrayProgram({"a": root, "b": op("add", twin, 1.0)}).operations()
+        == ArrayProgram({"a": root}).operations() + 1
     )
 
 
@@ -137,7 +138,7 @@ def test_common_parts_are_computed_once() -> None:
 def test_exact_conditions_respect_strictness(switch: Switch) -> None:
     env = {"x": torch.tensor([-1.0, 0.0, 1.0]), "y": torch.zeros(3)}
     more, least = ir.Predicate(X, strict=True), ir.Predicate(X)
-    program = Program(
+    program = ArrayProgram(
         {
             "gt": ir.Indicator(more),
             "ge": ir.Indicator(least),
@@ -161,7 +162,7 @@ def test_exact_conditions_respect_strictness(switch: Switch) -> None:
 def test_tanh_is_the_papers_equation() -> None:
     rho = np.linspace(-0.02, 0.02, 9)
     cond = ir.BoolOp("and", (ir.Predicate(X), ir.Predicate(op("sub", X, Y), strict=False)))
-    program = Program(
+    program = ArrayProgram(
         {
             "default": ir.Indicator(cond),
             "own": ir.Indicator(cond, sharpness=20.0),
@@ -181,7 +182,7 @@ def test_tanh_is_the_papers_equation() -> None:
 def test_straight_through_differentiates_condition_and_branch() -> None:
     x = torch.tensor([-0.1, 0.2], dtype=torch.float64, requires_grad=True)
     y = torch.tensor([2.0, 3.0], dtype=torch.float64, requires_grad=True)
-    out = Program({"out": ir.Where(ir.Predicate(X), op("mul", Y, 4.0), Y)})(
+    out = ArrayProgram({"out": ir.Where(ir.Predicate(X), op("mul", Y, 4.0), Y)})(
         {"x": x, "y": y}, TORCH, StraightThrough(5.0)
     )
     assert out["out"].tolist() == [2.0, 12.0]
@@ -194,14 +195,14 @@ def test_straight_through_differentiates_condition_and_branch() -> None:
 def test_gradient_of_a_distance_at_zero_is_zero() -> None:
     x = torch.zeros(2, requires_grad=True)
     y = torch.zeros(2, requires_grad=True)
-    out = Program({"a": op("norm", X, Y), "b": op("sqrt", op("add", op("square", X), op("square", Y)))})
+    out = ArrayProgram({"a": op("norm", X, Y), "b": op("sqrt", op("add", op("square", X), op("square", Y)))})
     sum(value.sum() for value in out({"x": x, "y": y}, TORCH).values()).backward()
     assert x.grad.tolist() == [0, 0]
 
 
 def test_constants_and_floats_in_the_environment() -> None:
     num = op("max", op("mul", ir.Signal("dt"), X), ir.Signal("t"))
-    program = Program({"out": num, "c": ir.Const(2.0)}, constants={"dt": 0.5})
+    program = ArrayProgram({"out": num, "c": ir.Const(2.0)}, constants={"dt": 0.5})
     assert program.columns == {"x", "t"}
     out = program({"t": 1.0, "x": torch.tensor([0.0, 4.0])}, TORCH)
     assert out["out"].tolist() == [1.0, 2.0]
@@ -216,16 +217,16 @@ def test_functions_of_the_system() -> None:
         return b, -a
 
     outputs = {"p": ir.Extern("turn", (X, Y), 0), "q": op("add", ir.Extern("turn", (X, Y), 1), 1.0)}
-    out = Program(outputs, externs={"turn": turn})({"x": np.ones(2), "y": np.full(2, 3.0)}, NUMPY)
+    out = ArrayProgram(outputs, externs={"turn": turn})({"x": np.ones(2), "y": np.full(2, 3.0)}, NUMPY)
     assert (out["p"].tolist(), out["q"].tolist(), len(calls)) == ([3, 3], [0, 0], 1)
 
 
 def test_a_temporal_formula_is_no_condition() -> None:
     later = ir.Temporal("always", ir.Window(0, 1), ir.Predicate(X))
     with pytest.raises(TypeError, match="not a state formula"):
-        Program({"out": ir.Indicator(later)})
+        ArrayProgram({"out": ir.Indicator(later)})
 
 
 def test_division_by_zero_is_quiet() -> None:
-    out = Program({"out": op("div", X, op("sub", Y, Y))})({"x": np.ones(1), "y": np.ones(1)}, NUMPY)
+    out = ArrayProgram({"out": op("div", X, op("sub", Y, Y))})({"x": np.ones(1), "y": np.ones(1)}, NUMPY)
     assert math.isinf(out["out"][0])

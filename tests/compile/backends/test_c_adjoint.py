@@ -17,7 +17,7 @@ from helpers.formula_strategies import NAMES
 
 from stlc.compile.backends.c.emit import Motion
 from stlc.compile.ir import nodes as ir
-from stlc.native import Outcome, compiler
+from stlc.native import ObjectiveSlopes, compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 
@@ -46,13 +46,13 @@ def test_the_gradient_through_conditions_of_a_step_is_that_of_a_tanh() -> None:
     by_x = np.zeros((1, 2, 2))
     by_x[0, 1] = 1.0
     rule = ir.Predicate(x)
-    found = adjoint_of(motion, [rule]).pull(x0, plans, Outcome(np.zeros((2, 1)), by_x, slope))
+    found = adjoint_of(motion, [rule]).pull(x0, plans, ObjectiveSlopes(np.zeros((2, 1)), by_x, slope))
     assert found[:, 0, 0].tolist() == [1.0, 2.0]
     two = Motion(("x",), ("u",), (), {"x": after}, 2, 0.1)
     plans = np.array([[[0.1], [0.7]], [[0.1], [0.7]]])
     by_x = np.zeros((1, 3, 2))
     by_x[0, 2] = 1.0
-    found = adjoint_of(two, [rule]).pull(x0, plans, Outcome(np.zeros((2, 1)), by_x, slope))
+    found = adjoint_of(two, [rule]).pull(x0, plans, ObjectiveSlopes(np.zeros((2, 1)), by_x, slope))
     first = np.array([0.3 + 0.1, 2 * 0.1])
     bump = 0.5 * slope / np.cosh(slope * first) ** 2
     through = 1.0 + bump * ((first + 0.7) - 2 * 0.7)
@@ -84,7 +84,7 @@ def test_equal_operands_share_the_slope() -> None:
     by_state, slope = np.zeros((1, 2, 1)), 2.0
     by_state[0, 1] = 1.0
     point = np.array([[[0.25, 0.25, 1.0]]])
-    outcome = Outcome(np.zeros((1, 1)), by_state, slope)
+    outcome = ObjectiveSlopes(np.zeros((1, 1)), by_state, slope)
     found = adjoint_of(motion, [ir.Predicate(ir.Signal("state"))]).pull(np.zeros((1, 1)), point, outcome)
     bump = 0.5 * slope / np.cosh(slope * 0.25) ** 2
     np.testing.assert_allclose(found[0, 0], [bump, bump, 0.0], rtol=1e-12)
@@ -96,6 +96,6 @@ def test_no_gradient_goes_through_fixed_states_and_broken_rows() -> None:
     rule = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(x))
     x0, plans = np.array([[0.0], [np.nan]]), np.full((2, 3, 1), -1.0)
     ones = np.ones((2, 1))
-    found = adjoint_of(motion, [rule]).pull(x0, plans, Outcome(ones, None, 5.0))
+    found = adjoint_of(motion, [rule]).pull(x0, plans, ObjectiveSlopes(ones, None, 5.0))
     assert found[:, :, 0].tolist() == [[1.0] * 3, [0.0] * 3]
-    assert not adjoint_of(motion, [rule], fixed=["x"]).pull(x0, plans, Outcome(ones, None, 5.0)).any()
+    assert not adjoint_of(motion, [rule], fixed=["x"]).pull(x0, plans, ObjectiveSlopes(ones, None, 5.0)).any()

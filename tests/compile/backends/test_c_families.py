@@ -29,7 +29,7 @@ from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.c.families import families
 from stlc.compile.backends.c.plan import Tabled, plan_of
 from stlc.compile.ir import nodes as ir
-from stlc.native import Outcome
+from stlc.native import ObjectiveSlopes
 
 X, Y, Z = (ir.Signal(name) for name in NAMES)
 WHOLE = ir.Window(0, STEPS)
@@ -216,7 +216,9 @@ def _both(rules: list[ir.Formula], seed: int, patched: pytest.MonkeyPatch) -> No
         patched.setattr(c_families, "LEAST", least)
         assert bool(loops(rules)) == (least == 2)
         rho, _ = kernel_of(follower(), rules).judge(x0, u)
-        found.append((rho + 0.0, adjoint_of(follower(), rules).pull(x0, u, Outcome(weights, None, 5.0))))
+        found.append(
+            (rho + 0.0, adjoint_of(follower(), rules).pull(x0, u, ObjectiveSlopes(weights, None, 5.0)))
+        )
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-9)
 

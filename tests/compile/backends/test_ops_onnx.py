@@ -9,7 +9,7 @@ from helpers.emitted import OPERATIONS
 from helpers.formula_strategies import NAMES
 from helpers.sheets import columns_on, computed
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Sheet
@@ -19,7 +19,7 @@ ROWS = 7
 
 
 def _agree(numbers: dict[str, ir.Num], env: dict[str, np.ndarray], tolerance: float = 1e-13) -> None:
-    program = Program(numbers)
+    program = ArrayProgram(numbers)
     found = computed(program(columns_on(Sheet(), tuple(env), len(env["x"])), ONNX), env)
     for name, wanted in program(env, NUMPY).items():
         value = np.broadcast_to(found[name], wanted.shape)
@@ -57,7 +57,7 @@ def test_angles_are_exact_at_the_edges() -> None:
         "angle": ir.Op("atan2", (ir.Signal("y"), ir.Signal("x"))),
         "slope": ir.Op("atan", (ir.Signal("y"),)),
     }
-    found = computed(Program(numbers)(columns_on(Sheet(), ("y", "x"), 1), ONNX), {"y": y, "x": x})
+    found = computed(ArrayProgram(numbers)(columns_on(Sheet(), ("y", "x"), 1), ONNX), {"y": y, "x": x})
     np.testing.assert_allclose(found["angle"], np.where(known, np.arctan2(y, x), np.nan), rtol=1e-15)
     np.testing.assert_allclose(found["slope"], np.arctan(y), rtol=1e-15)
 

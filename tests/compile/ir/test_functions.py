@@ -11,7 +11,7 @@ import torch
 
 from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array import numpy_ops
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY, NumpyOps
 from stlc.compile.backends.c.numbers import NumberWriter
 from stlc.compile.backends.c.slopes import SlopeWriter
@@ -66,14 +66,14 @@ def test_an_entry_is_all_that_a_function_needs(monkeypatch: pytest.MonkeyPatch) 
     for module in (
         functions,
         numpy_ops,
-        *map(__import__("sys").modules.__getitem__, (Program.__module__, NumberWriter.__module__)),
+        *map(__import__("sys").modules.__getitem__, (ArrayProgram.__module__, NumberWriter.__module__)),
         *map(__import__("sys").modules.__getitem__, (SlopeWriter.__module__, bounds.__module__)),
     ):
         monkeypatch.setattr(module, "FUNCTIONS", table)
     monkeypatch.setattr(NumpyOps, "tanh", staticmethod(np.tanh), raising=False)
     monkeypatch.setattr(TorchOps, "tanh", staticmethod(torch.tanh), raising=False)
     number = ir.Op("tanh", (X,))
-    program = Program({"y": number})
+    program = ArrayProgram({"y": number})
     assert "tanh" in functions.callable_names()
     assert program({"x": np.array([0.5])}, NUMPY)["y"] == pytest.approx(math.tanh(0.5))
     assert program({"x": torch.tensor([0.5])}, TORCH)["y"].item() == pytest.approx(math.tanh(0.5))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.coverage import RADII, Axis, axes_of, chance, chances
 from stlc.controller.problem.task import Task
-from stlc.runtime.prefixes import SAMPLINGS, Grid, Sampling
+from stlc.runtime.prefixes import SAMPLINGS, PrefixGrid, Sampling
 
 DRAWN = 20_000
 
@@ -92,7 +92,7 @@ def test_of_a_task(car_task: Task) -> None:
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_of_a_sample_at_least_that_much_is_met(sampling: Sampling) -> None:
     axes = [even("a", -1, 1, 6), even("b", 0, 1, 6)]
-    grid = Grid(tuple(axis.values for axis in axes), (2,), 100, 400, sampling)
+    grid = PrefixGrid(tuple(axis.values for axis in axes), (2,), 100, 400, sampling)
     found = chance(axes, 0.1, 2, grid.samples)
     assert found.sampled
     assert found.candidates == 400

@@ -16,7 +16,7 @@ from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
-from stlc.runtime.prefixes import Grid
+from stlc.runtime.prefixes import PrefixGrid
 
 F64 = torch.float64
 
@@ -33,14 +33,14 @@ class Constant:
         return torch.full((len(x0), self.task.horizon, 1), self.action, dtype=x0.dtype)
 
 
-def paper_search(task: Task, policy: Policy, grid: Grid, seconds: float | None = None) -> StagedSearch:
+def paper_search(task: Task, policy: Policy, grid: PrefixGrid, seconds: float | None = None) -> StagedSearch:
     """The stages of the paper's guard."""
     return StagedSearch(task, policy, "paper", grid=grid, limits=Limits(paper=seconds))
 
 
-def grid(**changed: object) -> Grid:
+def grid(**changed: object) -> PrefixGrid:
     values = {"values": ((-10.0, -5.0, 0.0, 5.0, 10.0),), "lengths": (1, 2), "batch": 4096} | changed
-    return Grid(**values)  # type: ignore[arg-type]
+    return PrefixGrid(**values)  # type: ignore[arg-type]
 
 
 def failing(task: Task, action: float, n: int = 400, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -51,7 +51,7 @@ def failing(task: Task, action: float, n: int = 400, seed: int = 0) -> tuple[Ten
     return x[bad], plan[bad]
 
 
-def slow_choice(task: Task, x: Tensor, action: float, g: Grid) -> tuple[int, float, bool]:
+def slow_choice(task: Task, x: Tensor, action: float, g: PrefixGrid) -> tuple[int, float, bool]:
     """Choice for one state, plan by plan: (T0, rho, whether phi or phi_safe was met)."""
     for length in g.lengths:
         heads = [(action,) * length, *product(g.values[0], repeat=length)]
@@ -184,7 +184,7 @@ def test_the_grid_is_that_of_the_system_file(car_task: Task) -> None:
 
 
 def test_the_grid_of_two_controls() -> None:
-    g = Grid(((0.0, 1.0), (5.0, 6.0, 7.0)), (2,), 10)
+    g = PrefixGrid(((0.0, 1.0), (5.0, 6.0, 7.0)), (2,), 10)
     prefixes = {tuple(map(tuple, prefix)) for prefix in g.prefixes(2).tolist()}
     assert len(prefixes) == 6**2
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
@@ -28,7 +28,7 @@ PANDA = (EXAMPLES / "panda.urdf").read_text()
 def computed(body: ir.Body, q: np.ndarray) -> np.ndarray:
     """The body as a program, (n, joints) -> (n, 3)."""
     args = tuple(ir.Signal(f"a{i}") for i in range(len(body.formals)))
-    program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
+    program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)
 

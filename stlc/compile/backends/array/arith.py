@@ -13,7 +13,7 @@ from functools import partial, reduce
 from typing import Any, TypeAlias, assert_never
 
 from stlc.compile.backends.array.namespace import Array, Ops
-from stlc.compile.backends.array.tape import Instr, Operand, Tape
+from stlc.compile.backends.array.tape import GradientTape, Instr, Operand
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import key_of, leaves
@@ -28,7 +28,7 @@ _TAKES_FLOATS = frozenset({"pow"})
 """Kernels that take a constant as a Python float."""
 
 
-class Program:
+class ArrayProgram:
     """Executable form of several numbers over one environment.
 
     Args:
@@ -51,7 +51,7 @@ class Program:
         self._outputs = dict(outputs)
         self._constants = {name: float(value) for name, value in (constants or {}).items()}
         self._externs = dict(externs or {})
-        self._tapes: dict[bool, tuple[Tape, dict[str, Operand]]] = {}
+        self._tapes: dict[bool, tuple[GradientTape, dict[str, Operand]]] = {}
         self._bound: dict[tuple[str, Switch, Hashable], _Bound] = {}
         tape, _ = self._tape(exact=True)
         self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
@@ -77,7 +77,7 @@ class Program:
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
 
-    def _tape(self, *, exact: bool) -> tuple[Tape, dict[str, Operand]]:
+    def _tape(self, *, exact: bool) -> tuple[GradientTape, dict[str, Operand]]:
         if exact not in self._tapes:
             writer = _Writer(self._constants, exact=exact)
             outputs = {name: writer.number(num) for name, num in self._outputs.items()}
@@ -159,7 +159,7 @@ def _array(value: float, env: Mapping[str, Array], ops: Ops) -> Array:
     return ops.full((), float(value), _first(env))
 
 
-def _needed(tape: Tape, outputs: Any) -> list[int]:
+def _needed(tape: GradientTape, outputs: Any) -> list[int]:
     """Registers that the outputs depend on, in order."""
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
@@ -177,8 +177,10 @@ class _Writer:
     With `exact`, conditions are masks; otherwise margins passed to the switch.
     """
 
-    def __init__(self, constants: Mapping[str, float], *, exact: bool, tape: Tape | None = None) -> None:
-        self.tape = Tape() if tape is None else tape
+    def __init__(
+        self, constants: Mapping[str, float], *, exact: bool, tape: GradientTape | None = None
+    ) -> None:
+        self.tape = GradientTape() if tape is None else tape
         self.bound: dict[str, Operand] = {}
         self._constants = constants
         self._exact = exact
@@ -311,7 +313,7 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 # ------------------------------------------------------------------------- inputs
 
 
-def inputs(program: Program, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
+def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
     """Return the inputs of `program` at the instants `run`, each `(count, batch)`; at least one column.
 
     Args:

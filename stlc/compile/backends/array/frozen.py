@@ -15,7 +15,7 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from stlc.compile.backends.array.arith import Program, inputs
+from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, columns, looks_at_ends, reach, uses_end
@@ -125,7 +125,7 @@ class Freezer:
 
     def _held(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
         """Bound values of each instant of `run`, constant along time: `(length, count * batch)`."""
-        program = Program(dict(node.bindings))
+        program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
         blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
         rows = self.ops.full((run.count, self._batch), 0.0, self._like)

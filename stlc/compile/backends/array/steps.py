@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, assert_never, final
 
 import numpy as np
 
-from stlc.compile.backends.array.arith import Program, inputs
+from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.frozen import Freezer
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.backends.array.windows import Windows
@@ -50,11 +50,11 @@ class Batch:
     """Predicates computed by one program at the same instants, all within the trace."""
 
     run: IndexRange
-    program: Program
+    program: ArrayProgram
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class StepSource:
     """Source of a predicate's values: an output of a program, or a column.
 
     Attributes:
@@ -82,7 +82,7 @@ class ArrayPlan:
 
     schedule: Schedule
     batches: tuple[Batch, ...]
-    predicates: dict[int, Source]
+    predicates: dict[int, StepSource]
     beyond: int = 0
     runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
 
@@ -95,15 +95,15 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
     return ArrayPlan(found, batches, predicates, sum(max(min(stop), 0) for stop in stops))
 
 
-def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, Source]]:
+def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
     """Group predicates over the same instants into programs; predicates that are columns need none."""
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
-    predicates: dict[int, Source] = {}
+    predicates: dict[int, StepSource] = {}
     for index, step in enumerate(steps):
         if isinstance(step.node, ir.Predicate):
             inside = within(reads(step.node.num, domain), step.run, domain)
             if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
-                predicates[index] = Source(None, step.node.num.name, inside)
+                predicates[index] = StepSource(None, step.node.num.name, inside)
             elif inside.count > 0:
                 wanted.setdefault(_signed(step.node), []).append((inside, index))
     grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
@@ -113,9 +113,9 @@ def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, .
     batches = []
     for number, (stretch, nums) in enumerate(grouped.items()):
         outputs = {str(i): num for i, num in enumerate(nums)}
-        batches.append(Batch(stretch, Program(outputs)))
+        batches.append(Batch(stretch, ArrayProgram(outputs)))
         for i, indices in enumerate(nums.values()):
-            predicates.update({index: Source(number, str(i), inside) for inside, index in indices})
+            predicates.update({index: StepSource(number, str(i), inside) for inside, index in indices})
     return tuple(batches), predicates
 
 

@@ -34,7 +34,7 @@ class Instr:
     params: tuple[object, ...] = ()
 
 
-class Tape:
+class GradientTape:
     """List of instructions; emitting an existing one returns its register."""
 
     def __init__(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from stlc.compile.backends.array.arith import Program, inputs
+from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.ops import ONNX
@@ -63,7 +63,7 @@ def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
 def _frozen(node: ir.Freeze, env: Columns) -> Value:
     """Robustness of a `freeze` at all samples, `(samples, batch)`; NaN where undefined."""
     like = next(iter(env.values()))
-    program, samples = Program(dict(node.bindings)), len(like)
+    program, samples = ArrayProgram(dict(node.bindings)), len(like)
     rows = []
     for instant, known in enumerate(defined(node, samples)):
         if not known:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from stlc.compile.backends.c.climb import CLIMB
 from stlc.compile.backends.c.numbers import Leaf, NumberWriter
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
-from stlc.compile.backends.c.plan import Place, Plan, plan_of
+from stlc.compile.backends.c.plan import Plan, Storage, plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.ir import nodes as ir
 
@@ -131,18 +131,18 @@ def roots_in(plan: Plan) -> list[str]:
     return [_along(i, root, rows, "LANE g{value} += g[{i}][j];") for i, root, rows in _side_by_side(plan)]
 
 
-def _side_by_side(plan: Plan) -> list[tuple[int, Place, int]]:
+def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
     """Requirements with values in consecutive rows: index of the first, its place, and their number."""
-    runs: list[tuple[int, Place, int]] = []
+    runs: list[tuple[int, Storage, int]] = []
     for i, root in enumerate(plan.roots):
-        if runs and root == Place(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
+        if runs and root == Storage(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
             runs[-1] = (*runs[-1][:2], runs[-1][2] + 1)
         else:
             runs.append((i, root, 1))
     return runs
 
 
-def _along(first: int, root: Place, rows: int, form: str) -> str:
+def _along(first: int, root: Storage, rows: int, form: str) -> str:
     if rows == 1:
         return form.format(i=first, value=root.buffer[str(root.row)])
     text = form.format(i=f"{first} + i", value=root.buffer[f"{root.row} + i"])

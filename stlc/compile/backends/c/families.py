@@ -20,7 +20,7 @@ Entry: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class FamilyTable:
     """Constants and columns that distinguish the members of a family, one row per member.
 
     Attributes:
@@ -51,7 +51,7 @@ class Family:
 
     members: tuple[int, ...]
     shape: ir.Formula
-    table: Table
+    table: FamilyTable
 
 
 def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
@@ -99,7 +99,7 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
         stands.append(first)
     left = iter(stands)
     shape = _changed(formulas[members[0]], lambda _: next(left))
-    table = Table(len(members), values, {name: key for key, name in columns.items()})
+    table = FamilyTable(len(members), values, {name: key for key, name in columns.items()})
     return Family(tuple(members), shape, table)
 
 

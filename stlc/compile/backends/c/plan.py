@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TypeAlias
 
-from stlc.compile.backends.c.families import Family, Table, families
+from stlc.compile.backends.c.families import Family, FamilyTable, families
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of, reach_of
@@ -26,8 +26,8 @@ from stlc.compile.schedule.schedule import (
     Pick,
     Schedule,
     Scheduler,
-    Scope,
     Step,
+    StepScope,
     TraceDomain,
     earliest,
     latest,
@@ -81,12 +81,12 @@ class Tabled:
         pick: extremum over the rows at each instant; None: the first value of each row is kept.
     """
 
-    table: Table
+    table: FamilyTable
     pick: Pick | None
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Storage:
     """Location of one value: a row of a buffer."""
 
     buffer: Buffer
@@ -106,7 +106,7 @@ class Plan:
     """
 
     schedule: Schedule
-    roots: tuple[Place, ...]
+    roots: tuple[Storage, ...]
     buffers: tuple[Buffer, ...]
     size: int
     calls: Mapping[CallKey, int]
@@ -127,12 +127,12 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
     places = planner.roots(formulas)
     numbers = tuple(number for number, _ in places)
     schedule = Schedule(planner.domain, tuple(planner.scope.steps), numbers)
-    roots = tuple(Place(planner.buffers[number], row) for number, row in places)
+    roots = tuple(Storage(planner.buffers[number], row) for number, row in places)
     return Plan(schedule, roots, tuple(planner.buffers), planner.size, planner.calls)
 
 
 @dataclass(slots=True)
-class _Scope(Scope):
+class _Scope(StepScope):
     """Scope of steps: the whole plan, the body of a `freeze`, or the body of a loop over a table."""
 
     read: frozenset[str] = frozenset()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
-Attribute: TypeAlias = "int | tuple[int, ...] | Body"
+Attribute: TypeAlias = "int | tuple[int, ...] | GraphBody"
 
 BATCH = 1 << 40
 """Axis length known only at run time; all such axes in one operation have the same length."""
@@ -26,7 +26,7 @@ WRITTEN_OUT = 600
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class GraphNode:
     """ONNX operation, with the names of its inputs and outputs."""
 
     op: str
@@ -37,12 +37,12 @@ class Node:
     @property
     def reads(self) -> frozenset[str]:
         """Names that the node depends on, including those of the outer graph that its body reads."""
-        bodies = (value for _, value in self.attributes if isinstance(value, Body))
+        bodies = (value for _, value in self.attributes if isinstance(value, GraphBody))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Body:
+class GraphBody:
     """Loop body: a graph inside a node.
 
     Attributes:
@@ -54,7 +54,7 @@ class Body:
     outputs: tuple[Value, ...]
 
     @property
-    def nodes(self) -> list[Node]:
+    def nodes(self) -> list[GraphNode]:
         """Nodes of an iteration, in order."""
         return self.sheet.needed(self.outputs)
 
@@ -80,7 +80,7 @@ class Sheet:
         prefix: of its names, distinct for a body and its outer graph.
     """
 
-    nodes: list[Node] = field(default_factory=list)
+    nodes: list[GraphNode] = field(default_factory=list)
     constants: dict[str, NDArray[Any]] = field(default_factory=dict)
     inputs: list[Value] = field(default_factory=list)
     prefix: str = ""
@@ -118,7 +118,7 @@ class Sheet:
                 Value(self, f"{self.prefix}v{len(self.nodes)}.{place}", shape, kind)
                 for place, shape in enumerate(shapes)
             )
-            self.nodes.append(Node(op, names, tuple(value.name for value in made), facts))
+            self.nodes.append(GraphNode(op, names, tuple(value.name for value in made), facts))
             self._known[key] = made
         return self._known[key]
 
@@ -138,7 +138,7 @@ class Sheet:
         now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carried)]
         row = [inner.input(f"{inner.prefix}r{i}", each.shape[1:], each.kind) for i, each in enumerate(rows)]
         later, kept = turn(inner, now, [each.reshaped(1, *each.shape) for each in row])
-        body = Body(inner, (*later, *kept))
+        body = GraphBody(inner, (*later, *kept))
         if count * len(body.nodes) <= WRITTEN_OUT:
             return self._written_out(carried, rows, turn)
         shapes = [each.shape for each in later] + [(count, *each.shape) for each in kept]
@@ -153,7 +153,7 @@ class Sheet:
             history.append(kept)
         return tuple(joined(each) for each in zip(*history, strict=True))
 
-    def needed(self, outputs: Sequence[Value]) -> list[Node]:
+    def needed(self, outputs: Sequence[Value]) -> list[GraphNode]:
         """Return the nodes that outputs depend on, in order."""
         wanted, kept = {value.name for value in outputs}, []
         for node in reversed(self.nodes):

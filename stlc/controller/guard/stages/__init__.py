@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
-    from stlc.runtime.prefixes import Grid
+    from stlc.runtime.prefixes import PrefixGrid
 
 STAGES: PackageRegistry[type[GuardStage]] = PackageRegistry(
     "stage", "stlc.controller.guard.stages", "STAGE", default=""
@@ -43,7 +43,7 @@ class Setup:
 
     task: Task
     policy: Policy
-    grid: Grid
+    grid: PrefixGrid
     limits: Limits
     guard: str
     generator: torch.Generator

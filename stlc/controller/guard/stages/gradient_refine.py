@@ -25,7 +25,7 @@ from stlc.compile.semantics.switch import StraightThrough
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
-from stlc.native import Outcome
+from stlc.native import ObjectiveSlopes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -182,7 +182,7 @@ class GradientAscent:
         threads = torch.get_num_threads()
 
         def pull(by: Numbers) -> Numbers:
-            return native.adjoint.pull(x, u, Outcome(by, None, SLOPE), threads=threads)
+            return native.adjoint.pull(x, u, ObjectiveSlopes(by, None, SLOPE), threads=threads)
 
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 

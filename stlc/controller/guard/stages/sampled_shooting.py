@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
-    from stlc.runtime.prefixes import Grid
+    from stlc.runtime.prefixes import PrefixGrid
 
 
 class SampledPrefixes:
@@ -35,7 +35,7 @@ class SampledPrefixes:
         most: maximum number per length; a larger grid is sampled.
     """
 
-    def __init__(self, task: Task, policy: Policy, grid: Grid, most: int) -> None:
+    def __init__(self, task: Task, policy: Policy, grid: PrefixGrid, most: int) -> None:
         self.task, self.policy = task, policy
         few = replace(grid, samples=min(grid.samples, most))
         longest = max(grid.lengths, default=0)
