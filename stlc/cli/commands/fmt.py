@@ -41,9 +41,9 @@ def fmt(
     diff: Annotated[bool, typer.Option("--diff", help="Write nothing; print what would change.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Format specifications in the standard layout; their meaning is unchanged.
+    """Format specifications in the standard layout.
 
-    Comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □) become those of
+    Meaning, comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □) become those of
     the language; parentheses are added where other tools parse a formula differently. Formatting is
     idempotent. Exit code: 0, or 1 if --check or --diff found a difference.
     """

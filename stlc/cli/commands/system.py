@@ -48,7 +48,7 @@ def check(
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate a system file, draw initial states, and simulate random controls.
+    """Validate a system file with random rollouts.
 
     With --steps 0 the file is only read, without torch; otherwise random rollouts find initial sets that
     reject nearly all samples, and dynamics that diverge. Kinematics from a URDF are compared with
