@@ -43,9 +43,10 @@ def fmt(
 ) -> None:
     """Format specifications in the standard layout.
 
-    Meaning, comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □) become those of
-    the language; parentheses are added where other tools parse a formula differently. Formatting is
-    idempotent. Exit code: 0, or 1 if --check or --diff found a difference.
+    Meaning, comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □)
+    become those of the language; parentheses are added where other tools parse a formula differently.
+    Formatting is idempotent.
+    Exit code: 0, or 1 if --check or --diff found a difference.
     """
     names = spec_files(files or ["."])
     findings: list[Diagnostic] = []
