@@ -169,7 +169,7 @@ class _Box:
         return gymnasium.spaces.Box(self.low, self.high, dtype=np.float32)
 
     def clipped(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
-        """The physical value of a (normalised) value of the space, clipped to the bounds."""
+        """Clip `given` to the bounds, in physical units; with `unit` it is normalised."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         value = np.asarray(given, dtype=np.float64)
         return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)

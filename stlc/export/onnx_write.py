@@ -135,7 +135,7 @@ TIMED = 200
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Milliseconds per decision of one agent on one thread: of the policy, and with a previous plan."""
+    """Milliseconds per decision of one agent on one thread: from a state alone, and with a previous plan."""
 
     median: float
     p99: float

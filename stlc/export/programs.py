@@ -109,10 +109,10 @@ class _Tried:
 
 
 class Guarding(nn.Module):
-    """Module from states (B, n) and the policy's plans (B, T, m) to the backup policy's plans; float64.
+    """Module that maps states (B, n) and the policy's plans (B, T, m) to the backup policy's plans; float64.
 
-    The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1 where phi or
-    phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as
+    The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1: the plan
+    satisfies phi or phi_safe, 2: it has the longest safe prefix) and t0 (B,), the length of its prefix, as
     `stlc.controller.guard.candidates.Candidates`.
     """
 

@@ -121,10 +121,10 @@ class Monitor:
 
         Args:
             signals: by name, or a trace, or the path of one.
-            at: evaluate at this sample, or at "all" starts; None takes each requirement's own instants.
+            at: a sample index, or "all" for every possible start; None takes each requirement's own instants.
             end: where a trace is too short: "open" takes bounds over all its continuations and may be
                 inconclusive, "strict" refuses, "truncate" cuts windows.
-            tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
+            tolerance: a robustness of at least minus this is satisfied; 0 tells `<` from `<=`.
             require: names of the requirements to evaluate; none means all.
             semantics: of the reported robustness, or its name; verdicts and reasons are always exact.
 

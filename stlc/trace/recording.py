@@ -97,7 +97,7 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
 
 
 def clock_among(names: Iterable[str]) -> str | None:
-    """The clock among names: `t`, or the only usual name of a clock."""
+    """Name of the clock column: `t`, else the usual name of a clock if exactly one occurs."""
     known = list(names)
     found = [name for name in known if name.strip().lower() in CLOCKS]
     return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None

@@ -205,12 +205,12 @@ class Shot:
         alt: description in words.
         frames: number of instants.
         dt: seconds between them.
-        t0: of the first one.
+        t0: time of the first frame, s.
         keys: legend entries.
         strip: strip charts.
         events: violations.
         names: of the agents.
-        requirements: names of the judged ones.
+        requirements: names of the requirements judged.
         taped: records the drawing of given frames.
     """
 

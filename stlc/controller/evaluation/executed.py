@@ -61,7 +61,7 @@ class Executed:
 
 
 def judge_executed(task: Task, recording: DeploymentRecording, *, savable: Mask | None = None) -> Executed:
-    """Judge a recording. If no window fits, there are no starts.
+    """Judge a recording at every sample from which a whole horizon fits; a shorter one has no such sample.
 
     `savable`: (rows,), starts with a known safe plan; a search finds them if not given.
     """

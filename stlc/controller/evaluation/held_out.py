@@ -175,7 +175,7 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """Share of states known to be feasible, extrapolated from the searched failing states."""
+    """Estimated share of feasible states: the known ones, and of failing ones the share found by search."""
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried
     return (int(known.sum()) + left * found / max(1, tried)) / len(known)

@@ -121,7 +121,7 @@ class RunWriter:
             self.folder.update(facts)
 
     def before(self, look: int) -> None:
-        """Drop the rows from the validation at step `look` on, which will be repeated."""
+        """Drop the rows of the validation at step `look` and of later ones; these steps are run again."""
         if self.writes:
             self.folder.keep_rows(lambda row: row.get("step", 0) < look)
 

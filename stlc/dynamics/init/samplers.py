@@ -1,4 +1,4 @@
-"""Initial states: a mixture of situations, drawn in order, with rejection by the conditions of `where`."""
+"""Random initial states: a situation by weight, its variables in order, rejected unless `where` holds."""
 
 from __future__ import annotations
 

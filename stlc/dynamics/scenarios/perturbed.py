@@ -164,7 +164,7 @@ class _RewritingNames(Names):
         return cls(names.constants, names.columns, names.controls, dict(names.entries), names.places, rewrite)
 
     def expressions(self, reader: Reader) -> Expressions:
-        """A compiler of rewritten expressions."""
+        """Compiler of expressions in which the perturbed names are replaced."""
         return _RewritingExpressions(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
 
 

@@ -147,7 +147,7 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def _body(expr: ast.Expr, interval: str) -> str:
-    """Return the operand of a temporal operator; a vector, which would be its interval, gets parentheses."""
+    """Return the operand of a temporal operator; a vector gets parentheses: `[a, b]` is an interval."""
     text = show_at(expr, Level.PREFIX)
     return f"({text})" if text.startswith("[") and not interval else text
 
@@ -229,7 +229,7 @@ def show_name(name: str) -> str:
 
 
 def own_name(name: str) -> str:
-    """Return a name in its declaration."""
+    """Return a name as its declaration writes it, quoted if it has to be."""
     return f"`{name}`" if name in BUILT_IN else show_name(name)
 
 

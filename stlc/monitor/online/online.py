@@ -132,9 +132,9 @@ class Watched:
 class Online:
     """Monitor of a stream of samples; see `Monitor.online`.
 
-    Memory is bounded by the windows of the requirements, not by the length of the stream. A window to
-    the end of the trace costs nothing where it stands outermost or under other such windows; a requirement
-    with one under a bounded window is evaluated on all samples, which are stored for it.
+    Memory is bounded by the windows of the requirements, not by the length of the stream. An
+    unbounded window (to the end of the trace) needs no memory if it is outermost or inside unbounded windows
+    only. If it is inside a bounded window, all samples are stored and the requirement is evaluated on them.
     """
 
     def __init__(

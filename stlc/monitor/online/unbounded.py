@@ -112,10 +112,10 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """The column of the value of an operator from the last row on.
+    """Column with the value of an operator from the last row on.
 
-    Operators that read the same columns may still differ at the end of the trace: `next` of an operator is
-    not the operator of `next` there.
+    Operators that read the same columns may still differ at the end of the trace: `next (always p)` and
+    `always (next p)` are not equal there.
     """
     for name, known in found.origins.items():
         if known == origin:

@@ -121,7 +121,7 @@ class GradientAscent:
         return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
-        """Nearest plan to (agents, T, m), on the line to the repaired one, with the target robustness."""
+        """Plan (agents, T, m) on the way to the repaired one: the first of target robustness."""
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
         each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))
