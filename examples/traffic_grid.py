@@ -81,7 +81,7 @@ def turn_pose(direction: int, turn: int, s: float) -> tuple[float, float, float]
 
 
 def overlap(a: np.ndarray, b: np.ndarray, grow: float = 0.0) -> np.ndarray:
-    """Whether cars at the poses `a`, `b` (..., 3), grown by `grow` metres, intersect (separating axes)."""
+    """True if cars at the poses `a`, `b` (..., 3), grown by `grow` metres, intersect (separating axes)."""
     half = np.array([LENGTH_CAR, WIDTH_CAR]) / 2 + grow
     delta = b[..., :2] - a[..., :2]
     turned = np.abs(np.stack([np.cos(b[..., 2] - a[..., 2]), np.sin(b[..., 2] - a[..., 2])], -1))

@@ -30,7 +30,7 @@ def fingerprint():
 
 
 def is_current():
-    """Whether `.venv` was made for exactly this tree."""
+    """True if `.venv` was made for exactly this tree."""
     return PYTHON.exists() and STAMP.exists() and STAMP.read_text() == fingerprint()
 
 
@@ -52,7 +52,7 @@ def ensure():
 
 
 def has_same_python():
-    """Whether the Python in `.venv` runs and is the version of this one."""
+    """True if the Python in `.venv` runs and is the version of this one."""
     ask = [str(PYTHON), "-c", "import sys; print(sys.version)"]
     try:
         return subprocess.check_output(ask, text=True).strip() == sys.version

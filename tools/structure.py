@@ -166,7 +166,7 @@ class House:
 
 
 def _unlike(annotation: ast.expr) -> bool:
-    """Whether an annotation is a tuple of fixed length with entries of different types."""
+    """True if an annotation is a tuple of fixed length with entries of different types."""
     if not (isinstance(annotation, ast.Subscript) and ast.unparse(annotation.value) == "tuple"):
         return False
     if not isinstance(annotation.slice, ast.Tuple):

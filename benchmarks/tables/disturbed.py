@@ -102,7 +102,7 @@ def section(results: Sequence[Result]) -> list[str]:
 
 
 def _lost_to_the_world(row: Row) -> bool:
-    """Whether unsafe drives are due to the world: the model is exact, and the full guard is active."""
+    """True if unsafe drives are due to the world: the model is exact, and the full guard is active."""
     every, quiet = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
     return every is not None and quiet is not None and float(every["mean"]) < min(float(quiet["mean"]), MOST)
 

@@ -309,7 +309,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
 
 
 def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
-    """Whether a plan holds a number that is not finite, or a value computed from it is NaN, (1, batch)."""
+    """True if a plan holds a number that is not finite, or a value computed from it is NaN, (1, batch)."""
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))

@@ -36,7 +36,7 @@ class Times:
 
     @property
     def complete(self) -> bool:
-        """Whether both are known."""
+        """True if both are known."""
         return self.dt is not None and self.horizon is not None
 
     def grid(self) -> Grid:

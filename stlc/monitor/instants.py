@@ -67,7 +67,7 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """Whether values at the evaluated instants are independent of samples from `samples` on, (count,)."""
+    """True if values at the evaluated instants are independent of samples from `samples` on, (count,)."""
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)

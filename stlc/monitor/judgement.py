@@ -87,7 +87,7 @@ class Judgement:
 
     @property
     def satisfied(self) -> bool | None:
-        """Whether all traces satisfy it: True, False, or None where that is unknown."""
+        """True if all traces satisfy it: True, False, or None where that is unknown."""
         return _known(self.overall)
 
     @property
@@ -201,7 +201,7 @@ class Verdict:
 
     @property
     def satisfied(self) -> bool | None:
-        """Whether all traces satisfy all requirements: True, False, or None where that is unknown."""
+        """True if all traces satisfy all requirements: True, False, or None where that is unknown."""
         return _known(self.overall)
 
     @property

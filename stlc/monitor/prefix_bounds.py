@@ -82,7 +82,7 @@ class _PrefixBound:
 
 
 def reads_seen(formula: ir.Formula) -> bool:
-    """Whether `with_seen` is needed."""
+    """True if `with_seen` is needed."""
     return SEEN in columns(formula)
 
 

@@ -265,7 +265,7 @@ class Monitor:
             raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
 
     def _lacks(self, times: Times) -> bool:
-        """Whether the specification needs a time step or horizon that is unknown."""
+        """True if the specification needs a time step or horizon that is unknown."""
         grid, spec = times.grid(), self._resolved
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 

@@ -67,7 +67,7 @@ def wordless(recording: Recording) -> Recording:
 
 
 def _is_odd(values: NDArray[Any] | None) -> bool:
-    """Whether an array holds words, or complex numbers."""
+    """True if an array holds words, or complex numbers."""
     return values is not None and values.dtype.kind in "Uc"
 
 

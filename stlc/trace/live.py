@@ -380,7 +380,7 @@ class Gridded:
 
     @property
     def _has_to_wait(self) -> bool:
-        """Whether the first samples are needed to estimate the usual step."""
+        """True if the first samples are needed to estimate the usual step."""
         return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
 
     def _take(self, moment: TimedSample) -> float:

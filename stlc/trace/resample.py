@@ -122,7 +122,7 @@ class _Timed:
 
     @property
     def events(self) -> bool:
-        """Whether all signals are held between samples."""
+        """True if all signals are held between samples."""
         return len(self.held) == len(self.signals)
 
     @property

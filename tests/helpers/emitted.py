@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from helpers.formula_strategies import GRID, NAMES, numbers, state_formulas
+from helpers.formula_strategies import GRID, NAMES, formulas, numbers, state_formulas
 from helpers.reference import number
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
@@ -21,7 +21,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
-from stlc.compile.ir.traverse import leaves, subexpressions
+from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.switch import StraightThrough
@@ -90,6 +90,19 @@ def planned(formula: typed.Formula) -> ir.Formula | None:
     """A formula as it is trained for; None where it looks beyond a plan of `STEPS` steps."""
     node = simplify(lower(formula, GRID, sink=[]))
     return node if defined(node, STEPS + 1)[0] else None
+
+
+def planned_formulas(count: int) -> list[ir.Formula]:
+    """Random formulas as they are trained for."""
+    drawn = [*gathered(formulas(), count // 2), *gathered(formulas(held=()), count - count // 2)]
+    return [node for node in map(planned, drawn) if node is not None]
+
+
+def assert_every_kind(rules: Sequence[ir.Formula]) -> None:
+    """Require a formula of every kind that training takes."""
+    kinds = {type(node) for rule in rules for node in nodes(rule)}
+    temporal = {ir.Temporal, ir.PastTemporal, ir.Until, ir.Since, ir.Shift, ir.Freeze}
+    assert kinds >= temporal | {ir.BoolOp, ir.Predicate}
 
 
 def choosing(count: int, first: int) -> list[ir.Num]:

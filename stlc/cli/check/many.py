@@ -86,7 +86,7 @@ def outcome_of(work: Work) -> Outcome:
 
 
 def _too_large(path: Path) -> bool:
-    """Whether a file should be read in chunks; never for small files, however well compressed."""
+    """True if a file should be read in chunks; never for small files, however well compressed."""
     if path.stat().st_size < SMALL:
         return False
     from stlc.trace.chunks import LARGE, size_of

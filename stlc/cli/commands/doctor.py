@@ -150,7 +150,7 @@ def _cache() -> HealthFinding:
 
 
 def _compiler() -> HealthFinding:
-    """Whether plans are evaluated by C kernels or by torch, and remembered failures of the compiler."""
+    """Evaluator of plans, C kernels or torch, and remembered failures of the compiler."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()

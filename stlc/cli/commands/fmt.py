@@ -28,7 +28,7 @@ class _Formatted:
 
     @property
     def differs(self) -> bool:
-        """Whether formatting changes the text."""
+        """True if formatting changes the text."""
         return self.before != self.after
 
 

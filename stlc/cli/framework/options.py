@@ -107,5 +107,5 @@ def _below(name: str) -> Iterator[str]:
 
 
 def _shown(path: Path, folder: Path) -> bool:
-    """Whether no part of the path below the folder is hidden."""
+    """True if no part of the path below the folder is hidden."""
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)

@@ -29,7 +29,7 @@ WIDEST = 80
 
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
 QUIET: ContextVar[bool] = ContextVar("stlc_quiet", default=False)
-"""Whether remarks and progress are suppressed."""
+"""True if remarks and progress are suppressed."""
 
 
 def emit(text: str, *, styled: bool = False) -> None:
@@ -107,7 +107,7 @@ def noticing() -> Iterator[None]:
 
 
 def wants_color(stream: TextIO) -> bool:
-    """Whether colour may be written to `stream`: by `--color`, then `NO_COLOR`, then being a terminal."""
+    """True if colour may be written to `stream`: by `--color`, then `NO_COLOR`, then being a terminal."""
     mode = COLOR.get()
     if mode != "auto":
         return mode == "always"

@@ -356,7 +356,7 @@ class _AsGiven:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value already has its annotated type."""
+    """True if a value already has its annotated type."""
     if annotation in (str, bool, int, float):
         return type(value) is annotation
     if get_origin(annotation) is Literal:

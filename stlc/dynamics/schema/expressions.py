@@ -173,7 +173,7 @@ class Expressions:
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     def _known(self, names: frozenset[str], span: Span) -> bool:
-        """Whether all columns have a value here."""
+        """True if all columns have a value here."""
         early = sorted(names - self.ready) if self.ready is not None else []
         if early:
             listed = ", ".join(f"`{name}`" for name in early)

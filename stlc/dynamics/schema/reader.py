@@ -226,12 +226,12 @@ def first_line(span: Span) -> Span:
 
 
 def _opens_more(node: Scalar) -> bool:
-    """Whether a plain text leaves a bracket open."""
+    """True if a plain text leaves a bracket open."""
     return node.style == "plain" and _balance(node.text) > 0
 
 
 def _closes_more(node: Scalar) -> bool:
-    """Whether a plain text closes a bracket that it did not open."""
+    """True if a plain text closes a bracket that it did not open."""
     return node.style == "plain" and _balance(node.text) < 0
 
 

@@ -97,7 +97,7 @@ class CauseNode:
 
     @property
     def path_moves(self) -> bool:
-        """Whether `moves` holds for all nodes on the path to the predicate that decides."""
+        """True if `moves` holds for all nodes on the path to the predicate that decides."""
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
@@ -324,7 +324,7 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """Whether the formula is undecided because the trace was cut: its margin has no upper bound."""
+        """True if the formula is undecided because the trace was cut: its margin has no upper bound."""
         return bool(np.isposinf(self._margins(formula, wanted, range(sample, sample + 1))[0]))
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
@@ -492,7 +492,7 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """Whether the window extends to instants at which everything is unknown."""
+        """True if the window extends to instants at which everything is unknown."""
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
             return False

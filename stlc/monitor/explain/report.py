@@ -264,7 +264,7 @@ def _telling(tree: CauseNode) -> CauseNode:
 
 
 def _closest(tree: CauseNode) -> bool:
-    """Whether the predicate that decides is the closest attempt of a window in which nothing succeeds."""
+    """True if the predicate that decides is the closest attempt of a window in which nothing succeeds."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]

@@ -26,7 +26,7 @@ _SPARE = 64
 
 
 def fits(plans: ColumnPlans) -> bool:
-    """Whether both bounds follow from one formula, over predicates of the present and latched values."""
+    """True if both bounds follow from one formula, over predicates of the present and latched values."""
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(map(_of_the_present, planned.streams))
 

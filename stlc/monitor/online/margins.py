@@ -71,7 +71,7 @@ class _Watched:
 
     @property
     def everywhere(self) -> bool:
-        """Whether it is evaluated at every start, and not only at the first sample."""
+        """True if it is evaluated at every start, and not only at the first sample."""
         return self.rule.windowed and not self.rule.absolute and self.horizon is not None
 
     @property

@@ -99,12 +99,12 @@ class Watched:
             self.truths.grow(signals, kept.first, kept.samples)
 
     def due(self, samples: int) -> bool:
-        """Whether to evaluate it again after so many samples."""
+        """True if it is due for evaluation after so many samples."""
         return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
 
     @property
     def over(self) -> bool:
-        """Whether its only instant is settled."""
+        """True if its only instant is settled."""
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> JudgedInstants:
@@ -306,7 +306,7 @@ class Online:
         return self._find(name).rule
 
     def repeats(self, name: str) -> bool:
-        """Whether a requirement is evaluated at every start, and not only at the first sample."""
+        """True if a requirement is evaluated at every start, and not only at the first sample."""
         return self._find(name).everywhere
 
     @property
@@ -342,7 +342,7 @@ class Online:
 
     @property
     def in_scope(self) -> bool | None:
-        """Whether the assumptions hold at the first sample: yes, no, or not known yet."""
+        """True if the assumptions hold at the first sample: yes, no, or not known yet."""
         if not self.samples:
             return None if self._scope else True
         found = {self._standing(watched).status for watched in self._scope}

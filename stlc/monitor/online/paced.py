@@ -220,7 +220,7 @@ class PacedTracker:
     _pace: int = 1
 
     def due(self, samples: int) -> bool:
-        """Whether to evaluate it again after so many samples."""
+        """True if it is due for evaluation after so many samples."""
         return samples - self.samples >= self._pace
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:

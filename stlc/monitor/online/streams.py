@@ -97,7 +97,7 @@ def read_by(stream: DerivedColumn) -> frozenset[str]:
 
 
 def endless(formula: ir.Formula) -> bool:
-    """Whether the formula has an unbounded future window."""
+    """True if the formula has an unbounded future window."""
     return any(
         isinstance(node, (ir.Temporal, ir.Until)) and node.window.hi is None for node in nodes(formula)
     )
@@ -194,7 +194,7 @@ def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
 
 
 def unbounded_past(node: ir.Formula) -> bool:
-    """Whether a node is a past operator with an unbounded window."""
+    """True if a node is a past operator with an unbounded window."""
     return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
 
 

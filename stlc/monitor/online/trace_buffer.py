@@ -60,7 +60,7 @@ class TraceBuffer:
 
     @property
     def full(self) -> bool:
-        """Whether samples have to be dropped."""
+        """True if samples have to be dropped."""
         return (self._kept.samples - self._kept.first) * self._wide > 2 * _MOST
 
     def forget(self) -> None:
@@ -120,7 +120,7 @@ class TraceBuffer:
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """Whether a requirement is `always` over an unbounded window, with a bounded body."""
+    """True if a requirement is `always` over an unbounded window, with a bounded body."""
     return (
         isinstance(formula, ir.Temporal)
         and formula.op == "always"

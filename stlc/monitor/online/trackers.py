@@ -67,7 +67,7 @@ class _CutTracker(ABC):
     @property
     @abstractmethod
     def cuts(self) -> bool:
-        """Whether the end of the trace cuts windows."""
+        """True if the end of the trace cuts windows."""
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
@@ -116,7 +116,7 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def cuts(self) -> bool:
-        """Whether the end of the trace cuts windows."""
+        """True if the end of the trace cuts windows."""
         return self.options.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
@@ -266,7 +266,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """Whether a column has known values beyond the last sample."""
+    """True if a column has known values beyond the last sample."""
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -364,7 +364,7 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def cuts(self) -> bool:
-        """Whether the end of the trace cuts windows."""
+        """True if the end of the trace cuts windows."""
         return self.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:

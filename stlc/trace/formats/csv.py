@@ -267,7 +267,7 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
 
 
 def _told(line: str, sheet: _Sheet) -> bool:
-    """Whether any cell of a line is filled."""
+    """True if any cell of a line is filled."""
     return bool(line.strip(f" \t{sheet.delimiter}"))
 
 

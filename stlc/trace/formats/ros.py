@@ -64,7 +64,7 @@ class _Layout:
 
     @property
     def stamp(self) -> bool:
-        """Whether the message is a time stamp."""
+        """True if the message is a time stamp."""
         return {each.name for each in self.fields} in STAMPS
 
 
@@ -139,7 +139,7 @@ class _Builder:
 
 
 def _tells(line: str) -> bool:
-    """Whether a line declares a field, not a constant or a comment."""
+    """True if a line declares a field, not a constant or a comment."""
     told = line.split("#")[0]
     match = _FIELD.fullmatch(told.rstrip())
     return bool(told.strip()) and (match is None or not match["rest"].startswith("="))

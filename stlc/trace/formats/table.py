@@ -66,7 +66,7 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text in brackets after a name is a unit."""
+    """True if a text in brackets after a name is a unit."""
     if text.lower() in _SPELLINGS:
         return True
     try:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from helpers.emitted import (
     STEPS,
+    assert_every_kind,
     follower,
-    gathered,
     gradients_agree,
     kernel_of,
-    planned,
+    planned_formulas,
     traces_of,
     values_agree,
 )
-from helpers.formula_strategies import NAMES, formulas
+from helpers.formula_strategies import NAMES
 
 from stlc import native
 from stlc.compile.backends.array.graph import evaluate
@@ -24,7 +24,6 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import nodes
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 
@@ -38,35 +37,19 @@ def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native, "FLAGS", (*native.FLAGS, "-O0"))
 
 
-def _drawn(count: int) -> list[ir.Formula]:
-    """Formulas of every kind that training takes."""
-    drawn = [*gathered(formulas(), count // 2), *gathered(formulas(held=()), count - count // 2)]
-    return [node for node in map(planned, drawn) if node is not None]
-
-
 def test_random_formulas_equal_the_evaluator() -> None:
-    rules = _drawn(90)
-    kinds = {type(node) for rule in rules for node in nodes(rule)}
-    assert kinds >= {
-        ir.Temporal,
-        ir.PastTemporal,
-        ir.Until,
-        ir.Since,
-        ir.Shift,
-        ir.Freeze,
-        ir.BoolOp,
-        ir.Predicate,
-    }
+    rules = planned_formulas(90)
+    assert_every_kind(rules)
     values_agree(rules, np.round(traces_of(1, 60) * 8) / 8)
 
 
 def test_random_formulas_have_the_gradient_of_torch() -> None:
-    gradients_agree(_drawn(50), traces_of(2, 40), 3)
+    gradients_agree(planned_formulas(50), traces_of(2, 40), 3)
 
 
 @pytest.mark.slow
 def test_thousands_of_random_formulas() -> None:
-    rules = _drawn(3000)
+    rules = planned_formulas(3000)
     assert len(rules) > 2000
     for seed, first in enumerate(range(0, len(rules), 50)):
         some = rules[first : first + 50]

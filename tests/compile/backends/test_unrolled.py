@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.emitted import STEPS, gathered, planned, traces_of
-from helpers.formula_strategies import NAMES, formulas
+from helpers.emitted import STEPS, assert_every_kind, planned_formulas, traces_of
+from helpers.formula_strategies import NAMES
 from helpers.sheets import columns_on, computed
 
 from stlc.compile.backends.array.graph import evaluate
@@ -14,7 +14,6 @@ from stlc.compile.backends.array.unrolled import written
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import Sheet
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import nodes
 
 X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
 
@@ -28,30 +27,15 @@ def _agree(rules: list[ir.Formula], trace: np.ndarray, count: int = 1) -> None:
         np.testing.assert_allclose(np.broadcast_to(value, wanted.shape), wanted, rtol=1e-12, atol=1e-12)
 
 
-def _drawn(count: int) -> list[ir.Formula]:
-    drawn = [*gathered(formulas(), count // 2), *gathered(formulas(held=()), count - count // 2)]
-    return [node for node in map(planned, drawn) if node is not None]
-
-
 def test_random_formulas_equal_the_evaluator() -> None:
-    rules = _drawn(60)
-    kinds = {type(node) for rule in rules for node in nodes(rule)}
-    assert kinds >= {
-        ir.Temporal,
-        ir.PastTemporal,
-        ir.Until,
-        ir.Since,
-        ir.Shift,
-        ir.Freeze,
-        ir.BoolOp,
-        ir.Predicate,
-    }
+    rules = planned_formulas(60)
+    assert_every_kind(rules)
     _agree(rules, np.round(traces_of(1, 40) * 8) / 8)
 
 
 @pytest.mark.slow
 def test_a_thousand_random_formulas() -> None:
-    rules = _drawn(1200)
+    rules = planned_formulas(1200)
     for seed, first in enumerate(range(0, len(rules), 60)):
         _agree(rules[first : first + 60], np.round(traces_of(seed, 30) * 8) / 8)
 

@@ -39,7 +39,7 @@ class Sliding:
 
     @property
     def to_end(self) -> bool:
-        """Whether every window reaches the last row."""
+        """True if every window reaches the last row."""
         return self.width >= self.rows
 
 
