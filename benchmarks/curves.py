@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.view.style import BLUE, INK, MUTED, ORANGE, Picture, look, new_figure
+from stlc.view.style import BLUE, INK, MUTED, ORANGE, Picture, new_figure, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,7 +66,7 @@ def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
     if not shown:
         return None
     rows, columns = -(-len(shown) // COLUMNS), min(len(shown), COLUMNS)
-    with look():
+    with picture_style():
         figure = new_figure(3.1 * columns + 0.4, 2.3 * rows + 0.3)
         grid = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
         for axes, panel in zip(grid, shown, strict=False):

@@ -212,7 +212,7 @@ require_window()
 import pytorch_kinematics
 """,
     "video": """
-from stlc.view.film import video
+from stlc.view.animation import video
 from PIL import Image
 with video("a.mp4", (64, 64), 40) as write:
     for _ in range(3):

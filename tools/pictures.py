@@ -1,11 +1,11 @@
-"""The pictures in docs/img: the film at the head of the README, a still of each world, traffic in motion.
+"""The pictures in docs/img: the animation of the README, a still of each world, traffic in motion.
 
     python tools/pictures.py --runs runs
 
 deploys the newest run of every specification (seed 0, with the paper's backup policy, and without it for
-comparison) and takes the instant with most interventions. The film shows the ships of `ship_track.stl` under
-its scenario `shifted`: four ships of each of the seeds 0 to 9 are simulated, and the first seed is shown in
-which a ship violates safety without the guard while all starts are viable (a plan search succeeds).
+comparison) and takes the instant with most interventions. The animation shows the ships of `ship_track.stl`
+under its scenario `shifted`: four ships of each of the seeds 0 to 9 are simulated, and the first seed is
+shown in which a ship violates safety without the guard while all starts are viable (a plan search succeeds).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from stlc.controller.sketch import (
 )
 from stlc.files import write_atomic
 from stlc.rundir import RunDir
-from stlc.view.animate import RESULT, Seen, film_of, seen_in
-from stlc.view.film import Film, frames_in, save_film, save_still, wipe
+from stlc.view.animation import Animation, clear_artists, frames_in, save_animation, save_still
+from stlc.view.run_animation import RESULT, RecordedScene, animation_of, recorded_scene
 from stlc.view.style import INK, MUTED
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -68,14 +68,14 @@ def draw(spec: str, scenario: str | None, runs: Path, folder: Path) -> Iterator[
     """Deploy the newest run of `spec` and draw it; yields the written files."""
     run = RunDir.open(spec, runs)
     _simulate(run, scenario, "--seeds", "0")
-    film = film_of(run, title=" · ".join(part for part in (spec, scenario) if part))
-    if film is None:
+    animation = animation_of(run, title=" · ".join(part for part in (spec, scenario) if part))
+    if animation is None:
         raise SystemExit(f"{run.shown} could not be drawn")
     name = "-".join(part for part in (spec, scenario) if part)
-    yield save_still(film, folder / f"{name}.webp")
+    yield save_still(animation, folder / f"{name}.webp")
     if name == MOVING:
         path = folder / f"{name}.gif"
-        save_film(film, path, max_bytes=MAX_BYTES)
+        save_animation(animation, path, max_bytes=MAX_BYTES)
         yield path
 
 
@@ -85,7 +85,7 @@ def _simulate(run: RunDir, scenario: str | None, *more: str) -> None:
         raise SystemExit(f"{run.shown} could not be deployed")
 
 
-# ------------------------------------------------------------------------------- the film
+# ------------------------------------------------------------------------------- the animation
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +98,16 @@ class Unsafe:
 
 
 def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
-    """The film at the head of the README; its seed is chosen unless given. Yields the written files."""
+    """The animation at the head of the README; its seed is chosen unless given. Yields the written files."""
     run = RunDir.open("ship_track", runs)
     size = ("--agents", str(SHIPS), "--steps", str(round(SECONDS / 0.15)))
     seed = _chosen(run, size) if seed is None else seed
     _simulate(run, "shifted", "--seeds", str(seed), *size)
-    without, guarded = seen_in(run, guarded=False), seen_in(run)
+    without, guarded = recorded_scene(run, guarded=False), recorded_scene(run)
     assert without is not None
     assert guarded is not None
     path = folder / "guard.webp"
-    pictures = list(frames_in(lead_film(without, guarded), range(without.frames), 100))
+    pictures = list(frames_in(lead_animation(without, guarded), range(without.frames), 100))
     for quality in range(80, 20, -8):
         buffer = io.BytesIO()
         pictures[0].save(
@@ -155,7 +155,7 @@ def unsafe_in(run: RunDir) -> list[Unsafe]:
     return found
 
 
-def lead_film(without: Seen, guarded: Seen) -> Film:
+def lead_animation(without: RecordedScene, guarded: RecordedScene) -> Animation:
     """Film of both runs, one above the other; the view follows the ships of both."""
     middle = np.mean([seen.scene["ships"][..., 0].mean(1) for seen in (without, guarded)], 0)
     hits = [first_hits(seen) for seen in (without, guarded)]
@@ -179,7 +179,7 @@ def lead_film(without: Seen, guarded: Seen) -> Film:
         def turn(index: int) -> None:
             clock.set_text(f"{index * without.dt:.1f} s")
             for axes, seen, hit, text in zip(panels, (without, guarded), hits, told, strict=True):
-                wipe(axes)
+                clear_artists(axes)
                 _river(axes, seen, index, float(middle[index]), hit <= index)
                 aground = int((hit <= index).sum())
                 text.set_text(f"{aground} aground" if aground else "none aground")
@@ -187,7 +187,9 @@ def lead_film(without: Seen, guarded: Seen) -> Film:
 
         return turn
 
-    return Film(without.frames, without.dt, (7.8, 5.6), begin, words.replace("\n", " "), without.frames // 3)
+    return Animation(
+        without.frames, without.dt, (7.8, 5.6), begin, words.replace("\n", " "), without.frames // 3
+    )
 
 
 def _sentence(without: int, guarded: int) -> str:
@@ -195,7 +197,7 @@ def _sentence(without: int, guarded: int) -> str:
     return f"{without} {run} aground without the guard, {guarded or 'none'} with it"
 
 
-def first_hits(seen: Seen) -> NDArray[np.float64]:
+def first_hits(seen: RecordedScene) -> NDArray[np.float64]:
     """First frame in which each ship violates safety, (ships,); infinity for never."""
     assert seen.judged is not None
     hits = np.full(seen.scene["ships"].shape[1], np.inf)
@@ -205,7 +207,7 @@ def first_hits(seen: Seen) -> NDArray[np.float64]:
     return hits
 
 
-def _river(axes: Any, seen: Seen, index: int, middle: float, aground: NDArray[np.bool_]) -> None:
+def _river(axes: Any, seen: RecordedScene, index: int, middle: float, aground: NDArray[np.bool_]) -> None:
     """Draw the river around `middle`, in metres."""
     left, right, half = middle - BEHIND, middle + AHEAD, float(seen.scene["half"][index])
     axes.add_patch(Rectangle((left, -half - 1), right - left, 2 * half + 2, color=BANK, lw=0))
@@ -260,8 +262,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--output", type=Path, default=ROOT / "docs/img")
-    parser.add_argument("--seed", type=int, help="of the film, where it was chosen before")
-    parser.add_argument("names", nargs="*", help="specifications, or `guard` for the film; by default all")
+    parser.add_argument("--seed", type=int, help="of the animation, where it was chosen before")
+    parser.add_argument(
+        "names", nargs="*", help="specifications, or `guard` for the animation; by default all"
+    )
     given = parser.parse_args()
     written = (
         [lead(given.runs, given.output, given.seed)] if not given.names or "guard" in given.names else []

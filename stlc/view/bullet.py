@@ -45,10 +45,10 @@ def available() -> bool:
 
 def stage_drawing(stage: Stage) -> Draw:
     """Function that draws frame `index` of a scene: a rendered picture of all robots, side by side."""
-    theatre = Theatre(stage, "picture")
+    renderer = Renderer(stage, "picture")
 
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        picture = theatre.picture(index, deciders(scene, index, stage.joints.shape[1]))
+        picture = renderer.picture(index, deciders(scene, index, stage.joints.shape[1]))
         height, width = picture.shape[:2]
         axes.imshow(picture, extent=(0, width, 0, height), interpolation="antialiased")
         for robot in range(stage.joints.shape[1]):
@@ -67,17 +67,17 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
         MissingError: R301, PyBullet is not installed; R302, there is no display.
     """
     require_window()
-    theatre = Theatre(stage, "window")
+    renderer = Renderer(stage, "window")
     try:
         for index in range(len(stage.joints)):
             begin = time.perf_counter()
-            theatre.turn(index, deciders(scene, index, stage.joints.shape[1]))
+            renderer.turn(index, deciders(scene, index, stage.joints.shape[1]))
             time.sleep(max(0.0, dt - (time.perf_counter() - begin)))
-    except theatre.client.error:  # the user closed the window
-        if theatre.open:
+    except renderer.client.error:  # the user closed the window
+        if renderer.open:
             raise
     finally:
-        theatre.close()
+        renderer.close()
 
 
 def require_window() -> None:
@@ -90,7 +90,7 @@ def require_window() -> None:
         raise MissingError(Diagnostic("R302", "there is no display for a window", help=advice))
 
 
-class Theatre:
+class Renderer:
     """The robots of a stage and the balls around them, side by side along x."""
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
@@ -147,7 +147,7 @@ class Theatre:
 
     def _robots(self) -> list[int]:
         with tempfile.TemporaryDirectory() as folder:
-            path = str(dressed(self.stage.urdf, self.stage.meshes, Path(folder)))
+            path = str(with_visuals(self.stage.urdf, self.stage.meshes, Path(folder)))
             robots = [self.client.loadURDF(path, place.tolist(), useFixedBase=True) for place in self.places]
         joints = range(self.client.getNumJoints(robots[0]))
         self.movable = [j for j in joints if self.client.getJointInfo(robots[0], j)[2] in (0, 1)]
@@ -248,7 +248,7 @@ ROD = 0.05  # m, radius
 _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz": "0"}
 
 
-def dressed(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
+def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
     """`urdf` itself if it has visual geometry, else a copy in `folder` with added geometry.
 
     Args:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.escape import picture
-from stlc.view.style import BLUE, INK, MUTED, SERIES, Picture, look, new_figure
+from stlc.view.style import BLUE, INK, MUTED, SERIES, Picture, new_figure, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ def draw_curves(rows: Rows) -> Picture | None:
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None
-    with look():
+    with picture_style():
         figure = new_figure(9, 3.4)
         left, middle, right = figure.subplots(1, 3, width_ratios=[1.35, 1.35, 1])
         _draw_accuracy(left, measured)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
+from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
-from stlc.view.material import Material
 from stlc.view.words import cause_words, count, drives_of, guard_words, seconds, share, spread
 
 Record = Mapping[str, Any]
@@ -17,9 +17,9 @@ MOST_BROKEN = 12
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
-def deployment_tiles(material: Material) -> list[tuple[str, str]]:
+def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
     """Key figures of the deployment for the first screen."""
-    guards = _guards(material)
+    guards = _guards(contents)
     if not guards:
         return []
     name, guard = list(guards.items())[-1]
@@ -27,7 +27,7 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
     beside = guard_words(name).beside
     each = {
         guard_words(name).beside: f"{drives['obeyed']:,} of {drives['count']:,}"
-        for name, drives in drives_of(material.simulation).items()
+        for name, drives in drives_of(contents.simulation).items()
     }
     tiles = [
         *((obeyed, f"drives obeyed, {guard}") for guard, obeyed in reversed(each.items())),
@@ -36,15 +36,15 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
     return [tile for tile in tiles if tile[0]]
 
 
-def deployment_section(material: Material) -> Section | None:
+def deployment_section(contents: RunContents) -> Section | None:
     """Tables of metrics (a column per guard), sources of decisions, and decision times."""
-    guards = _guards(material)
+    guards = _guards(contents)
     if not guards:
         return None
     body = join(
-        el("p", _setting(material.simulation or {})),
+        el("p", _setting(contents.simulation or {})),
         _compared("", guards, _drive_rows(guards)),
-        _broken(material.simulation),
+        _broken(contents.simulation),
         _compared("Progress", guards, _progress_rows(guards)),
         _compared("Decisions", guards, _decision_rows(guards)),
         _compared("Plans and starts, window by window", guards, _share_rows(guards)),
@@ -63,8 +63,8 @@ def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, 
     return join(el("h3", title), compared) if title else compared
 
 
-def _guards(material: Material) -> dict[str, Record]:
-    guards = (material.simulation or {}).get("guards")
+def _guards(contents: RunContents) -> dict[str, Record]:
+    guards = (contents.simulation or {}).get("guards")
     return dict(guards) if isinstance(guards, Mapping) else {}
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import picture
 from stlc.signature import Signature
-from stlc.view.style import BLUE, INK, MUTED, RED, Picture, look, new_figure
+from stlc.view.style import BLUE, INK, MUTED, RED, Picture, new_figure, picture_style
 from stlc.view.words import labelled
 
 if TYPE_CHECKING:
@@ -314,7 +314,7 @@ def draw_failures(
     weakness = find_weakness(held)
     if weakness is None:
         return None
-    with look():
+    with picture_style():
         figure = new_figure(9, 3.4)
         left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
         _draw_starts(left, held, weakness, signature)

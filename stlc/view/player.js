@@ -1,6 +1,6 @@
 "use strict";
 (() => {
-  const data = JSON.parse(document.getElementById("film-data").textContent);
+  const data = JSON.parse(document.getElementById("animation-data").textContent);
   const root = document.querySelector(".player"), dusk = matchMedia("(prefers-color-scheme: dark)");
   const find = (name) => [...root.querySelectorAll(name)];
   const canvases = find("canvas"), cursors = find(".cursor"), values = find(".value");

@@ -1,7 +1,8 @@
-"""The film at the head of the report: playback, scrubbing, and jumps to violations.
+"""The animation at the head of the report: playback, scrubbing, and jumps to violations.
 
-Without scripts the page shows a still. The film is stored as drawing commands (`stlc.view.tape`), not as
-pixels: it is sharp at every width and follows the reader's light or dark scheme; `player.js` replays it.
+Without scripts the page shows a still. The animation is stored as drawing commands
+(`stlc.view.vector`), not as pixels: it is sharp at every width and follows the reader's light or dark scheme;
+`player.js` replays it.
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.prepared import beside
-from stlc.view.animate import STILL, Shot, current, film_name, film_of, shots_of
-from stlc.view.film import Taped, in_the_dark, speed_of, still_bytes
+from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_bytes
+from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
-from stlc.view.judged import Event
-from stlc.view.material import Material
+from stlc.view.run_animation import STILL, RunPanel, animation_name, animation_of, current, run_panels
 from stlc.view.signals import Strip, finite, margin_limits, margin_text
 from stlc.view.style import SCENES_ON_DARK
+from stlc.view.verdicts import Event
 from stlc.view.words import count, labelled
 
 SCRIPT = "player.js"
 MOST_FRAMES = 160
-"""Maximum number of frames of the page's film; others are subsampled evenly."""
+"""Maximum number of frames of the page's animation; others are subsampled evenly."""
 MOST_ROWS = 60
 """Maximum number of listed events per requirement."""
 _WIDE, _HIGH = 1000, 40  # of a track
@@ -46,25 +47,25 @@ class _Track:
     values: list[str | None]
 
 
-def player_section(material: Material) -> Section | None:
-    """The film of the newest deployment; None without a recording."""
-    shots = shots_of(material.run)
-    if not shots:
+def player_section(contents: RunContents) -> Section | None:
+    """The animation of the newest deployment; None without a recording."""
+    panels = run_panels(contents.run)
+    if not panels:
         return None
-    frames = min(shot.frames for shot in shots)
+    frames = min(panel.frames for panel in panels)
     shown = range(0, frames, -(-frames // MOST_FRAMES))
-    tapes = [shot.taped(shown) for shot in shots]
-    tracks = [_tracks(shot, shown) for shot in shots]
+    animations = [panel.vector_frames(shown) for panel in panels]
+    tracks = [_tracks(panel, shown) for panel in panels]
     head = el(
         "div",
-        _keys(shots),
-        _stage(shots, tapes, material),
-        _data(shots, tapes, tracks, shown),
+        _keys(panels),
+        _stage(panels, animations, contents),
+        _data(panels, animations, tracks, shown),
         _controls(len(shown)),
-        _columns(shots, tracks),
+        _columns(panels, tracks),
         attrs={"class": "player", "tabindex": "0"},
     )
-    return Section("film", "", join(head, _files(material), _events(shots)))
+    return Section("film", "", join(head, _files(contents), _events(panels)))
 
 
 def script() -> Html:
@@ -75,39 +76,39 @@ def script() -> Html:
 # ------------------------------------------------------------------------------- stage
 
 
-def _stage(shots: Sequence[Shot], tapes: Sequence[Taped], material: Material) -> Html:
+def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], contents: RunContents) -> Html:
     """A canvas for each run, and a still for readers without scripts."""
-    panels = [
+    figures = [
         el(
             "figure",
-            el("figcaption", shot.title) if shot.title else None,
+            el("figcaption", panel.title) if panel.title else None,
             el(
                 "canvas",
                 attrs={
                     "role": "img",
-                    "aria-label": shot.alt,
-                    "width": str(tape.width),
-                    "height": str(tape.height),
+                    "aria-label": panel.alt,
+                    "width": str(animation.width),
+                    "height": str(animation.height),
                 },
             ),
         )
-        for shot, tape in zip(shots, tapes, strict=True)
+        for panel, animation in zip(panels, animations, strict=True)
     ]
-    wide = " wide" if len(shots) > 1 and tapes[0].width > 2 * tapes[0].height else ""
-    kind = f"panels{wide}" if len(shots) > 1 else "panels one"
-    return join(classed("div", kind, panels), el("noscript", _still(material)))
+    wide = " wide" if len(panels) > 1 and animations[0].width > 2 * animations[0].height else ""
+    kind = f"panels{wide}" if len(panels) > 1 else "panels one"
+    return join(classed("div", kind, figures), el("noscript", _still(contents)))
 
 
-def _still(material: Material) -> Html | None:
+def _still(contents: RunContents) -> Html | None:
     """The still of the animation, drawn if it is missing."""
-    path = material.run.path / STILL
-    if current(material.run) and path.is_file():
+    path = contents.run.path / STILL
+    if current(contents.run) and path.is_file():
         kind, content = "png", path.read_bytes()
     else:
-        film = film_of(material.run)
-        if film is None:
+        animation = animation_of(contents.run)
+        if animation is None:
             return None
-        kind, content = "webp", still_bytes(film)
+        kind, content = "webp", still_bytes(animation)
     address = f"data:image/{kind};base64," + base64.b64encode(content).decode()
     return el("img", attrs={"src": address, "alt": "the deployment at its most telling instant"})
 
@@ -132,9 +133,9 @@ def _controls(frames: int) -> Html:
     )
 
 
-def _keys(shots: Sequence[Shot]) -> Html:
+def _keys(panels: Sequence[RunPanel]) -> Html:
     """The legend of all runs."""
-    keys = {key.word: key for shot in shots for key in shot.keys}
+    keys = {key.word: key for panel in panels for key in panel.keys}
     swatches = [
         classed(
             "span",
@@ -152,11 +153,11 @@ def _inks(color: str) -> str:
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
 
 
-def _files(material: Material) -> Html | None:
+def _files(contents: RunContents) -> Html | None:
     """The animation as files beside the page."""
-    name = film_name(material.run)
+    name = animation_name(contents.run)
     there = [
-        f"{name}{suffix}" for suffix in (".gif", ".mp4") if (material.run.path / f"{name}{suffix}").exists()
+        f"{name}{suffix}" for suffix in (".gif", ".mp4") if (contents.run.path / f"{name}{suffix}").exists()
     ]
     if not there:
         return None
@@ -167,9 +168,9 @@ def _files(material: Material) -> Html | None:
 # ------------------------------------------------------------------------------ tracks
 
 
-def _columns(shots: Sequence[Shot], tracks: Sequence[Sequence[_Track]]) -> Html:
+def _columns(panels: Sequence[RunPanel], tracks: Sequence[Sequence[_Track]]) -> Html:
     columns = []
-    for shot, own in zip(shots, tracks, strict=True):
+    for panel, own in zip(panels, tracks, strict=True):
         if not own:
             continue
         rows = [
@@ -182,10 +183,10 @@ def _columns(shots: Sequence[Shot], tracks: Sequence[Sequence[_Track]]) -> Html:
             )
             for track in own
         ]
-        times = shot.strip.times if shot.strip is not None else np.zeros(1)
+        times = panel.strip.times if panel.strip is not None else np.zeros(1)
         foot = classed("div", "track axis", el("span"), classed("div", "ends", _ends(times)), el("span"))
-        words = f"{shot.strip.words}, red where violated" if shot.strip is not None else ""
-        words = f"{shot.title}: {words}" if shot.title else words
+        words = f"{panel.strip.words}, red where violated" if panel.strip is not None else ""
+        words = f"{panel.title}: {words}" if panel.title else words
         columns.append(classed("div", "tracks", classed("p", "quiet", words), rows, foot))
     return classed("div", "columns", columns)
 
@@ -194,8 +195,8 @@ def _ends(times: NDArray[np.float64]) -> list[Html]:
     return [el("span", f"{times[0]:g} s"), el("span", f"{times[-1]:g} s")]
 
 
-def _tracks(shot: Shot, shown: range) -> list[_Track]:
-    strip = shot.strip
+def _tracks(panel: RunPanel, shown: range) -> list[_Track]:
+    strip = panel.strip
     if strip is None:
         return []
     rows = [_acted(strip, shown)] if strip.acted.any() else []
@@ -288,40 +289,40 @@ def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArra
 # ------------------------------------------------------------------------------ events
 
 
-def _events(shots: Sequence[Shot]) -> Html | None:
+def _events(panels: Sequence[RunPanel]) -> Html | None:
     """List of violations by requirement; each line links to its instant."""
-    names = list(dict.fromkeys(name for shot in shots for name in shot.requirements))
+    names = list(dict.fromkeys(name for panel in panels for name in panel.requirements))
     if not names:
         return None
     blocks = []
     for name in names:
-        rows = [(shot, event) for shot in shots for event in shot.events if event.requirement == name]
+        rows = [(panel, event) for panel in panels for event in panel.events if event.requirement == name]
         rows.sort(key=lambda row: row[1].sample)
-        counts = [sum(1 for own, _ in rows if own is shot) for shot in shots]
+        counts = [sum(1 for own, _ in rows if own is panel) for panel in panels]
         told = ", ".join(
-            f"{count(number, 'violation')} {shot.title}".strip()
-            for number, shot in zip(counts, shots, strict=True)
+            f"{count(number, 'violation')} {panel.title}".strip()
+            for number, panel in zip(counts, panels, strict=True)
         )
         summary = el("summary", name, " ", classed("span", "bad" if rows else "quiet", told))
         if rows:
             blocks.append(el("details", summary, _event_table(rows[:MOST_ROWS], len(rows))))
         else:
             blocks.append(classed("p", "none", el("strong", name), " ", classed("span", "quiet", told)))
-    return classed("div", "events", el("h3", "Violations in this film"), blocks)
+    return classed("div", "events", el("h3", "Violations in this animation"), blocks)
 
 
-def _event_table(rows: list[tuple[Shot, Event]], count_: int) -> Html:
-    several = any(shot.title for shot, _ in rows)
+def _event_table(rows: list[tuple[RunPanel, Event]], count_: int) -> Html:
+    several = any(panel.title for panel, _ in rows)
     header = ["when", *(["drive"] if several else []), "who", "why"]
     cells: list[list[Child]] = []
-    for shot, event in rows:
-        moment, start = (f"t = {shot.time(sample):.10g} s" for sample in (event.sample, event.start))
-        at = {"type": "button", "data-at": f"{shot.time(event.sample) - shot.time(0):.9g}"}
-        button = el("button", f"{shot.time(event.sample):.4g} s", attrs=at)
+    for panel, event in rows:
+        moment, start = (f"t = {panel.time(sample):.10g} s" for sample in (event.sample, event.start))
+        at = {"type": "button", "data-at": f"{panel.time(event.sample) - panel.time(0):.9g}"}
+        button = el("button", f"{panel.time(event.sample):.4g} s", attrs=at)
         window = beside(moment, start).removeprefix(moment).strip()
         when: Child = join(button, el("small", window) if window else None)
-        drive: list[Child] = [shot.title] if several else []
-        cells.append([when, *drive, shot.names[event.agent], event.because])
+        drive: list[Child] = [panel.title] if several else []
+        cells.append([when, *drive, panel.names[event.agent], event.because])
     more = el("p", f"and {count_ - len(rows):,} more") if count_ > len(rows) else None
     return join(table(header, cells, kind="jump"), more)
 
@@ -330,17 +331,20 @@ def _event_table(rows: list[tuple[Shot, Event]], count_: int) -> Html:
 
 
 def _data(
-    shots: Sequence[Shot], tapes: Sequence[Taped], tracks: Sequence[Sequence[_Track]], shown: range
+    panels: Sequence[RunPanel],
+    animations: Sequence[VectorAnimation],
+    tracks: Sequence[Sequence[_Track]],
+    shown: range,
 ) -> Html:
     """The replayed data as JSON, escaped for a `<script>` element."""
-    dt = shots[0].dt
+    dt = panels[0].dt
     document: dict[str, Any] = {
         "times": [round(index * dt, 9) for index in shown],
         "digits": 1 if dt >= 0.1 else 2,
-        "pace": speed_of(shots[0].frames, dt),
-        "dark": dict(in_the_dark(tapes, SCENES_ON_DARK)),
-        "panels": [tape.as_json() for tape in tapes],
+        "pace": speed_up(panels[0].frames, dt),
+        "dark": dict(dark_colors(animations, SCENES_ON_DARK)),
+        "panels": [animation.as_json() for animation in animations],
         "rows": [track.values for own in tracks for track in own],
     }
     text = script_json(dumps(document))
-    return el("script", Html(text), attrs={"type": "application/json", "id": "film-data"})
+    return el("script", Html(text), attrs={"type": "application/json", "id": "animation-data"})

@@ -1,8 +1,8 @@
 """`report.html`: results of a run, its settings, its failures and the commands that repeat it.
 
-It begins with an interactive film of the newest deployment. The page is self-contained: style, pictures and
-its one script are embedded, and it needs no network. Without scripts it shows a still; it follows the
-reader's light or dark scheme. Missing parts (a deployment, say) are left out.
+It begins with an interactive animation of the newest deployment. The page is self-contained: style,
+pictures and its one script are embedded, and it needs no network. Without scripts it shows a still; it
+follows the reader's light or dark scheme. Missing parts (a deployment, say) are left out.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from stlc.files import write_atomic
 from stlc.rundir import RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
+from stlc.view.contents import RunContents, read_contents, untagged
 from stlc.view.curves import draw_curves
 from stlc.view.deployment import deployment_section, deployment_tiles
-from stlc.view.driven import driven_section, map_section
 from stlc.view.held_out import draw_failures, unsolved_text
 from stlc.view.html import (
     Child,
@@ -36,8 +36,8 @@ from stlc.view.html import (
     yaml_html,
 )
 from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
-from stlc.view.material import Material, gather, untagged
 from stlc.view.player import player_section, script
+from stlc.view.recorded import map_section, recorded_section
 from stlc.view.words import (
     count,
     guard_words,
@@ -60,85 +60,85 @@ def write_report(run: RunDir) -> Path:
         RunError: R101, the folder is no run.
     """
     require_drawing()
-    material = gather(run)
-    sections = sections_of(material)
+    contents = read_contents(run)
+    sections = sections_of(contents)
     path = run.path / REPORT
-    write_atomic(path, render_report(material, sections))
+    write_atomic(path, render_report(contents, sections))
     for part in sections:
         if part.picture is not None:
             part.picture.save_png(run.path / f"{part.anchor}.png")
     return path
 
 
-def sections_of(material: Material) -> list[Section]:
+def sections_of(contents: RunContents) -> list[Section]:
     """Sections of the report, in order."""
     parts = (
-        requirements_section(material),
-        deployment_section(material),
-        map_section(material),
-        driven_section(material),
-        failures_section(material),
-        training_section(material),
-        repeat_section(material),
-        texts_section(material),
+        requirements_section(contents),
+        deployment_section(contents),
+        map_section(contents),
+        recorded_section(contents),
+        failures_section(contents),
+        training_section(contents),
+        repeat_section(contents),
+        texts_section(contents),
     )
     return [part for part in parts if part is not None]
 
 
-def render_report(material: Material, sections: list[Section]) -> str:
+def render_report(contents: RunContents, sections: list[Section]) -> str:
     """The page of `material`."""
-    film = player_section(material)
+    animation = player_section(contents)
     head = join(
-        headline(material),
-        film.html if film is not None else None,
-        numbers(material, deployment_tiles(material)),
+        headline(contents),
+        animation.html if animation is not None else None,
+        numbers(contents, deployment_tiles(contents)),
     )
     return page(
-        f"{material.spec} · {material.run.name}",
+        f"{contents.spec} · {contents.run.name}",
         head,
         sections,
-        f"Written by stlc {__version__} from {material.run.shown}",
-        script() if film is not None else None,
+        f"Written by stlc {__version__} from {contents.run.shown}",
+        script() if animation is not None else None,
     )
 
 
 # ---------------------------------------------------------------------- opening
 
 
-def headline(material: Material) -> Html:
+def headline(contents: RunContents) -> Html:
     """Result of the run in one sentence, with advice.
 
     A deployed run is judged by its closed-loop runs, another by its plans.
     """
-    record, result, simulation = material.record, material.result, material.simulation or {}
+    record, result, simulation = contents.record, contents.result, contents.simulation or {}
     driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
     trial = [] if driven else driven_lines(result or {})
-    head = f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else _verdict(material)
-    names = dict.fromkeys((material.spec, str(record.get("system", "")), f"run {material.run.name}"))
+    head = f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else _verdict(contents)
+    names = dict.fromkeys((contents.spec, str(record.get("system", "")), f"run {contents.run.name}"))
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
         el("h1", driven or head),
-        el("p", *_spoken(". ".join((*trial[1:], _verdict(material))))) if trial else None,
+        el("p", *_spoken(". ".join((*trial[1:], _verdict(contents))))) if trial else None,
         el("p", f"{lost}.") if lost else None,
-        el("p", f"{_verdict(material)}. {_beside(result)}" if driven else _beside(result))
+        el("p", f"{_verdict(contents)}. {_beside(result)}" if driven else _beside(result))
         if result
         else None,
-        _advice(material),
+        _advice(contents),
     )
 
 
-def numbers(material: Material, tiles: list[tuple[str, str]]) -> Html | None:
+def numbers(contents: RunContents, tiles: list[tuple[str, str]]) -> Html | None:
     """Key figures of the training; `tiles` adds those of the deployment."""
-    return _tiles([*_training_tiles(material.result), *tiles])
+    return _tiles([*_training_tiles(contents.result), *tiles])
 
 
-def _verdict(material: Material) -> str:
-    accuracy = material.result.get("accuracy")
+def _verdict(contents: RunContents) -> str:
+    accuracy = contents.result.get("accuracy")
     if accuracy is None:
-        return f"Training of {material.spec} is {material.record.get('status', 'not finished')}"
-    held_out = material.result.get("held_out")
+        return f"Training of {contents.spec} is {contents.record.get('status', 'not finished')}"
+    held_out = contents.result.get("held_out")
     starts = f"{held_out:,} held-out starts" if held_out else "held-out starts"
-    return f"The policy's plan satisfies {material.spec} from {share(accuracy)} of {starts}"
+    return f"The policy's plan satisfies {contents.spec} from {share(accuracy)} of {starts}"
 
 
 def _beside(result: Mapping[str, Any]) -> str:
@@ -160,11 +160,11 @@ def _sampled(result: Mapping[str, Any]) -> str:
     return f" (an estimate: {searched:,} were searched or solved)"
 
 
-def _advice(material: Material) -> Html | None:
+def _advice(contents: RunContents) -> Html | None:
     """Level of the training and advice if the policy falls short."""
-    where = clause(material.held_out, material.signature)
-    commands = Commands.of(shlex.quote(material.run.shown), guard=recommended(material.record))
-    learning = learning_on_record(material.record, material.rows, commands, where)
+    where = clause(contents.held_out, contents.signature)
+    commands = Commands.of(shlex.quote(contents.run.shown), guard=recommended(contents.record))
+    learning = learning_on_record(contents.record, contents.rows, commands, where)
     if learning is None or not learning.advice:
         return None
     level = f"{learning.level[0].upper()}{learning.level[1:]}."
@@ -199,28 +199,28 @@ def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
     )
 
 
-def requirements_section(material: Material) -> Section | None:
+def requirements_section(contents: RunContents) -> Section | None:
     """Every requirement with its text and the share of plans that satisfy it."""
-    shares: Mapping[str, float] = material.result.get("requirements") or {}
-    names = list(shares) or list(material.requirements)
+    shares: Mapping[str, float] = contents.result.get("requirements") or {}
+    names = list(shares) or list(contents.requirements)
     if not names:
         return None
-    held_out = material.result.get("held_out")
+    held_out = contents.result.get("held_out")
     worst = min(shares, key=shares.__getitem__) if shares else None
     rows: list[tuple[Child, ...]] = []
     for name in names:
         value = shares.get(name)
         fails = "" if value is None or not held_out else f"{round((1 - value) * held_out):,}"
         kind = "bad" if name == worst and value is not None and value < 1 else "plain"
-        rows.append((_described(material, name), classed("span", kind, share(value)), fails))
+        rows.append((_described(contents, name), classed("span", kind, share(value)), fails))
     header = ("requirement", "satisfied", f"fails of {held_out:,}" if held_out else "fails")
     intro = el("p", "Each is judged alone, on the plans from the held-out starts; all must hold together.")
     body = join(intro, table(header, rows, numeric=(1, 2)))
     return Section("requirements", "Requirements", body)
 
 
-def _described(material: Material, name: str) -> Html:
-    declared = material.requirements.get(name)
+def _described(contents: RunContents, name: str) -> Html:
+    declared = contents.requirements.get(name)
     if declared is None:
         return el("strong", name)
     tags = " ".join(" ".join(tag.span.text.split()) for tag in declared.tags)
@@ -232,11 +232,11 @@ def _described(material: Material, name: str) -> Html:
     )
 
 
-def training_section(material: Material) -> Section:
+def training_section(contents: RunContents) -> Section:
     """Curves, options, machine and versions."""
-    curves = draw_curves(material.rows)
+    curves = draw_curves(contents.rows)
     shown = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
-    last = material.rows[-1] if material.rows else {}
+    last = contents.rows[-1] if contents.rows else {}
     search = None
     if last.get("failing") is not None:
         search = el(
@@ -244,7 +244,7 @@ def training_section(material: Material) -> Section:
             f"In the last round the search repaired {last.get('repaired', 0)} of "
             f"{count(int(last['failing']), 'failing start')}.",
         )
-    body = join(shown, search, facts(_facts(material)))
+    body = join(shown, search, facts(_facts(contents)))
     return Section("training", "How it was trained", body, curves)
 
 
@@ -255,8 +255,8 @@ _CURVES = (
 )
 
 
-def _facts(material: Material) -> list[tuple[str, Child]]:
-    record = material.record
+def _facts(contents: RunContents) -> list[tuple[str, Child]]:
+    record = contents.record
     hardware, git = record.get("hardware") or {}, record.get("git") or {}
     versions = record.get("versions") or {}
     budget = record.get("budget")
@@ -329,13 +329,13 @@ _TITLES = {
 }
 
 
-def failures_section(material: Material) -> Section | None:
+def failures_section(contents: RunContents) -> Section | None:
     """Region of the initial set in which the policy's plans fail."""
-    if material.held_out is None:
+    if contents.held_out is None:
         return None
-    picture = draw_failures(material.held_out, material.signature, material.units)
+    picture = draw_failures(contents.held_out, contents.signature, contents.units)
     if picture is None:
-        text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
+        text = f"None of the plans from {len(contents.held_out.x0):,} held-out starts fails a requirement."
         return Section("failures", "Where plans fail", el("p", text))
     boxed = "; the dashed box is the region named above" if picture.figure.axes[0].patches else ""
     caption = (
@@ -343,25 +343,25 @@ def failures_section(material: Material) -> Section | None:
         "Right: how far the plans are from failing (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
-    left = el("p", f"Unsolved: {unsolved_text(material.held_out)}.")
+    left = el("p", f"Unsolved: {unsolved_text(contents.held_out)}.")
     return Section("failures", "Where plans fail", join(left, el("p", picture.alt), body), picture)
 
 
-def repeat_section(material: Material) -> Section:
+def repeat_section(contents: RunContents) -> Section:
     """The commands that reproduce the run."""
     intro = el(
         "p",
         "The same seed and steps give the same weights on the same machine. The folder of the run "
         "holds the specification and the system as they were.",
     )
-    lines = "\n".join(_commands(material))
+    lines = "\n".join(_commands(contents))
     return Section("repeat", "How to repeat it", join(intro, el("pre", lines)))
 
 
-def _commands(material: Material) -> list[str]:
-    record, run = material.record, operand(material.run.shown)
-    spec = str(record.get("spec_path") or f"{material.run.shown}/spec.stl")
-    system = str(record.get("system_path") or f"{material.run.shown}/system.yaml")
+def _commands(contents: RunContents) -> list[str]:
+    record, run = contents.record, operand(contents.run.shown)
+    spec = str(record.get("spec_path") or f"{contents.run.shown}/spec.stl")
+    system = str(record.get("system_path") or f"{contents.run.shown}/system.yaml")
     train = ["stlc", "train", spec, "--system", system]
     steps = record.get("schedule") or record.get("steps")
     for option, value in (("seed", record.get("seed")), ("steps", steps)):
@@ -372,11 +372,11 @@ def _commands(material: Material) -> list[str]:
         if options.get(option) not in (None, "guided"):
             train += [f"--{option}", str(options[option])]
     train += _set(record)
-    commands = [shell(train), shell([*_simulate(material), *_set(material.simulation or {})])]
-    if material.trace is not None:
-        check = ["stlc", "check", f"{material.run.shown}/trace.npz"]
-        if material.outside:
-            check += ["--system", f"{material.run.shown}/system.yaml"]
+    commands = [shell(train), shell([*_simulate(contents), *_set(contents.simulation or {})])]
+    if contents.trace is not None:
+        check = ["stlc", "check", f"{contents.run.shown}/trace.npz"]
+        if contents.outside:
+            check += ["--system", f"{contents.run.shown}/system.yaml"]
         commands.append(shell(check))
     return [*commands, shell(("stlc", "report", run))]
 
@@ -387,17 +387,17 @@ def _set(record: Mapping[str, Any]) -> list[str]:
     return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
 
 
-def _simulate(material: Material) -> list[str]:
+def _simulate(contents: RunContents) -> list[str]:
     """The command of the newest deployment, or one with the backup policy if there is none."""
-    done = material.simulation or {}
+    done = contents.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
-    words = ["stlc", "simulate", material.run.shown, *guard_words(guard).option.split()]
+    words = ["stlc", "simulate", contents.run.shown, *guard_words(guard).option.split()]
     if done.get("scenario"):
         words += ["--scenario", str(done["scenario"])]
     seeds = done.get("seeds") or range(10)
     if list(seeds) != list(range(10)):
         words += ["--seeds", _seeds(seeds)]
-    for name, usual in (("agents", material.usual.get("agents")), ("steps", material.usual.get("steps"))):
+    for name, usual in (("agents", contents.usual.get("agents")), ("steps", contents.usual.get("steps"))):
         if done.get(name) not in (None, usual):
             words += [f"--{name}", str(done[name])]
     return words + _limits(done)
@@ -421,12 +421,12 @@ def _limits(done: Mapping[str, Any]) -> list[str]:
     return words + [word for name in asked for word in ("--margin", f"{name}={asked[name]:.6g}")]
 
 
-def texts_section(material: Material) -> Section | None:
+def texts_section(contents: RunContents) -> Section | None:
     """The texts of specification and system, and collapsed the files derived from them."""
-    if not material.texts:
+    if not contents.texts:
         return None
     blocks = []
-    for name, text in material.texts.items():
+    for name, text in contents.texts.items():
         shown = (
             spec_html(text) if name.endswith(".stl") else yaml_html(text) if name.endswith(".yaml") else text
         )

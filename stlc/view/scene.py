@@ -1,4 +1,4 @@
-"""The film of a recorded scene: the world's drawing, a legend above it, and strip charts of margins below."""
+"""Animation of a recorded scene: the world's drawing, a legend above, and strip charts below."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, DECIDERS, VIOLATED
-from stlc.view.film import Film, speed_of, wipe
-from stlc.view.signals import Mover, Strip, draw_strip
-from stlc.view.style import INK, MUTED, look, new_figure
+from stlc.view.animation import Animation, clear_artists, speed_up
+from stlc.view.signals import FrameUpdate, Strip, draw_strip
+from stlc.view.style import INK, MUTED, new_figure, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,8 +47,8 @@ class LegendKey:
 
 
 @dataclass(frozen=True, slots=True)
-class Staging:
-    """Parameters of a scene's film.
+class SceneOptions:
+    """Parameters of a scene's animation.
 
     Attributes:
         draw: what draws one frame of it.
@@ -79,19 +79,19 @@ def frames_of(scene: Scene) -> int:
     return min(len(values) for values in scene.values())
 
 
-def scene_film(scene: Scene, staging: Staging) -> Film:
-    """The film of a scene, arrays (instants, …)."""
+def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
+    """The animation of a scene, arrays (instants, …)."""
     frames = frames_of(scene)
-    keys = keys_of(scene, staging.keys)
-    plan = _planned(ratio_of(staging.draw, scene), 0 if staging.strip is None else staging.strip.height, keys)
-    seconds, speed = (frames - 1) * staging.dt, speed_of(frames, staging.dt)
+    keys = keys_of(scene, options.keys)
+    plan = _planned(ratio_of(options.draw, scene), 0 if options.strip is None else options.strip.height, keys)
+    seconds, speed = (frames - 1) * options.dt, speed_up(frames, options.dt)
 
     def begin(figure: Figure) -> Callable[[int], None]:
         figure.set_layout_engine("none")
-        clock = _head(figure, plan, staging.title, keys)
-        movers = _draw_over_time(figure, plan, staging.strip)
+        clock = _head(figure, plan, options.title, keys)
+        updates = _draw_over_time(figure, plan, options.strip)
         axes = _panel(figure, plan, plan.scene)
-        moving = [axes, clock, *(artist for mover in movers for artist in mover.artists)]
+        moving = [axes, clock, *(artist for update in updates for artist in update.artists)]
         for artist in moving:
             artist.set_animated(True)  # not part of the background, which is drawn once
         canvas: Any = figure.canvas
@@ -99,20 +99,20 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
         ground = canvas.copy_from_bbox(figure.bbox)
 
         def turn(index: int) -> None:
-            wipe(axes)
-            staging.draw(axes, scene, index)
+            clear_artists(axes)
+            options.draw(axes, scene, index)
             pace = f"   {speed}x" if speed > 1 else ""
-            clock.set_text(f"{index * staging.dt:.1f} s{pace}")
-            for mover in movers:
-                mover.turn(index)
+            clock.set_text(f"{index * options.dt:.1f} s{pace}")
+            for update in updates:
+                update.turn(index)
             canvas.restore_region(ground)
             for artist in moving:
                 figure.draw_artist(artist)
 
         return turn
 
-    alt = f"{staging.title}: {seconds:.0f} s of deployment."
-    return Film(frames, staging.dt, plan.size, begin, alt, _moment(scene, frames), draws=True)
+    alt = f"{options.title}: {seconds:.0f} s of deployment."
+    return Animation(frames, options.dt, plan.size, begin, alt, _moment(scene, frames), draws=True)
 
 
 def _moment(scene: Scene, frames: int) -> int:
@@ -131,7 +131,7 @@ def _moment(scene: Scene, frames: int) -> int:
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
     """Aspect ratio (height / width) of the world's drawing."""
-    with look():
+    with picture_style():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
@@ -214,15 +214,15 @@ def _head(figure: Figure, plan: _Plan, title: str, keys: list[LegendKey]) -> Tex
     return clock
 
 
-def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[Mover]:
+def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[FrameUpdate]:
     """Draw the strip charts with a heading above the first one."""
     if strip is None or not plan.rows:
         return []
-    movers = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])
+    updates = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])
     (width, height), (left, bottom, wide, high) = plan.size, plan.rows[0]
     narrow = wide < WIDTH / 2
     words = f"{strip.words}, red where violated"
     words = words.replace(", ", ",\n") if narrow else words
     at = ((left - (_NAMES - 0.2 if narrow else 0.0)) / width, (bottom + high + 0.05) / height)
     figure.text(*at, words, color=MUTED, fontsize=7.5, va="bottom")
-    return movers
+    return updates

@@ -15,7 +15,7 @@ from stlc.controller.sketch import DECIDED, DECIDERS
 from stlc.escape import picture
 from stlc.signature import Column
 from stlc.trace import Trace
-from stlc.view.film import Film
+from stlc.view.animation import Animation
 from stlc.view.style import (
     BLUE,
     FAINT,
@@ -26,10 +26,10 @@ from stlc.view.style import (
     RED,
     SKY,
     Picture,
-    look,
+    hide_frame,
     narrow_gaps,
     new_figure,
-    quiet,
+    picture_style,
 )
 from stlc.view.words import labelled
 
@@ -56,9 +56,9 @@ MOST_LETTERS = 44
 MOST_ROWS = 7
 """Maximum number of requirements in a strip chart, least margins first."""
 MOST_PANELS, MOST_AGENTS = 6, 40
-"""Maximum numbers of signals and agents in the film of a trace."""
+"""Maximum numbers of signals and agents in the animation of a trace."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
-_VEIL = 0.72
+_COVER = 0.72
 
 
 def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
@@ -173,7 +173,7 @@ def draw_signals(
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
-    with look():
+    with picture_style():
         figure = new_figure(9, sum(heights) + 0.07 * len(rows) + 0.8)
         narrow_gaps(figure)
         grid = figure.subplots(
@@ -220,7 +220,7 @@ def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
     handles = []
     if judged:
         handles = [
-            Patch(color=BLUE, alpha=0.5, lw=0, label="to spare"),
+            Patch(color=BLUE, alpha=0.5, lw=0, label="robustness margin"),
             Patch(color=RED, lw=0, label="violated"),
         ]
     decisions = decisions_of(trace)
@@ -252,7 +252,7 @@ def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
         axes.locator_params(axis="y", nbins=3)
     elif kind == "decision":
         axes.set_ylim(0, 1)
-        quiet(axes)
+        hide_frame(axes)
     if kind != "strip":
         for left, right, source in agent.decided():
             _, color = DECISIONS.get(source, ("", MUTED))
@@ -288,7 +288,7 @@ def _draw_discrete(axes: Axes, agent: _Agent, column: Column) -> None:
         if label and (right - left) > 0.08 * trace.dt * trace.samples:
             axes.text((left + right) / 2, 0.5, label, ha="center", va="center", fontsize=7, color=INK)
     axes.set_ylim(0, 1)
-    quiet(axes)
+    hide_frame(axes)
 
 
 def _runs(values: Floats) -> list[tuple[int, int, float]]:
@@ -302,7 +302,7 @@ def _runs(values: Floats) -> list[tuple[int, int, float]]:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """Strip charts below a film: least margin of each requirement, and interventions of the guard.
+    """Strip charts below an animation: least margin of each requirement, and interventions of the guard.
 
     Attributes:
         times: of the frames, in seconds, (frames,).
@@ -349,32 +349,32 @@ class Strip:
 
 
 @dataclass(frozen=True, slots=True)
-class Mover:
+class FrameUpdate:
     """Function that updates artists to a frame, and these artists."""
 
     turn: Callable[[int], None]
     artists: tuple[Artist, ...]
 
 
-def draw_strip(strip: Strip, panels: list[Axes]) -> list[Mover]:
+def draw_strip(strip: Strip, panels: list[Axes]) -> list[FrameUpdate]:
     """Draw the strip charts, one per panel; return the artists that change from frame to frame."""
-    movers: list[Mover] = []
+    updates: list[FrameUpdate] = []
     free = list(panels)
     if strip.acted.any():
-        movers.append(_draw_interventions(strip, free.pop(0)))
-    movers += [_draw_margin(strip, name, axes) for name, axes in zip(strip.rows, free, strict=True)]
+        updates.append(_draw_interventions(strip, free.pop(0)))
+    updates += [_draw_margin(strip, name, axes) for name, axes in zip(strip.rows, free, strict=True)]
     for axes in panels:
-        movers.append(_veil(axes, strip.times))
+        updates.append(_cover_future(axes, strip.times))
         axes.grid(visible=False)
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)
         axes.spines["bottom"].set_visible(axes is panels[-1])
         axes.tick_params(labelbottom=axes is panels[-1])
     panels[-1].set_xlabel("time [s]", color=MUTED, fontsize=7.5, labelpad=1)
-    return movers
+    return updates
 
 
-def _draw_interventions(strip: Strip, axes: Axes) -> Mover:
+def _draw_interventions(strip: Strip, axes: Axes) -> FrameUpdate:
     assert strip.decisions is not None
     agents = strip.decisions.shape[1]
     for color, low, high in strip.stacked():
@@ -387,10 +387,10 @@ def _draw_interventions(strip: Strip, axes: Axes) -> Mover:
         value.set_text(f"{count} of {agents}")
         value.set_color(INK if count else MUTED)
 
-    return Mover(turn, (value,))
+    return FrameUpdate(turn, (value,))
 
 
-def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
+def _draw_margin(strip: Strip, name: str, axes: Axes) -> FrameUpdate:
     rho = finite(strip.margins[name])
     _plot_margin(axes, strip.times, rho)
     axes.set_ylim(*margin_limits(rho))
@@ -401,7 +401,7 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
         value.set_text(margin_text(now, strip.units.get(name, "")))
         value.set_color(RED if now < -TOLERANCE else INK)
 
-    return Mover(turn, (value,))
+    return FrameUpdate(turn, (value,))
 
 
 def _titled(axes: Axes, name: str) -> Text:
@@ -412,13 +412,13 @@ def _titled(axes: Axes, name: str) -> Text:
     return axes.text(1.01, 0.5, "", ha="left", **beside)
 
 
-def _veil(axes: Axes, times: Floats) -> Mover:
+def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
     """A cover over the future and a line at the present time."""
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))
     transform = axes.get_xaxis_transform()
-    cover = Rectangle((0, 0), 0, 1, transform=transform, color=PAPER, alpha=_VEIL, lw=0, zorder=4)
+    cover = Rectangle((0, 0), 0, 1, transform=transform, color=PAPER, alpha=_COVER, lw=0, zorder=4)
     axes.add_patch(cover)
     present = axes.axvline(float(times[0]), color=INK, lw=1, zorder=5)
 
@@ -427,14 +427,14 @@ def _veil(axes: Axes, times: Floats) -> Mover:
         cover.set_bounds(now, 0, float(times[-1]) - now, 1)
         present.set_xdata([now, now])
 
-    return Mover(turn, (cover, present))
+    return FrameUpdate(turn, (cover, present))
 
 
-# ---------------------------------------------------------------------------- film of a trace
+# ---------------------------------------------------------------------------- animation of a trace
 
 
-def signal_film(trace: Trace, *, title: str = "") -> Film:
-    """The film of a trace without a world or regions: a panel per signal, with all agents."""
+def signal_animation(trace: Trace, *, title: str = "") -> Animation:
+    """The animation of a trace without a world or regions: a panel per signal, with all agents."""
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 
@@ -455,7 +455,7 @@ def signal_film(trace: Trace, *, title: str = "") -> Film:
 
     height = 0.7 + 0.8 * len(names)
     alt = f"{title}: signals of {trace.traces} agents."
-    return Film(trace.samples, trace.dt, (6.4, height), begin, alt, trace.samples - 1)
+    return Animation(trace.samples, trace.dt, (6.4, height), begin, alt, trace.samples - 1)
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
@@ -466,7 +466,7 @@ def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
     times = np.broadcast_to(trace.times, values.shape)
     axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=INK, lw=0.8, alpha=0.7)
     (present,) = axes.plot([], [], "o", color=BLUE, ms=3, zorder=5)
-    cover = _veil(axes, trace.times)
+    cover = _cover_future(axes, trace.times)
 
     def turn(index: int) -> None:
         present.set_data(times[:, index], values[:, index])

@@ -102,7 +102,7 @@ _RC: Any = {
 
 
 @contextmanager
-def look() -> Iterator[None]:
+def picture_style() -> Iterator[None]:
     """Apply matplotlib's settings for pictures within the block."""
     require_drawing()
     import matplotlib as mpl
@@ -132,7 +132,7 @@ def narrow_gaps(figure: Figure) -> None:
         engine.set(h_pad=0.02, w_pad=0.06, hspace=0.03, wspace=0.03)
 
 
-def quiet(axes: Axes) -> None:
+def hide_frame(axes: Axes) -> None:
     """Remove frame, ticks and grid; shared axes keep their ticks."""
     axes.grid(visible=False)
     axes.tick_params(labelbottom=False, labelleft=False)
@@ -154,7 +154,7 @@ class Picture:
         buffer = io.StringIO()
         for text in self.figure.findobj(Text):
             text.set_text(lawful(text.get_text()))  # its comments may contain characters that XML forbids
-        with look():
+        with picture_style():
             self._lay_out()
             self.figure.savefig(
                 buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
@@ -167,7 +167,7 @@ class Picture:
 
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
         """Write the figure on a white background to `path`."""
-        with look(), atomic_path(path) as beside:
+        with picture_style(), atomic_path(path) as beside:
             self._lay_out()
             self.figure.savefig(beside, format="png", dpi=dpi, facecolor=PAPER)
         return path

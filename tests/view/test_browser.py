@@ -14,7 +14,7 @@ from stlc.view.report import write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FRAMES = 4
-"""Of the film, as `conftest` has it."""
+"""Of the animation, as `conftest` has it."""
 WIDTHS = {"desktop": 1280, "phone": 390}
 PROBE = """<!doctype html><body><iframe src="report.html" width="%d" height="900"></iframe><script>
 const frame = document.querySelector("iframe")
@@ -51,7 +51,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="the
 
 @pytest.fixture
 def written(deployed, recording):
-    """A report with a film."""
+    """A report with an animation."""
     save_trace(deployed.path / "trace.npz", recording)
     write_report(deployed)
     return deployed.path

@@ -1,4 +1,4 @@
-"""Robots as bodies: dressed descriptions, rendered pictures, no window without a display."""
+"""Robots as bodies: descriptions with visuals, rendered pictures, no window without a display."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,7 +9,7 @@ import pytest
 from stlc.controller.stage import Ball, Stage
 from stlc.diagnostics import MissingError
 from stlc.view import bullet
-from stlc.view.bullet import dressed
+from stlc.view.bullet import with_visuals
 
 PANDA = Path(__file__).parents[2] / "examples/panda.urdf"
 needs_pybullet = pytest.mark.skipif(not bullet.available(), reason="PyBullet is not installed")
@@ -25,7 +25,7 @@ def stage(robots=2, frames=3, **more):
 
 
 def test_bare_links_get_rods_along_their_joints(tmp_path):
-    robot = ElementTree.parse(dressed(PANDA, {}, tmp_path)).getroot()
+    robot = ElementTree.parse(with_visuals(PANDA, {}, tmp_path)).getroot()
     shapes = {link.get("name"): link.findall("visual/geometry/*") for link in robot.findall("link")}
     assert [shape.tag for shape in shapes["panda_link0"]] == ["cylinder", "sphere"]
     assert float(shapes["panda_link0"][0].get("length")) == pytest.approx(0.333)
@@ -34,7 +34,7 @@ def test_bare_links_get_rods_along_their_joints(tmp_path):
 
 
 def test_a_rod_points_to_its_joint(tmp_path):
-    robot = ElementTree.parse(dressed(PANDA, {}, tmp_path)).getroot()
+    robot = ElementTree.parse(with_visuals(PANDA, {}, tmp_path)).getroot()
     link = next(link for link in robot.findall("link") if link.get("name") == "panda_link4")
     origin = link.find("visual/origin")
     middle, (_, tilt, turn) = (np.array(origin.get(key).split(), dtype=float) for key in ("xyz", "rpy"))
@@ -47,13 +47,13 @@ def test_a_description_with_something_to_see_stays(tmp_path):
     path = tmp_path / "seen.urdf"
     shape = "<visual><geometry><sphere radius='1'/></geometry></visual>"
     path.write_text(f"<robot name='a'><link name='b'>{shape}</link></robot>")
-    assert dressed(path, {}, tmp_path) == path
+    assert with_visuals(path, {}, tmp_path) == path
 
 
 @needs_pybullet
 def test_a_picture_shows_bodies_balls_and_who_decided(capfd):
-    theatre = bullet.Theatre(stage(), "picture")
-    still, moved, elsewhere = (theatre.picture(index, np.array([0, 1])) for index in range(3))
+    renderer = bullet.Renderer(stage(), "picture")
+    still, moved, elsewhere = (renderer.picture(index, np.array([0, 1])) for index in range(3))
     assert capfd.readouterr().out == ""  # PyBullet's own talk stays away from results
     height, width = still.shape[:2]
     assert (width, still.shape[2]) == (bullet.SIZE, 3)

@@ -1,4 +1,4 @@
-"""The film of the report: what it holds, and that no text in it can leave it."""
+"""The animation of the report: what it holds, and that no text in it can leave it."""
 
 import base64
 import hashlib
@@ -12,9 +12,9 @@ import pytest
 
 from stlc.trace import load_trace, save_trace
 from stlc.view import player
-from stlc.view.animate import UNGUARDED, WITH, WITHOUT, shots_of
-from stlc.view.material import gather
+from stlc.view.contents import read_contents
 from stlc.view.report import render_report, write_report
+from stlc.view.run_animation import UNGUARDED, WITH, WITHOUT, run_panels
 
 WORLD = """
 from stlc.controller.sketch import violations
@@ -55,13 +55,13 @@ def compared(deployed, recording):
 
 
 def data_in(html):
-    return json.loads(re.search(r'id="film-data">([^<]*)</script>', html)[1])
+    return json.loads(re.search(r'id="animation-data">([^<]*)</script>', html)[1])
 
 
 @pytest.mark.slow
 def test_both_drives_are_shown_with_what_was_violated(compared):
-    shots = shots_of(compared)
-    assert [shot.title for shot in shots] == [WITHOUT, WITH]
+    panels = run_panels(compared)
+    assert [panel.title for panel in panels] == [WITHOUT, WITH]
     html = write_report(compared).read_text(encoding="utf-8")
     data = data_in(html)
     assert len(data["panels"]) == 2
@@ -70,20 +70,20 @@ def test_both_drives_are_shown_with_what_was_violated(compared):
     assert html.count("<canvas") == 2
     assert html.index("<canvas") < html.index('class="tiles"')  # the report begins with it
     assert len(html) < 5_000_000
-    told = {(event.requirement, event.agent) for shot in shots for event in shot.events}
+    told = {(event.requirement, event.agent) for panel in panels for event in panel.events}
     verdicts = {name for name, _ in told}
     assert verdicts <= {"no_collision", "stop_sign", "give_way", "red_light"}
     assert verdicts
     jumps = [float(at) for at in re.findall(r'data-at="([^"]*)"', html)]
     assert jumps
     assert all(0 <= at <= 15 for at in jumps)
-    event = shots[1].events[0]
+    event = panels[1].events[0]
     assert f"agent {event.agent}" in html
     assert "window from" in html
 
 
 def test_the_page_runs_its_own_script_and_no_other_and_has_a_still_without_it(compared):
-    html = render_report(gather(compared), [])
+    html = render_report(read_contents(compared), [])
     scripts = re.findall(r"<script([^>]*)>(.*?)</script>", html, re.DOTALL)
     assert len(scripts) == 2
     (_, data), (attributes, code) = scripts
@@ -107,18 +107,18 @@ def test_what_cannot_be_compared_is_shown_alone(compared, damage):
             np.savez(compared.path / UNGUARDED[1], x=np.zeros((7, 10)), decision=np.zeros((7, 10)))
         case _:
             (compared.path / "dots.py").write_text(WORLD.replace('scene["x"][index], 0', 'scene["y"], 0'))
-    (shot,) = shots_of(compared)
-    assert shot.title == ""
-    assert shot.frames == 151
+    (panel,) = run_panels(compared)
+    assert panel.title == ""
+    assert panel.frames == 151
 
 
 def test_a_system_without_a_world_is_scrubbed_by_its_signals(deployed, recording):
     save_trace(deployed.path / "trace.npz", recording)
-    (shot,) = shots_of(deployed)
-    assert shot.frames == recording.samples
-    tape = shot.taped(range(0, 151, 50))
-    assert len(tape.frames) == 4
-    words = {command[3] for command in tape.commands if command[0] == "t"}
+    (panel,) = run_panels(deployed)
+    assert panel.frames == recording.samples
+    animation = panel.vector_frames(range(0, 151, 50))
+    assert len(animation.frames) == 4
+    words = {command[3] for command in animation.commands if command[0] == "t"}
     assert "v\n[m/s]" in words or {"v", "[m/s]"} <= words
     trace = load_trace(deployed.path / "trace.npz")
-    assert len(shot.names) == trace.traces
+    assert len(panel.names) == trace.traces

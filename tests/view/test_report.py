@@ -14,8 +14,8 @@ import stlc.view
 from stlc.diagnostics import MissingError, RunError
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
+from stlc.view.contents import read_contents
 from stlc.view.deployment import deployment_section
-from stlc.view.material import gather
 from stlc.view.report import render_report, repeat_section, sections_of, write_report
 
 VOID = {"meta", "img", "br", "hr", "input"}
@@ -54,8 +54,8 @@ def page_of(run):
 
 
 def text_of(run):
-    material = gather(run)
-    return render_report(material, sections_of(material))
+    contents = read_contents(run)
+    return render_report(contents, sections_of(contents))
 
 
 def test_a_trained_run(trained):
@@ -77,16 +77,18 @@ def test_a_trained_run(trained):
 
 
 def test_units_of_robustness_are_those_of_the_specification(trained):
-    assert gather(trained).units == {"no_collision": "m"}  # the others compare more than one kind of thing
+    assert read_contents(trained).units == {
+        "no_collision": "m"
+    }  # the others compare more than one kind of thing
     (trained.path / "spec.stl").write_text("require (")
-    assert gather(trained).units == {}
+    assert read_contents(trained).units == {}
 
 
 def test_a_deployed_run(deployed):
     html = write_report(deployed).read_text(encoding="utf-8")
     page = Page(html)
     anchors = ["requirements", "deployment", "driven", "failures", "training", "repeat", "texts"]
-    assert page.ids == ["film", "film-data", *anchors]
+    assert page.ids == ["film", "animation-data", *anchors]
     assert "2 seeds of 10 agents, 150 steps each" in page.text
     assert "98.1 % ± 1.2" in page.text
     assert "4.00 ± 0.10 m/s" in page.text
@@ -95,7 +97,7 @@ def test_a_deployed_run(deployed):
     assert "What failed, and why" in page.text
     assert "before_junction means x < x_inter / 2" in page.text
     assert "stlc check" in page.text
-    assert "Violations in this film" in page.text
+    assert "Violations in this animation" in page.text
     drawn = {path.name for path in deployed.path.glob("*.png")}
     assert drawn == {"driven.png", "failures.png", "training.png"}
     kinds = [image["src"].partition(";")[0] for image in page.images]
@@ -196,7 +198,7 @@ def test_every_metric_of_a_deployment_is_shown(deployed):
 
 def part_of(run, section):
     """The text of a section alone."""
-    return Page(section(gather(run)).html).text
+    return Page(section(read_contents(run)).html).text
 
 
 def test_a_world_that_no_plan_foresees_is_said(deployed):

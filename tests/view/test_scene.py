@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from stlc.controller.sketch import DECIDERS
-from stlc.view.film import DPI
-from stlc.view.scene import TALLEST, WIDTH, Staging, scene_film
+from stlc.view.animation import DPI
+from stlc.view.scene import TALLEST, WIDTH, SceneOptions, scene_animation
 from stlc.view.signals import MOST_ROWS, Strip
-from stlc.view.style import PAPER, look, new_figure
+from stlc.view.style import PAPER, new_figure, picture_style
 
 FRAMES = 21
 TIMES = np.arange(FRAMES) * 0.1
@@ -24,13 +24,13 @@ def scene_of(tall=0.4, decision=None):
     return scene if decision is None else {**scene, "decision": decision}
 
 
-def drawn(film, index):
+def drawn(animation, index):
     """The figure at an instant, and its picture."""
-    with look():
-        figure = new_figure(*film.size)
+    with picture_style():
+        figure = new_figure(*animation.size)
         figure.set_dpi(DPI)
         figure.set_facecolor(PAPER)
-        film.begin(figure)(index)
+        animation.begin(figure)(index)
         return figure, np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(int)
 
 
@@ -54,7 +54,7 @@ def strip_of(decision, **margins):
 def test_a_flat_scene_has_its_strip_beneath_and_a_tall_one_beside(acted):
     strip = strip_of(acted, safe=np.linspace(1, -1, FRAMES))
     sizes = {
-        tall: scene_film(scene_of(tall, acted), Staging(draw_field, 0.1, strip=strip)).size
+        tall: scene_animation(scene_of(tall, acted), SceneOptions(draw_field, 0.1, strip=strip)).size
         for tall in (0.3, 1.0)
     }
     assert sizes[0.3][0] == WIDTH
@@ -64,16 +64,16 @@ def test_a_flat_scene_has_its_strip_beneath_and_a_tall_one_beside(acted):
 
 
 def test_the_still_is_where_most_agents_were_guarded(acted):
-    assert scene_film(scene_of(decision=acted), Staging(draw_field, 0.1)).moment in (12, 13)
-    assert scene_film(scene_of(), Staging(draw_field, 0.1)).moment == FRAMES // 2
+    assert scene_animation(scene_of(decision=acted), SceneOptions(draw_field, 0.1)).moment in (12, 13)
+    assert scene_animation(scene_of(), SceneOptions(draw_field, 0.1)).moment == FRAMES // 2
 
 
 def test_the_legend_names_who_decided_and_what_the_world_adds(acted):
-    staging = Staging(draw_field, 0.1, keys={"goal": "#009e73"})
-    figure, _ = drawn(scene_film(scene_of(decision=acted), staging), 0)
+    options = SceneOptions(draw_field, 0.1, keys={"goal": "#009e73"})
+    figure, _ = drawn(scene_animation(scene_of(decision=acted), options), 0)
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [*DECIDERS[:3], "goal"]
-    free, _ = drawn(scene_film(scene_of(), Staging(draw_field, 0.1)), 0)
+    free, _ = drawn(scene_animation(scene_of(), SceneOptions(draw_field, 0.1)), 0)
     assert not free.legends
 
 
@@ -81,11 +81,11 @@ def test_the_strip_tells_the_present(acted):
     strip = strip_of(acted, safe=np.linspace(1, -1, FRAMES), never=np.full(FRAMES, np.nan))
     assert strip.rows == ["safe"]
     assert strip.height == 2
-    film = scene_film(scene_of(decision=acted), Staging(draw_field, 0.1, "run", strip=strip))
-    before, early = drawn(film, 0)
+    animation = scene_animation(scene_of(decision=acted), SceneOptions(draw_field, 0.1, "run", strip=strip))
+    before, early = drawn(animation, 0)
     assert {"guard acted", "safe", "+1.00", "0 of 4", "run", "0.0 s"} <= set(texts(before))
-    assert {"-0.20", "3 of 4", "1.2 s"} <= set(texts(drawn(film, 12)[0]))
-    _, late = drawn(film, FRAMES - 1)
+    assert {"-0.20", "3 of 4", "1.2 s"} <= set(texts(drawn(animation, 12)[0]))
+    _, late = drawn(animation, FRAMES - 1)
     near = [np.abs(picture - (230, 159, 0)).max(2) < 12 for picture in (early, late)]
     orange = [mask[mask.shape[0] // 2 :].sum() for mask in near]
     assert orange[1] > 200 > 5 > orange[0]  # the future is veiled
@@ -94,8 +94,8 @@ def test_the_strip_tells_the_present(acted):
 def test_margins_have_their_units(acted):
     margins = {"safe": np.full(FRAMES, 0.25), "mixed": np.full(FRAMES, -0.004)}
     strip = Strip(TIMES, margins, acted.astype(np.int64), units={"safe": "m"})
-    film = scene_film(scene_of(decision=acted), Staging(draw_field, 0.1, strip=strip))
-    assert {"+0.25 m", "+0.00"} <= set(texts(drawn(film, 3)[0]))
+    animation = scene_animation(scene_of(decision=acted), SceneOptions(draw_field, 0.1, strip=strip))
+    assert {"+0.25 m", "+0.00"} <= set(texts(drawn(animation, 3)[0]))
 
 
 def test_the_least_margins_are_kept_where_there_are_many(acted):

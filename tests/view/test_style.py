@@ -1,4 +1,4 @@
-"""The look: scheme-aware, deterministic, and without traces in matplotlib's settings."""
+"""The style of pictures: scheme-aware, deterministic, and without traces in matplotlib's settings."""
 
 import base64
 import xml.etree.ElementTree as ET
@@ -9,11 +9,11 @@ from PIL import Image
 
 import stlc.view
 from stlc.diagnostics import MissingError
-from stlc.view.style import BLUE, INK, ON_DARK, Picture, look, new_figure
+from stlc.view.style import BLUE, INK, ON_DARK, Picture, new_figure, picture_style
 
 
 def draw():
-    with look():
+    with picture_style():
         figure = new_figure(3, 2)
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color=BLUE)
@@ -74,7 +74,7 @@ def test_available_here():
 
 def test_an_svg_is_xml_whatever_its_labels_hold():
     """Noncharacters and controls may stand in no XML, not even in a comment."""
-    with look():
+    with picture_style():
         figure = new_figure(2, 1)
         figure.text(0, 0, "\x1b[31m\ufffe\uffff--> <b>&$x$")
     root = ET.fromstring(Picture(figure, "").svg())

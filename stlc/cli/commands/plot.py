@@ -53,8 +53,8 @@ def plot(
     from stlc.cli.check.judge import laid_out, monitor_of, specification
     from stlc.trace import read_recording
     from stlc.view import require_drawing
-    from stlc.view.judged import margins_of, units_of
     from stlc.view.signals import draw_signals
+    from stlc.view.verdicts import margins_of, units_of
 
     require_drawing()
     path = _find(what, reading.runs)
@@ -145,15 +145,15 @@ def _one(trace: Trace, wanted: int | None) -> Trace:
 
 def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
     """Paths over the regions of the requirements. Raises UsageError (U101) if they name none."""
-    from stlc.view.chart import chart_of, draw_chart
+    from stlc.view.region_map import draw_map, map_of
 
-    chart = chart_of(monitor.spec, monitor.check(trace, require=wanted), trace)
+    chart = map_of(monitor.spec, monitor.check(trace, require=wanted), trace)
     if chart is None:
         advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
         raise UsageError(
             Diagnostic("U101", f"no requirement of `{monitor.spec.name}` names a place", help=advice)
         )
-    return draw_chart(chart)
+    return draw_map(chart)
 
 
 def _require_trace(traces: int, wanted: int) -> None:
@@ -165,8 +165,8 @@ def _require_trace(traces: int, wanted: int) -> None:
 def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:
     import numpy as np
 
-    from stlc.view.judged import trace_names
     from stlc.view.signals import Choice, acted_in, choose_traces
+    from stlc.view.verdicts import trace_names
 
     names = trace_names(trace)
     if wanted is not None:
@@ -179,7 +179,7 @@ def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice
 
 def _save(picture: object, target: Path) -> None:
     from stlc.files import atomic_path, write_atomic
-    from stlc.view.style import Picture, look
+    from stlc.view.style import Picture, picture_style
 
     assert isinstance(picture, Picture)
     match target.suffix:
@@ -188,5 +188,5 @@ def _save(picture: object, target: Path) -> None:
         case ".png":
             picture.save_png(target)
         case _:
-            with look(), atomic_path(target) as beside:
+            with picture_style(), atomic_path(target) as beside:
                 picture.figure.savefig(beside, format="pdf")

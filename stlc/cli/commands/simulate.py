@@ -361,13 +361,13 @@ def _pictures(run: Run) -> dict[str, str]:
     if not available():
         say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
         return {}
-    from stlc.view.animate import animate, seen_in
+    from stlc.view.animation import ADVICE as VIDEO
     from stlc.view.bullet import ADVICE as BODIES
     from stlc.view.bullet import available as in_space
-    from stlc.view.film import ADVICE as VIDEO
     from stlc.view.report import write_report
+    from stlc.view.run_animation import animate, recorded_scene
 
-    seen = seen_in(run.dir)
+    seen = recorded_scene(run.dir)
     if seen is not None and seen.stage is not None and not in_space():
         say(f"robots are drawn as lines: bodies need pybullet ({BODIES})")
     with PULSE.doing("drawing the animation"):
@@ -405,9 +405,9 @@ def _show_robots(run: Run) -> None:
     """Play the newest deployment in PyBullet's window."""
     from stlc.cli.framework.output import PULSE
     from stlc.view import bullet
-    from stlc.view.animate import seen_in
+    from stlc.view.run_animation import recorded_scene
 
-    seen = seen_in(run.dir)
+    seen = recorded_scene(run.dir)
     stage = None if seen is None else seen.stage
     if seen is not None and stage is not None:
         with PULSE.doing(""):

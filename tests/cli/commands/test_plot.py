@@ -12,7 +12,7 @@ from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import load_trace, save_trace
-from stlc.view.judged import margins_of
+from stlc.view.verdicts import margins_of
 
 
 @pytest.fixture(autouse=True)

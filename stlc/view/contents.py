@@ -24,7 +24,7 @@ Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class RunContents:
     """The parts of one run.
 
     Attributes:
@@ -70,7 +70,7 @@ class Material:
         return str(self.record.get("spec", "specification"))
 
 
-def gather(run: RunDir) -> Material:
+def read_contents(run: RunDir) -> RunContents:
     """Read everything that a report can show.
 
     Raises:
@@ -78,7 +78,7 @@ def gather(run: RunDir) -> Material:
     """
     decl, simulation = _decl(run), _simulation(run)
     texts = {name: text for name in TEXTS if (text := _text(run, name))}
-    return Material(
+    return RunContents(
         run=run,
         record=run.record(),
         rows=run.rows(),

@@ -14,28 +14,28 @@ from stlc.monitor.explain.report import Cause, explain_all
 from stlc.monitor.prepared import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.trace import Trace
-from stlc.view.chart import chart_of, draw_chart
+from stlc.view.contents import RunContents, untagged
 from stlc.view.html import Child, Html, Section, classed, el, figure, join, table
-from stlc.view.judged import judged_once, margins_of, monitor_of, trace_names, units_of
-from stlc.view.material import Material, untagged
+from stlc.view.region_map import draw_map, map_of
 from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
+from stlc.view.verdicts import judged_at_start, margins_of, monitor_of, trace_names, units_of
 from stlc.view.words import count, share
 
 TITLE = "What was driven"
 MAP_CAPTION = (
-    "Paths over the places that the specification names, from the hollow points to the full ones. "
-    "Beside it the share of traces that are in a place (shaded: when it matters; dashed: who has been there "
-    "in that time)."
+    "Paths over the regions that the specification names, from the hollow points to the full ones. Beside "
+    "the map the share of traces in each region over time (shaded: times at which it is active; dashed: the "
+    "share of traces that have visited the region by then)."
 )
 
 
-def driven_section(material: Material) -> Section | None:
+def recorded_section(contents: RunContents) -> Section | None:
     """Verdicts on the recorded traces; None without a trace that can be judged."""
-    trace = material.trace
+    trace = contents.trace
     if trace is None:
         return None
     try:
-        monitor = _monitor(material, trace)
+        monitor = _monitor(contents, trace)
         verdict = monitor.check(trace)
         margins = margins_of(monitor, verdict, trace)
     except StlcError as error:
@@ -48,21 +48,21 @@ def driven_section(material: Material) -> Section | None:
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
     picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
-        _rules_part(material, trace, names),
+        _rules_part(contents, trace, names),
         el("p", _summary(verdict)),
         _verdict_table(verdict, causes, names),
-        figure(picture.data_uri(), picture.alt, _caption(trace, judged_once(verdict))),
+        figure(picture.data_uri(), picture.alt, _caption(trace, judged_at_start(verdict))),
         causes_of(causes, names, monitor.spec),
     )
     return Section("driven", TITLE, body, picture)
 
 
-def _rules_part(material: Material, trace: Trace, names: list[str]) -> Html | None:
+def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
     """Verdicts by the rules for runs stored in the trace; None if there are none."""
     if not trace.meta.judge_text:
         return None
     try:
-        monitor = monitor_of(trace, system=material.run.path / "system.yaml", drives=True)
+        monitor = monitor_of(trace, system=contents.run.path / "system.yaml", drives=True)
         verdict = monitor.check(trace)
     except StlcError as error:
         said = "; ".join(d.message for d in error.diagnostics)
@@ -77,24 +77,24 @@ def _rules_part(material: Material, trace: Trace, names: list[str]) -> Html | No
     )
 
 
-def _monitor(material: Material, trace: Trace) -> Monitor:
-    text, system = material.texts.get("spec.stl", ""), material.run.path / "system.yaml"
+def _monitor(contents: RunContents, trace: Trace) -> Monitor:
+    text, system = contents.texts.get("spec.stl", ""), contents.run.path / "system.yaml"
     return monitor_of(trace, text, system=system)
 
 
-def map_section(material: Material) -> Section | None:
+def map_section(contents: RunContents) -> Section | None:
     """The map of paths over regions; None if the specification names no planar region."""
-    trace = material.trace
+    trace = contents.trace
     if trace is None:
         return None
     try:
-        monitor = _monitor(material, trace)
-        chart = chart_of(monitor.spec, monitor.check(trace), trace)
+        monitor = _monitor(contents, trace)
+        region_map = map_of(monitor.spec, monitor.check(trace), trace)
     except StlcError:
         return None
-    if chart is None:
+    if region_map is None:
         return None
-    picture = draw_chart(chart)
+    picture = draw_map(region_map)
     return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
 
 

@@ -1,4 +1,4 @@
-"""The map: who is where when, red for what is violated, and the film of it."""
+"""The map: who is where when, red for what is violated, and the animation of it."""
 
 import numpy as np
 import pytest
@@ -7,31 +7,31 @@ from PIL import Image
 
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
-from stlc.view.animate import film_of
-from stlc.view.chart import _clearest, chart_film, chart_of, draw_chart, plane_of, uses_text
-from stlc.view.driven import map_section
-from stlc.view.film import save_film
-from stlc.view.material import gather
-from stlc.view.style import RED, look, new_figure
+from stlc.view.animation import save_animation
+from stlc.view.contents import read_contents
+from stlc.view.recorded import map_section
+from stlc.view.region_map import _clearest, draw_map, map_animation, map_of, plane_of, uses_text
+from stlc.view.run_animation import animation_of
+from stlc.view.style import RED, new_figure, picture_style
 
 
 @pytest.fixture
-def chart():
+def region_map():
     trace = walk()
-    return chart_of(*judged(trace), trace)
+    return map_of(*judged(trace), trace)
 
 
-def test_who_violates_and_who_is_where(chart):
-    assert chart.violated.tolist() == [False, False, True, True]
-    assert chart.first(2).tolist() == [2, 3]
-    marsh, gate, *_ = chart.plane.places
-    assert chart.inside(marsh).any(1).tolist() == [False, False, True, True]
-    assert chart.inside(gate)[:, 20].tolist() == [True, True, True, False]
-    assert chart.color(marsh) == RED != chart.color(gate)
+def test_who_violates_and_who_is_where(region_map):
+    assert region_map.violated.tolist() == [False, False, True, True]
+    assert region_map.first(2).tolist() == [2, 3]
+    marsh, gate, *_ = region_map.plane.regions
+    assert region_map.inside(marsh).any(1).tolist() == [False, False, True, True]
+    assert region_map.inside(gate)[:, 20].tolist() == [True, True, True, False]
+    assert region_map.color(marsh) == RED != region_map.color(gate)
 
 
-def test_the_picture_says_what_it_shows(chart, tmp_path):
-    picture = draw_chart(chart)
+def test_the_picture_says_what_it_shows(region_map, tmp_path):
+    picture = draw_map(region_map)
     assert "4 traces, 2 of which satisfy" in picture.alt
     plot, *rows = picture.figure.axes
     assert [row.get_title(loc="left") for row in rows][:2] == ["not in marsh", "in gate"]
@@ -43,7 +43,7 @@ def test_the_picture_says_what_it_shows(chart, tmp_path):
 
 
 def test_a_name_stands_in_its_place_and_out_of_others():
-    depth = 5.0 - np.abs(np.arange(11) - 5.0)[None, :]  # deepest in the middle, where another place is
+    depth = 5.0 - np.abs(np.arange(11) - 5.0)[None, :]  # deepest in the middle, where another region is
     other = 2.0 - np.abs(np.arange(11) - 5.0)[None, :]
     _, column = _clearest(depth, [other])
     assert other[0, column] <= 0 < depth[0, column]
@@ -51,8 +51,8 @@ def test_a_name_stands_in_its_place_and_out_of_others():
     assert _clearest(depth, [np.full_like(depth, 9.0)]) == (0, 5)  # within another altogether
 
 
-def test_presence_is_a_share_of_the_traces(chart):
-    gate = draw_chart(chart).figure.axes[2]
+def test_presence_is_a_share_of_the_traces(region_map):
+    gate = draw_map(region_map).figure.axes[2]
     now, so_far = (line.get_ydata() for line in gate.lines)
     assert now[20] == pytest.approx(0.75)
     assert now[-1] == 0.0
@@ -60,11 +60,11 @@ def test_presence_is_a_share_of_the_traces(chart):
     assert np.all(np.diff(so_far) >= 0)
 
 
-def test_places_are_strong_while_they_matter(chart):
-    film = chart_film(chart, title="walk")
-    with look():
-        figure = new_figure(*film.size)
-        turn = film.begin(figure)
+def test_places_are_strong_while_they_matter(region_map):
+    animation = map_animation(region_map, title="walk")
+    with picture_style():
+        figure = new_figure(*animation.size)
+        turn = animation.begin(figure)
         gate = figure.axes[0].patches[1]
         seen = []
         for index in (0, 20, 40):
@@ -73,9 +73,9 @@ def test_places_are_strong_while_they_matter(chart):
     assert seen[0] == seen[2] < seen[1]
 
 
-def test_the_film_moves(chart, tmp_path):
+def test_the_film_moves(region_map, tmp_path):
     path = tmp_path / "walk.gif"
-    save_film(chart_film(chart), path, max_frames=3)
+    save_animation(map_animation(region_map), path, max_frames=3)
     with Image.open(path) as image:
         assert image.n_frames == 3
 
@@ -85,10 +85,10 @@ def test_a_run_whose_specification_names_places_shows_the_map(tmp_path):
     trace = walk()
     run.update({"spec": "walk", "status": "finished"})
     save_trace(run.path / "trace.npz", trace)
-    film = film_of(run)
-    assert film is not None
-    assert "places" in film.alt
-    section = map_section(gather(run))
+    animation = animation_of(run)
+    assert animation is not None
+    assert "regions" in animation.alt
+    section = map_section(read_contents(run))
     assert section is not None
     assert section.picture is not None
     assert "dashed" in section.html
@@ -103,38 +103,38 @@ def plane(text=SPEC):
     return plane_of(spec, [judgement.rule for judgement in verdict], trace)
 
 
-def place(name, text=SPEC):
-    return next(found for found in plane(text).places if found.name == name)
+def region(name, text=SPEC):
+    return next(found for found in plane(text).regions if found.name == name)
 
 
 def test_every_region_of_the_plane_once_in_the_order_of_the_text():
     found = plane()
     assert found.axes == ("x", "y")
-    names = [place.name for place in found.places]
+    names = [region.name for region in found.regions]
     assert names == ["marsh", "gate", "yard", "circle([-3 m, -3 m], 1 m)"]
-    assert [place.role for place in found.places] == ["avoid", "reach", "reach", "avoid"]
+    assert [region.role for region in found.regions] == ["avoid", "reach", "reach", "avoid"]
 
 
 def test_when_they_matter():
-    assert place("marsh").windows == ()
-    assert place("gate").windows == ((1.0, 3.0),)
-    assert place("gate").visited
-    assert not place("yard").visited
-    assert [place("yard").active(t) for t in (4.9, 5.0, 6.0, 6.1)] == [False, True, True, False]
-    assert place("marsh").active(17.0)
-    assert uses_text(place("gate").uses) == "pass_gate 1 to 3 s"
+    assert region("marsh").windows == ()
+    assert region("gate").windows == ((1.0, 3.0),)
+    assert region("gate").visited
+    assert not region("yard").visited
+    assert [region("yard").active(t) for t in (4.9, 5.0, 6.0, 6.1)] == [False, True, True, False]
+    assert region("marsh").active(17.0)
+    assert uses_text(region("gate").uses) == "pass_gate 1 to 3 s"
 
 
 def test_windows_of_nested_operators_add_up_and_those_of_plans_slide():
     nested = SPEC.replace("eventually@[1 s, 3 s] ", "eventually[1 s, 2 s] always[0.5 s, 1 s] ")
-    assert place("gate", nested).windows == ((1.5, 3.0),)
+    assert region("gate", nested).windows == ((1.5, 3.0),)
     sliding = SPEC.replace("eventually@[1 s, 3 s] ", "eventually[0, end] always[0, 1 s] ")
-    assert place("gate", sliding).windows == ((0.0, 1.0),)
+    assert region("gate", sliding).windows == ((0.0, 1.0),)
 
 
 def test_depth_is_the_signed_distance():
     trace = walk()
-    xs, ys, depth = plane().sampled(place("gate"), trace, ((2.0, 6.0), (-2.0, 2.0)), count=41)
+    xs, ys, depth = plane().sampled(region("gate"), trace, ((2.0, 6.0), (-2.0, 2.0)), count=41)
     across, up = np.meshgrid(xs, ys)
     np.testing.assert_allclose(depth, 1.0 - np.hypot(across - 4, up), atol=1e-12)
 
@@ -151,18 +151,18 @@ def test_depth_is_the_signed_distance():
 )
 def test_the_role_follows_negations(written, role):
     text = SPEC.replace("eventually@[1 s, 3 s] [x, y] in gate", f"always[0 s, 1 s] ({written})")
-    assert place("gate", text).role == role
+    assert region("gate", text).role == role
 
 
 def test_a_region_that_is_reached_and_avoided_is_mixed():
     text = SPEC + "require later: always@[4 s, 5 s] [x, y] not in gate\n"
-    assert place("gate", text).role == "mixed"
-    assert place("gate", text).windows == ((1.0, 3.0), (4.0, 5.0))
+    assert region("gate", text).role == "mixed"
+    assert region("gate", text).windows == ((1.0, 3.0), (4.0, 5.0))
 
 
 def test_a_region_without_a_name_does_not_cover_the_picture():
     text = SPEC + "require far: always ([x, y] not in box([-9, -9], [-8.5, -8.25]))\n"
-    titles = [found.title for found in plane(text).places]
+    titles = [found.title for found in plane(text).regions]
     assert titles[:3] == ["marsh", "gate", "yard"]
     assert max(map(len, titles)) == 26
     assert titles[-1].endswith("…")
@@ -170,7 +170,7 @@ def test_a_region_without_a_name_does_not_cover_the_picture():
 
 def test_moving_regions_are_left_out_and_no_places_are_no_plane():
     moving = SPEC.replace("circle([4 m, 0 m], 1 m)", "circle([4 m + v * 1 s, 0 m], 1 m)")
-    assert "gate" not in [found.name for found in plane(moving).places]
+    assert "gate" not in [found.name for found in plane(moving).regions]
     text = "spec walk\nstate signal x [m]\nrequire low: always x < 9 m\n"
     trace = walk(text=text)
     spec, verdict = judged(trace)

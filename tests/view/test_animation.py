@@ -10,9 +10,9 @@ from PIL import Image, ImageDraw
 
 from stlc.controller.sketch import DECIDED
 from stlc.diagnostics import MissingError
-from stlc.view.film import COLOURS, encoded, encoder, fitting, save_film, save_still
-from stlc.view.scene import Staging, scene_film
-from stlc.view.signals import signal_film
+from stlc.view.animation import COLOURS, encoded, encoder, fitting, save_animation, save_still
+from stlc.view.scene import SceneOptions, scene_animation
+from stlc.view.signals import signal_animation
 from stlc.view.style import GREEN, RED
 
 
@@ -23,13 +23,13 @@ def draw_dot(axes, scene, index):
     axes.set_axis_off()
 
 
-def film_of(scene, draw=draw_dot, dt=0.1):
-    return scene_film(scene, Staging(draw, dt, "dot"))
+def animation_of(scene, draw=draw_dot, dt=0.1):
+    return scene_animation(scene, SceneOptions(draw, dt, "dot"))
 
 
-def saved(film, folder, **limits):
+def saved(animation, folder, **limits):
     path = folder / "a.gif"
-    save_film(film, path, **limits)
+    save_animation(animation, path, **limits)
     return path
 
 
@@ -43,10 +43,10 @@ def frames_of(path):
 
 
 def test_a_scene_moves_in_real_time(tmp_path):
-    film = film_of({"x": np.linspace(1, 19, 12)})
-    assert film.frames == 12
-    assert film.size[0] > film.size[1]
-    frames = frames_of(saved(film, tmp_path))
+    animation = animation_of({"x": np.linspace(1, 19, 12)})
+    assert animation.frames == 12
+    assert animation.size[0] > animation.size[1]
+    frames = frames_of(saved(animation, tmp_path))
     assert len(frames) == 12
     assert {duration for _, duration in frames} == {100}
     scenes = [image[60:] for image, _ in frames]  # without the head
@@ -56,8 +56,8 @@ def test_a_scene_moves_in_real_time(tmp_path):
 
 
 def test_many_instants_are_thinned_and_keep_their_pace(tmp_path):
-    film = film_of({"x": np.linspace(1, 19, 50)})
-    frames = frames_of(saved(film, tmp_path, max_frames=10))
+    animation = animation_of({"x": np.linspace(1, 19, 50)})
+    frames = frames_of(saved(animation, tmp_path, max_frames=10))
     assert len(frames) == 10
     assert {duration for _, duration in frames} == {500}
 
@@ -67,50 +67,50 @@ def test_a_large_film_is_made_smaller(tmp_path):
         axes.imshow(scene["field"][index], cmap="gray")
 
     field = np.random.default_rng(0).random((4, 80, 80))
-    film = film_of({"field": field}, draw_noise)
-    path = saved(film, tmp_path, max_bytes=150_000)
+    animation = animation_of({"field": field}, draw_noise)
+    path = saved(animation, tmp_path, max_bytes=150_000)
     assert path.stat().st_size <= 150_000
     assert len(frames_of(path)) == 4
 
 
 def test_signals_grow(recording, tmp_path):
-    film = signal_film(recording, title="run")
-    assert film.frames == recording.samples
-    path = save_still(film, tmp_path / "still.png", at=film.frames - 1, dpi=40)
+    animation = signal_animation(recording, title="run")
+    assert animation.frames == recording.samples
+    path = save_still(animation, tmp_path / "still.png", at=animation.frames - 1, dpi=40)
     with Image.open(path) as image:
         assert image.size[0] == pytest.approx(6.4 * 40, abs=1)
-    frames = frames_of(saved(film, tmp_path, max_frames=3))
+    frames = frames_of(saved(animation, tmp_path, max_frames=3))
     first, last = frames[0][0].astype(int), frames[-1][0].astype(int)
     assert (last < 128).sum() > (first < 128).sum()
 
 
 def test_what_takes_long_is_shown_faster(tmp_path):
-    film = film_of({"x": np.linspace(1, 19, 400)})
-    assert film.speed == 3
-    frames = frames_of(saved(film, tmp_path, max_frames=8))
+    animation = animation_of({"x": np.linspace(1, 19, 400)})
+    assert animation.speed == 3
+    frames = frames_of(saved(animation, tmp_path, max_frames=8))
     assert {duration for _, duration in frames} == {1660}  # 5 s, in hundredths
 
 
 @pytest.mark.skipif(encoder() is None, reason="without ffmpeg there is no video")
 def test_a_video_has_the_same_pictures_twice_as_fine(tmp_path):
-    film = film_of({"x": np.linspace(1, 19, 6)})
-    save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+    animation = animation_of({"x": np.linspace(1, 19, 6)})
+    save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 6
     told = subprocess.run(
         [encoder(), "-i", tmp_path / "a.mp4", "-f", "null", "-"], capture_output=True, text=True, check=True
     ).stderr
-    width, height = (round(2 * 100 * side) for side in film.size)
+    width, height = (round(2 * 100 * side) for side in animation.size)
     assert f"{width}x{height - height % 2}" in told
     assert re.search(r"frame= *6 ", told)
 
 
 def test_without_ffmpeg_there_is_no_video(tmp_path, monkeypatch):
-    monkeypatch.setattr("stlc.view.film.encoder", lambda: None)
-    film = film_of({"x": np.linspace(1, 19, 2)})
+    monkeypatch.setattr("stlc.view.animation.encoder", lambda: None)
+    animation = animation_of({"x": np.linspace(1, 19, 2)})
     with pytest.raises(MissingError, match="R301"):
-        save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+        save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -118,10 +118,10 @@ def test_an_ffmpeg_that_fails_leaves_nothing(tmp_path, monkeypatch):
     broken = tmp_path / "ffmpeg"
     broken.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
     broken.chmod(0o755)
-    monkeypatch.setattr("stlc.view.film.encoder", lambda: str(broken))
-    film = film_of({"x": np.linspace(1, 19, 2)})
+    monkeypatch.setattr("stlc.view.animation.encoder", lambda: str(broken))
+    animation = animation_of({"x": np.linspace(1, 19, 2)})
     with pytest.raises(MissingError) as raised:
-        save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+        save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
     assert raised.value.diagnostics[0].note == ("no such codec",)
     assert list(tmp_path.iterdir()) == [broken]
 

@@ -6,18 +6,18 @@ import pytest
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
 from stlc.units import parse_unit
-from stlc.view.judged import (
-    AS_FORESEEN,
+from stlc.view.verdicts import (
+    CONSISTENT_ONLY,
     FLASH,
     FLASHES,
     Event,
-    as_foreseen,
     events_of,
-    judged_in,
-    judged_once,
+    judge_agents,
+    judged_at_start,
     least,
     margins_of,
     marks,
+    model_consistent,
     monitor_of,
     strip_of,
     units_of,
@@ -29,7 +29,7 @@ def test_margins_count_where_the_world_did_as_the_model_says():
     steps = np.array([[1, 1, 1], [0, 1, 1]])
     meta = TraceMeta(horizon=2)
     trace = Trace(Signature(()), 0.1, {"x": np.zeros((2, 4))}, extras={"foreseen": steps}, meta=meta)
-    counts = as_foreseen(trace, 2)
+    counts = model_consistent(trace, 2)
     assert counts.tolist() == [[True] * 4, [False, True, True, True]]
     np.testing.assert_array_equal(least(rho), [-1, 2, 3, np.nan])
     np.testing.assert_array_equal(least(rho, counts), [1, 2, 3, np.nan])
@@ -38,13 +38,13 @@ def test_margins_count_where_the_world_did_as_the_model_says():
 def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
     decisions = recording.extras["decision"][:10].T.astype(np.int64)
     decisions = np.concatenate([decisions, decisions[-1:]])
-    judged = judged_in(recording, 10, system=tmp_path / "none.yaml")
+    judged = judge_agents(recording, 10, system=tmp_path / "none.yaml")
     strip = strip_of(judged, decisions)
     assert judged.verdict.traces == 10
     assert judged.marked == {"no_collision", "give_way", "red_light"}
     assert strip.rows == ["no_collision", "stop_sign", "give_way", "red_light"]
     assert strip.decisions.shape == (151, 10)
-    assert strip.words != AS_FORESEEN  # nobody recorded whether it was so
+    assert strip.words != CONSISTENT_ONLY  # nobody recorded whether it was so
     assert np.isnan(strip.margins["red_light"][-25:]).all()
 
 
@@ -59,7 +59,7 @@ def test_what_is_judged_once_is_shown_as_it_was_judged():
     monitor = monitor_of(trace)
     verdict = monitor.check(trace)
     found = margins_of(monitor, verdict, trace)
-    assert judged_once(verdict) == ["once_only", "clock"]
+    assert judged_at_start(verdict) == ["once_only", "clock"]
     np.testing.assert_allclose(found["plan"], [[1, -4, -4, -4, np.nan, np.nan], [7] * 4 + [np.nan] * 2])
     np.testing.assert_allclose(found["once_only"], [[1] * 6, [7] * 6])  # not -4: nobody asks at 0.1 s
     np.testing.assert_allclose(found["clock"], [[1] * 6, [5] * 6])
@@ -84,9 +84,9 @@ def test_a_margin_has_the_unit_of_its_predicates():
 def test_where_little_goes_as_foreseen_all_agents_count(recording, tmp_path, right):
     extras = {**recording.extras, "foreseen": np.full((20, 150), right, dtype=np.int8)}
     told = Trace(recording.signature, 0.1, recording.data, extras=extras, meta=recording.meta)
-    judged = judged_in(told, 10, system=tmp_path / "none.yaml")
+    judged = judge_agents(told, 10, system=tmp_path / "none.yaml")
     strip = strip_of(judged, np.zeros((151, 10), dtype=np.int64))
-    assert (strip.words == AS_FORESEEN) is bool(right)
+    assert (strip.words == CONSISTENT_ONLY) is bool(right)
     assert np.isfinite(strip.margins["red_light"][0])
 
 

@@ -17,11 +17,28 @@ from stlc.escape import file_part, picture
 from stlc.rundir import RunDir
 from stlc.trace import Trace, load_trace
 from stlc.view import bullet
-from stlc.view.chart import Chart, chart_film, chart_of
-from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Taped, encoder, save_film, save_still
-from stlc.view.judged import Event, Judged, events_of, judged_in, marks, monitor_of, strip_of, trace_names
-from stlc.view.scene import LegendKey, Scene, Staging, frames_of, keys_of, ratio_of, scene_film
-from stlc.view.signals import Strip, decisions_of, signal_film
+from stlc.view.animation import (
+    MAX_BYTES,
+    MAX_FRAMES,
+    Animation,
+    VectorAnimation,
+    encoder,
+    save_animation,
+    save_still,
+)
+from stlc.view.region_map import RegionMap, map_animation, map_of
+from stlc.view.scene import LegendKey, Scene, SceneOptions, frames_of, keys_of, ratio_of, scene_animation
+from stlc.view.signals import Strip, decisions_of, signal_animation
+from stlc.view.verdicts import (
+    Event,
+    SceneVerdicts,
+    events_of,
+    judge_agents,
+    marks,
+    monitor_of,
+    strip_of,
+    trace_names,
+)
 
 if TYPE_CHECKING:
     from stlc.controller.world import WorldType
@@ -38,31 +55,32 @@ PANEL = 5.8
 
 
 @dataclass(frozen=True, slots=True)
-class Animation:
+class AnimationFiles:
     """The files of an animation; without ffmpeg there is no video."""
 
     gif: Path
     mp4: Path | None
 
 
-def film_of(run: RunDir, *, title: str | None = None) -> Film | None:
-    """Film of the run's deployment; None where nothing was recorded.
+def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
+    """Animation of the run's deployment; None if nothing was recorded.
 
-    The default title names specification, scenario and run.
-
-    The scene is drawn by its world, loaded from the folder. Without a world, or if it fails, the film shows
-    the paths of the trace over the regions of its specification, else the signals.
+    Its world, loaded from the folder, draws the scene. Without a world, or if it fails, the animation shows
+    the paths of the trace over the regions of its specification, else the signals. The default title names
+    specification, scenario and run.
     """
     title = _title(run) if title is None else title
-    return _scene_film(run, title) or _signal_film(run, title)
+    return _scene_animation(run, title) or _signal_animation(run, title)
 
 
-def film_name(run: RunDir) -> str:
+def animation_name(run: RunDir) -> str:
     """File name of the run's animation, without a suffix: that of its specification."""
     return file_part(str(run.record().get("spec", "")), empty="deployment")
 
 
-def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Animation | None:
+def animate(
+    run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES
+) -> AnimationFiles | None:
     """Animate the deployment of `run` into its folder, with a still beside it.
 
     Args:
@@ -76,27 +94,27 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
     """
-    film = film_of(run)
-    if film is None:
+    animation = animation_of(run)
+    if animation is None:
         return None
-    gif = run.path / f"{film_name(run)}.gif"
+    gif = run.path / f"{animation_name(run)}.gif"
     mp4 = gif.with_suffix(".mp4") if encoder() is not None else None
-    save_still(film, run.path / STILL)
-    save_film(film, gif, mp4, max_frames=max_frames, max_bytes=max_bytes)
+    save_still(animation, run.path / STILL)
+    save_animation(animation, gif, mp4, max_frames=max_frames, max_bytes=max_bytes)
     if mp4 is None:
         gif.with_suffix(".mp4").unlink(missing_ok=True)  # of an older deployment
-    return Animation(gif, mp4)
+    return AnimationFiles(gif, mp4)
 
 
 def current(run: RunDir) -> bool:
     """True if the animation in the folder shows the newest deployment."""
-    gif = run.path / f"{film_name(run)}.gif"
+    gif = run.path / f"{animation_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
     return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class RecordedScene:
     """A recorded scene with its world.
 
     Attributes:
@@ -110,7 +128,7 @@ class Seen:
     scene: Scene
     world: WorldType
     dt: float
-    judged: Judged | None = None
+    judged: SceneVerdicts | None = None
     events: tuple[Event, ...] = ()
 
     @property
@@ -137,7 +155,7 @@ class Seen:
         return strip_of(self.judged, decisions.astype(np.int64))
 
 
-def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
+def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None:
     """The scene of the run's deployment; None without one, or if its world cannot be loaded.
 
     With `guarded` false: the same seed simulated without the guard, if recorded.
@@ -161,13 +179,13 @@ def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
         return None
     judged = _judged(run, trace_name, scene)
     if judged is None:
-        return Seen(scene, world, float(decl.dt))
-    events = events_of(judged.drove, judged.drove.traces)
-    marked = marks(events, frames_of(scene), judged.drove.traces, judged.marked)
-    return Seen({**scene, "violated": marked}, world, float(decl.dt), judged, tuple(events))
+        return RecordedScene(scene, world, float(decl.dt))
+    events = events_of(judged.executed, judged.executed.traces)
+    marked = marks(events, frames_of(scene), judged.executed.traces, judged.marked)
+    return RecordedScene({**scene, "violated": marked}, world, float(decl.dt), judged, tuple(events))
 
 
-def _judged(run: RunDir, trace_name: str, scene: Scene) -> Judged | None:
+def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
     """Verdict on a scene's agents; None if the trace is of another deployment or cannot be judged."""
     decisions = scene.get("decision")
     if decisions is None:
@@ -176,19 +194,19 @@ def _judged(run: RunDir, trace_name: str, scene: Scene) -> Judged | None:
         trace = load_trace(run.path / trace_name)
         if trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
             return None
-        return judged_in(trace, decisions.shape[1], system=run.path / SYSTEM)
+        return judge_agents(trace, decisions.shape[1], system=run.path / SYSTEM)
     except StlcError:
         return None
 
 
-def _scene_film(run: RunDir, title: str) -> Film | None:
-    seen = seen_in(run)
+def _scene_animation(run: RunDir, title: str) -> Animation | None:
+    seen = recorded_scene(run)
     if seen is None:
         return None
     try:
         stage = seen.stage if bullet.available() else None
         draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
-        return scene_film(seen.scene, Staging(draw, seen.dt, title, seen.own_keys, seen.strip))
+        return scene_animation(seen.scene, SceneOptions(draw, seen.dt, title, seen.own_keys, seen.strip))
     except Exception:  # whatever a world's own code raises: there are other pictures
         return None
 
@@ -197,7 +215,7 @@ def _scene_film(run: RunDir, title: str) -> Film | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class RunPanel:
     """One closed-loop run as shown on a page.
 
     Attributes:
@@ -211,7 +229,7 @@ class Shot:
         events: violations.
         names: of the agents.
         requirements: names of the requirements judged.
-        taped: records the drawing of given frames.
+        vector_frames: records the drawing of given frames.
     """
 
     title: str
@@ -224,7 +242,7 @@ class Shot:
     events: tuple[Event, ...]
     names: tuple[str, ...]
     requirements: tuple[str, ...]
-    taped: Callable[[range], Taped]
+    vector_frames: Callable[[range], VectorAnimation]
 
     def time(self, sample: int) -> float:
         """Time of a sample, seconds."""
@@ -234,38 +252,38 @@ class Shot:
 WITHOUT, WITH = "without the guard", "with the guard"
 
 
-def shots_of(run: RunDir) -> list[Shot]:
+def run_panels(run: RunDir) -> list[RunPanel]:
     """Shots of the newest deployment for a page: the first seed without and with the guard.
 
-    One shot without a comparison; signals of the trace if there is no world; empty without a recording.
+    One panel without a comparison; signals of the trace if there is no world; empty without a recording.
     """
-    shots = []
+    panels = []
     for guarded, title in ((False, WITHOUT), (True, WITH)):
-        seen = seen_in(run, guarded=guarded)
+        seen = recorded_scene(run, guarded=guarded)
         if seen is not None:
-            shots.append((seen, title))
-    if shots and shots[-1][1] == WITH:
-        same = len(shots) > 1 and shots[0][0].frames == shots[1][0].frames
-        chosen = shots if same else shots[-1:]
+            panels.append((seen, title))
+    if panels and panels[-1][1] == WITH:
+        same = len(panels) > 1 and panels[0][0].frames == panels[1][0].frames
+        chosen = panels if same else panels[-1:]
         try:
-            return [_scene_shot(seen, title if same else "") for seen, title in chosen]
+            return [_scene_panel(seen, title if same else "") for seen, title in chosen]
         except Exception:  # whatever a world's own code raises: there are other pictures
             pass
-    return _trace_shots(run)
+    return _trace_panels(run)
 
 
-def _scene_shot(seen: Seen, title: str) -> Shot:
+def _scene_panel(seen: RecordedScene, title: str) -> RunPanel:
     judged, agents = seen.judged, seen.scene["decision"].shape[1] if "decision" in seen.scene else 0
     ratio = ratio_of(seen.world.draw, seen.scene)
     size = (PANEL, round(PANEL * ratio, 2))
 
-    def record(shown: range) -> Taped:
-        from stlc.view.tape import taped
+    def record(shown: range) -> VectorAnimation:
+        from stlc.view.vector import vector_frames
 
-        return taped(lambda axes, index: seen.world.draw(axes, seen.scene, index), shown, size)
+        return vector_frames(lambda axes, index: seen.world.draw(axes, seen.scene, index), shown, size)
 
     record(range(1))  # errors of a world's drawing code are raised here, not while the page is written
-    return Shot(
+    return RunPanel(
         title=title,
         alt=f"{agents} agents drive {title}".strip(),
         frames=seen.frames,
@@ -275,40 +293,40 @@ def _scene_shot(seen: Seen, title: str) -> Shot:
         strip=seen.strip,
         events=seen.events,
         names=tuple(f"agent {agent}" for agent in range(agents)),
-        requirements=() if judged is None else tuple(j.name for j in judged.drove),
-        taped=record,
+        requirements=() if judged is None else tuple(j.name for j in judged.executed),
+        vector_frames=record,
     )
 
 
-def _trace_shots(run: RunDir) -> list[Shot]:
-    """One shot of the trace: its paths over regions, or its signals."""
-    film = _signal_film(run, "")
-    if film is None:
+def _trace_panels(run: RunDir) -> list[RunPanel]:
+    """One panel of the trace: its paths over regions, or its signals."""
+    animation = _signal_animation(run, "")
+    if animation is None:
         return []
     trace = load_trace(run.path / TRACE)
 
-    def record(shown: range) -> Taped:
-        from stlc.view.tape import taped_film
+    def record(shown: range) -> VectorAnimation:
+        from stlc.view.vector import vector_animation
 
-        return taped_film(film, shown)
+        return vector_animation(animation, shown)
 
     try:
-        judged = judged_in(trace, trace.traces, system=run.path / SYSTEM)
+        judged = judge_agents(trace, trace.traces, system=run.path / SYSTEM)
     except StlcError:
         judged = None
     return [
-        Shot(
+        RunPanel(
             title="",
-            alt=film.alt,
-            frames=film.frames,
-            dt=film.dt,
+            alt=animation.alt,
+            frames=animation.frames,
+            dt=animation.dt,
             t0=trace.t0,
             keys=(),
             strip=None if judged is None else strip_of(judged, _decisions_shown(trace)),
-            events=() if judged is None else tuple(events_of(judged.drove, trace.traces)),
+            events=() if judged is None else tuple(events_of(judged.executed, trace.traces)),
             names=tuple(trace_names(trace)),
-            requirements=() if judged is None else tuple(j.name for j in judged.drove),
-            taped=record,
+            requirements=() if judged is None else tuple(j.name for j in judged.executed),
+            vector_frames=record,
         )
     ]
 
@@ -330,20 +348,22 @@ def _scenario(run: RunDir) -> str | None:
     return None if name is None else str(name)
 
 
-def _signal_film(run: RunDir, title: str) -> Film | None:
+def _signal_animation(run: RunDir, title: str) -> Animation | None:
     try:
         trace = load_trace(run.path / TRACE)
     except StlcError:
         return None
-    chart = _chart(trace)
-    return signal_film(trace, title=title) if chart is None else chart_film(chart, title=title)
+    region_map = _map_of(trace)
+    return (
+        signal_animation(trace, title=title) if region_map is None else map_animation(region_map, title=title)
+    )
 
 
-def _chart(trace: Trace) -> Chart | None:
+def _map_of(trace: Trace) -> RegionMap | None:
     """The map of a trace; None if its specification names no regions."""
     try:
         monitor = monitor_of(trace)
-        return chart_of(monitor.spec, monitor.check(trace), trace)
+        return map_of(monitor.spec, monitor.check(trace), trace)
     except StlcError:
         return None
 

@@ -1,4 +1,4 @@
-"""A film as drawing commands, not pixels: paths, texts and images, for a page that replays them.
+"""An animation as drawing commands, not pixels: paths, texts and images, for a page that replays them.
 
 `Tape` is the matplotlib renderer that records them. Commands shared by frames are stored once. Coordinates
 are whole quarters of a dot from the upper left.
@@ -18,8 +18,8 @@ from matplotlib.colors import to_hex
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 
-from stlc.view.film import Command, Film, Taped, wipe
-from stlc.view.style import look, new_figure
+from stlc.view.animation import Animation, Command, VectorAnimation, clear_artists
+from stlc.view.style import new_figure, picture_style
 
 if TYPE_CHECKING:
     pass
@@ -33,37 +33,39 @@ QUALITY = 60
 _LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outline.CURVE4: "c"}
 
 
-def taped(draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]) -> Taped:
+def vector_frames(
+    draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]
+) -> VectorAnimation:
     """Record frames drawn by `draw(axes, index)` on axes that fill a figure of a size in inches."""
-    with look():
+    with picture_style():
         figure = new_figure(*size)
         figure.set_dpi(DPI)
         figure.set_layout_engine("none")
         axes = figure.add_axes((0, 0, 1, 1))
-        tape = Tape(round(size[0] * DPI), round(size[1] * DPI))
+        renderer = CommandRenderer(round(size[0] * DPI), round(size[1] * DPI))
         for index in frames:
-            wipe(axes)
+            clear_artists(axes)
             draw(axes, index)
-            tape.begin()
-            axes.draw(tape)
-    return tape.taped()
+            renderer.begin()
+            axes.draw(renderer)
+    return renderer.recorded()
 
 
-def taped_film(film: Film, frames: Sequence[int]) -> Taped:
-    """Record the frames of a film."""
-    with look():
-        figure = new_figure(*film.size)
+def vector_animation(animation: Animation, frames: Sequence[int]) -> VectorAnimation:
+    """Record the frames of an animation."""
+    with picture_style():
+        figure = new_figure(*animation.size)
         figure.set_dpi(DPI)
-        turn = film.begin(figure)
-        tape = Tape(round(film.size[0] * DPI), round(film.size[1] * DPI))
+        turn = animation.begin(figure)
+        renderer = CommandRenderer(round(animation.size[0] * DPI), round(animation.size[1] * DPI))
         for index in frames:
             turn(index)
-            tape.begin()
-            figure.draw(tape)
-    return tape.taped()
+            renderer.begin()
+            figure.draw(renderer)
+    return renderer.recorded()
 
 
-class Tape(RendererBase):
+class CommandRenderer(RendererBase):
     """Matplotlib renderer that records drawing commands frame by frame."""
 
     def __init__(self, width: int, height: int) -> None:
@@ -77,10 +79,10 @@ class Tape(RendererBase):
         """Begin another frame."""
         self._frames.append([])
 
-    def taped(self) -> Taped:
+    def recorded(self) -> VectorAnimation:
         """The recording."""
         frames = tuple(tuple(frame) for frame in self._frames)
-        return Taped(self.width, self.height, tuple(self._known), frames)
+        return VectorAnimation(self.width, self.height, tuple(self._known), frames)
 
     def _enter(self, command: Command) -> None:
         self._frames[-1].append(self._known.setdefault(command, len(self._known)))

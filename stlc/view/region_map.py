@@ -20,7 +20,7 @@ from stlc.monitor.verdict import Monitor, Verdict
 from stlc.signature import Signature
 from stlc.source import Span
 from stlc.trace import Trace
-from stlc.view.film import Film
+from stlc.view.animation import Animation
 from stlc.view.signals import MOST_AGENTS
 from stlc.view.style import (
     BLUE,
@@ -33,8 +33,8 @@ from stlc.view.style import (
     RED,
     SKY,
     Picture,
-    look,
     new_figure,
+    picture_style,
 )
 from stlc.view.words import labelled
 
@@ -49,7 +49,7 @@ MOST_PATHS = 200
 CROWDED = 1000
 """Number of path points above which thinner lines are drawn."""
 TAIL = 2.5
-"""Length of the trail behind an agent in the film, in seconds."""
+"""Length of the trail behind an agent in the animation, in seconds."""
 STRONG, FEEBLE = 0.4, 0.1
 """Opacity of a region while it is active, and while it is not."""
 _TINTS = (GREEN, BLUE, PINK, SKY, ORANGE)
@@ -58,7 +58,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Chart:
+class RegionMap:
     """Data of a map.
 
     Attributes:
@@ -77,97 +77,101 @@ class Chart:
         across, up = self.plane.axes
         return self.trace.data[across], self.trace.data[up]
 
-    def color(self, place: ChartPlace) -> str:
+    def color(self, region: MapRegion) -> str:
         """Colour of a region: red if it must be avoided, else its own."""
-        if place.role == "avoid":
+        if region.role == "avoid":
             return RED
-        others = [other for other in self.plane.places if other.role != "avoid"]
-        return _TINTS[others.index(place) % len(_TINTS)]
+        others = [other for other in self.plane.regions if other.role != "avoid"]
+        return _TINTS[others.index(region) % len(_TINTS)]
 
-    def inside(self, place: ChartPlace) -> Mask:
+    def inside(self, region: MapRegion) -> Mask:
         """Mask of the traces in a region over time, (traces, samples)."""
-        return place.depth(self.trace) >= 0.0
+        return region.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
         """Indices of at most `most` traces, violating ones first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
-def chart_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> Chart | None:
+def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> RegionMap | None:
     """The map of a judged trace; None if its specification names no planar regions."""
     plane = plane_of(spec, [judgement.rule for judgement in verdict], trace)
     if plane is None:
         return None
     violated: Mask = np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict])
-    return Chart(trace, plane, violated)
+    return RegionMap(trace, plane, violated)
 
 
-def draw_chart(chart: Chart) -> Picture:
+def draw_map(region_map: RegionMap) -> Picture:
     """Draw all paths over the regions; beside them, for each region, the share of traces in it over time."""
-    with look():
+    with picture_style():
         figure = new_figure(9, 4.4)
-        plot, rows = _layout(figure, chart)
-        _draw_places(plot, chart)
-        _draw_paths(plot, chart)
-        for axes, place in zip(rows, chart.plane.places, strict=True):
-            _draw_presence(axes, chart, place)
-    return Picture(figure, f"{_summary(chart)}, over the places of the specification.")
+        plot, rows = _layout(figure, region_map)
+        _draw_regions(plot, region_map)
+        _draw_paths(plot, region_map)
+        for axes, region in zip(rows, region_map.plane.regions, strict=True):
+            _draw_presence(axes, region_map, region)
+    return Picture(figure, f"{_summary(region_map)}, over the regions of the specification.")
 
 
-def chart_film(chart: Chart, *, title: str = "") -> Film:
+def map_animation(region_map: RegionMap, *, title: str = "") -> Animation:
     """Film of the map: active regions are filled, trails fade behind the agents."""
 
     def begin(figure: Figure) -> Callable[[int], None]:
-        plot, rows = _layout(figure, chart)
-        areas = _draw_places(plot, chart)
-        moving = _Moving(plot, chart)
+        plot, rows = _layout(figure, region_map)
+        areas = _draw_regions(plot, region_map)
+        moving = _MovingAgents(plot, region_map)
         cursors = []
-        for axes, place in zip(rows, chart.plane.places, strict=True):
-            _draw_presence(axes, chart, place)
-            cursors.append(axes.axvline(chart.trace.t0, color=INK, lw=1.1))
-        head = plot.set_title(_heading(title, chart.trace.times[-1]))
+        for axes, region in zip(rows, region_map.plane.regions, strict=True):
+            _draw_presence(axes, region_map, region)
+            cursors.append(axes.axvline(region_map.trace.t0, color=INK, lw=1.1))
+        head = plot.set_title(_heading(title, region_map.trace.times[-1]))
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
 
         def turn(index: int) -> None:
-            now = float(chart.trace.times[index])
+            now = float(region_map.trace.times[index])
             head.set_text(_heading(title, now))
             moving.turn(index)
-            for place, area in zip(chart.plane.places, areas, strict=True):
-                strength = STRONG if place.active(now - chart.trace.t0) else FEEBLE
-                area.set_facecolor(_tint(chart.color(place), strength))
+            for region, area in zip(region_map.plane.regions, areas, strict=True):
+                strength = STRONG if region.active(now - region_map.trace.t0) else FEEBLE
+                area.set_facecolor(_tint(region_map.color(region), strength))
             for cursor in cursors:
                 cursor.set_xdata([now, now])
 
         return turn
 
-    alt = f"{title}: {_summary(chart)}, in motion over the places of the specification."
-    return Film(chart.trace.samples, chart.trace.dt, (8.4, 4.1), begin, alt, chart.trace.samples // 2)
+    alt = f"{title}: {_summary(region_map)}, in motion over the regions of the specification."
+    return Animation(
+        region_map.trace.samples, region_map.trace.dt, (8.4, 4.1), begin, alt, region_map.trace.samples // 2
+    )
 
 
 def _heading(title: str, seconds: float) -> str:
     return f"{title}   {seconds:4.1f} s".strip()
 
 
-def _summary(chart: Chart) -> str:
-    good = int((~chart.violated).sum())
-    return f"Paths of {len(chart.violated):,} traces, {good:,} of which satisfy every requirement"
+def _summary(region_map: RegionMap) -> str:
+    good = int((~region_map.violated).sum())
+    return f"Paths of {len(region_map.violated):,} traces, {good:,} of which satisfy every requirement"
 
 
 # ---------------------------------------------------------------------- pieces
 
 
-def _layout(figure: Figure, chart: Chart) -> tuple[Axes, list[Axes]]:
+def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
     """Axes of the map, and of a row for each region beside it."""
-    (left, right), (low, high) = chart.plane.window(chart.trace)
+    (left, right), (low, high) = region_map.plane.window(region_map.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
-    grid = figure.add_gridspec(len(chart.plane.places), 2, width_ratios=[1.55 * ratio**0.5, 1])
+    grid = figure.add_gridspec(len(region_map.plane.regions), 2, width_ratios=[1.55 * ratio**0.5, 1])
     plot = figure.add_subplot(grid[:, 0])
     plot.set(xlim=(left, right), ylim=(low, high), aspect="equal")
-    across, up = (labelled(name, chart.trace.signature[name].unit.text) for name in chart.plane.axes)
+    across, up = (
+        labelled(name, region_map.trace.signature[name].unit.text) for name in region_map.plane.axes
+    )
     plot.set(xlabel=across, ylabel=up)
     rows: list[Axes] = []
-    for index in range(len(chart.plane.places)):
+    for index in range(len(region_map.plane.regions)):
         rows.append(figure.add_subplot(grid[index, 1], sharex=rows[0] if rows else None))
     for axes in rows[:-1]:
         axes.tick_params(labelbottom=False)
@@ -175,15 +179,18 @@ def _layout(figure: Figure, chart: Chart) -> tuple[Axes, list[Axes]]:
     return plot, rows
 
 
-def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
+def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
     """Draw every region; return the filled patch of each, empty for an invisible one."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
     window = (axes.get_xlim(), axes.get_ylim())
-    areas, sampled = [], [chart.plane.sampled(place, chart.trace, window) for place in chart.plane.places]
-    for index, (place, (xs, ys, depth)) in enumerate(zip(chart.plane.places, sampled, strict=True)):
-        color = chart.color(place)
+    areas, sampled = (
+        [],
+        [region_map.plane.sampled(region, region_map.trace, window) for region in region_map.plane.regions],
+    )
+    for index, (region, (xs, ys, depth)) in enumerate(zip(region_map.plane.regions, sampled, strict=True)):
+        color = region_map.color(region)
         outline = Path(np.empty((0, 2)))
         if (depth >= 0).any():
             filled = axes.contourf(xs, ys, depth, levels=[0, 2 * max(float(depth.max()), 1e-9)])
@@ -191,9 +198,9 @@ def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
             filled.remove()
             others = [other for k, (_, _, other) in enumerate(sampled) if k != index]
             row, column = _clearest(depth, others)
-            _write(axes, place.title, (float(xs[column]), float(ys[row])))
+            _write(axes, region.title, (float(xs[column]), float(ys[row])))
         area = PathPatch(outline, fc=_tint(color, STRONG), ec=color, lw=1.2, zorder=2)
-        if place.role == "avoid":
+        if region.role == "avoid":
             area.set_hatch("///")
         axes.add_patch(area)
         areas.append(area)
@@ -218,18 +225,18 @@ def _write(axes: Axes, name: str, at: tuple[float, float]) -> None:
     axes.annotate(name, at, ha="center", va="center", color=INK, weight="bold", zorder=6, bbox=paper)
 
 
-def _draw_paths(axes: Axes, chart: Chart) -> None:
+def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
     """Draw satisfying paths in ink, violating ones in red above them; mark start and end."""
-    across, up = chart.paths
-    chosen = chart.first(MOST_PATHS)
+    across, up = region_map.paths
+    chosen = region_map.first(MOST_PATHS)
     for violated, color, order in ((False, INK, 3), (True, RED, 4)):
-        rows = chosen[chart.violated[chosen] == violated]
+        rows = chosen[region_map.violated[chosen] == violated]
         if not len(rows):
             continue
         strength = max(0.25, 0.9 - 0.01 * len(rows))
         width = 0.7 if across[rows].size < CROWDED else 0.45
         xs, ys = _joined(across[rows]), _joined(up[rows])
-        count = int((chart.violated == violated).sum())
+        count = int((region_map.violated == violated).sum())
         word = "violated" if violated else "satisfied"
         axes.plot(xs, ys, color=color, lw=width, alpha=strength, zorder=order, label=f"{word} ({count:,})")
         axes.plot(across[rows, 0], up[rows, 0], "o", mfc="white", mec=color, ms=3, mew=0.7, zorder=5)
@@ -242,25 +249,27 @@ def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
 
 
-def _draw_presence(axes: Axes, chart: Chart, place: ChartPlace) -> None:
+def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None:
     """Draw the share of traces in a region over time, with its active time shaded."""
-    color, times = chart.color(place), chart.trace.times
-    for low, high in place.windows:
-        axes.axvspan(chart.trace.t0 + low, chart.trace.t0 + high, color=FAINT, alpha=0.8, lw=0, zorder=0)
-    inside = chart.inside(place)
+    color, times = region_map.color(region), region_map.trace.times
+    for low, high in region.windows:
+        axes.axvspan(
+            region_map.trace.t0 + low, region_map.trace.t0 + high, color=FAINT, alpha=0.8, lw=0, zorder=0
+        )
+    inside = region_map.inside(region)
     share = inside.mean(0)
     axes.fill_between(times, share, 0, color=color, alpha=0.35, lw=0, zorder=1)
     axes.plot(times, share, color=color, lw=1.2, zorder=2)
-    if place.visited:
-        so_far = np.logical_or.accumulate(inside & _matters(place, chart.trace), axis=1).mean(0)
+    if region.visited:
+        so_far = np.logical_or.accumulate(inside & _matters(region, region_map.trace), axis=1).mean(0)
         axes.plot(times, so_far, color=color, lw=1, ls=(0, (3, 2)), zorder=2)
     axes.set(ylim=(-0.04, 1.12), xlim=(times[0], times[-1]))
     axes.set_yticks([0, 1], ["0", "all"])
     axes.grid(visible=False)
-    word = "not in" if place.role == "avoid" else "in"
-    axes.set_title(f"{word} {place.title}", color=INK, pad=3)
+    word = "not in" if region.role == "avoid" else "in"
+    axes.set_title(f"{word} {region.title}", color=INK, pad=3)
     axes.annotate(
-        uses_text(place.uses),
+        uses_text(region.uses),
         (1, 1),
         xycoords="axes fraction",
         xytext=(0, 3.5),
@@ -271,22 +280,22 @@ def _draw_presence(axes: Axes, chart: Chart, place: ChartPlace) -> None:
     )
 
 
-def _matters(place: ChartPlace, trace: Trace) -> Mask:
+def _matters(region: MapRegion, trace: Trace) -> Mask:
     """Mask of the samples at which a region is active, (samples,)."""
-    return np.array([place.active(float(seconds) - trace.t0) for seconds in trace.times])
+    return np.array([region.active(float(seconds) - trace.t0) for seconds in trace.times])
 
 
-class _Moving:
-    """The agents of the film: a point and a trail each."""
+class _MovingAgents:
+    """The agents of the animation: a point and a trail each."""
 
-    def __init__(self, axes: Axes, chart: Chart) -> None:
-        chosen = chart.first(MOST_AGENTS)
-        across, up = chart.paths
+    def __init__(self, axes: Axes, region_map: RegionMap) -> None:
+        chosen = region_map.first(MOST_AGENTS)
+        across, up = region_map.paths
         self._across, self._up = across[chosen], up[chosen]
-        self._tail = max(1, round(TAIL / chart.trace.dt))
+        self._tail = max(1, round(TAIL / region_map.trace.dt))
         axes.plot(_joined(self._across), _joined(self._up), color=MUTED, lw=0.5, alpha=0.25, zorder=3)
         (self._recent,) = axes.plot([], [], color=INK, lw=1.1, alpha=0.85, zorder=4)
-        colors = [RED if violated else INK for violated in chart.violated[chosen]]
+        colors = [RED if violated else INK for violated in region_map.violated[chosen]]
         self._points = axes.scatter(
             self._across[:, 0], self._up[:, 0], s=16, c=colors, lw=0.5, ec="white", zorder=7
         )
@@ -298,7 +307,7 @@ class _Moving:
         self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))
 
 
-# ---------------------------------------------------------------------- places
+# ---------------------------------------------------------------------- regions
 
 
 Role = Literal["reach", "avoid", "mixed"]
@@ -330,7 +339,7 @@ class Use:
 
 
 @dataclass(frozen=True, slots=True)
-class ChartPlace:
+class MapRegion:
     """A region of the plane.
 
     Attributes:
@@ -381,11 +390,11 @@ class Plane:
 
     Attributes:
         axes: names of the two columns.
-        places: in the order of the specification.
+        regions: in the order of the specification.
     """
 
     axes: tuple[str, str]
-    places: tuple[ChartPlace, ...]
+    regions: tuple[MapRegion, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
         """Part of the plane to show: all paths, and the regions near them."""
@@ -396,8 +405,8 @@ class Plane:
         size = max(high - low for low, high in ends) or 1.0
         search = [(low - size, high + size) for low, high in ends]
         lows, highs = [np.array([end[k] for end in ends]) for k in (0, 1)]
-        for place in self.places:
-            xs, ys, depth = self.sampled(place, trace, (search[0], search[1]), count=GRID // 2)
+        for region in self.regions:
+            xs, ys, depth = self.sampled(region, trace, (search[0], search[1]), count=GRID // 2)
             inside = depth >= 0.0
             if inside.any() and not (inside[0] | inside[-1] | inside[:, 0] | inside[:, -1]).any():
                 here = np.array([xs[inside.any(0)][[0, -1]], ys[inside.any(1)][[0, -1]]])
@@ -408,7 +417,7 @@ class Plane:
 
     def sampled(
         self,
-        place: ChartPlace,
+        region: MapRegion,
         like: Trace,
         window: tuple[Window, Window],
         *,
@@ -421,7 +430,7 @@ class Plane:
         data = dict(zip(self.axes, (across, up), strict=True))
         columns = Signature(tuple(like.signature[name] for name in self.axes))
         grid = replace(like, signature=columns, data=data, extras={})
-        return xs, ys, place.depth(grid)
+        return xs, ys, region.depth(grid)
 
 
 def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
@@ -443,18 +452,18 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
                 if node.negated and _point(node) is not node.item:  # a complement, not a `not` around it
                     use = _turned(use)
                 uses.setdefault(_texts(node), []).append(use)
-    found: list[tuple[tuple[str, ...], ChartPlace]] = []
+    found: list[tuple[tuple[str, ...], MapRegion]] = []
     shown = {_texts(node): node for node in members.values()}
     for key, its in uses.items():
         judge = _judge_of(spec, shown[key], trace)
         if judge is not None:
             columns = judge.compiled.signature.names
-            found.append((columns, ChartPlace(key[1], tuple(its), judge)))
+            found.append((columns, MapRegion(key[1], tuple(its), judge)))
     flat = [columns for columns, _ in found if len(columns) == 2 and all(c in trace.data for c in columns)]
     if not flat:
         return None
     axes = Counter(flat).most_common(1)[0][0]
-    return Plane((axes[0], axes[1]), tuple(place for columns, place in found if columns == axes))
+    return Plane((axes[0], axes[1]), tuple(region for columns, region in found if columns == axes))
 
 
 def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:

@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 
 ENOUGH = 0.4
 """Minimum share of model-consistent instants for which only their margins are shown."""
-AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
+CONSISTENT_ONLY = "least margin from each instant on, of the agents for which the world did as the model says"
 MOST = 240
 """Maximum number of events per requirement."""
 FLASH = (True, True, True, False)
@@ -58,7 +58,7 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Fl
     """
     found = monitor.requirement_robustness(trace)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
-    for name in judged_once(verdict):
+    for name in judged_at_start(verdict):
         rows[name] = np.repeat(verdict[name].least[:, None], rows[name].shape[1], 1)
     return rows
 
@@ -68,7 +68,7 @@ def units_of(verdict: Verdict) -> dict[str, str]:
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
-def judged_once(verdict: Verdict) -> list[str]:
+def judged_at_start(verdict: Verdict) -> list[str]:
     """Names of the requirements judged only at the start of a trace."""
     planned = verdict.subject.horizon is not None
     return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
@@ -89,14 +89,14 @@ def trace_names(trace: Trace) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class SceneVerdicts:
     """The runs of a scene's agents (those of the first seed) and the verdict on them.
 
     Attributes:
         trace: of these agents.
         monitor: of the specification of plans.
         verdict: of that monitor.
-        drove: verdict by the rules for closed-loop runs, if stored; else the same.
+        executed: verdict by the rules for closed-loop runs, if stored; else the same.
         foreseen: model-consistent samples: the world followed the model for the length of a plan, (agents,
             samples); None: not recorded.
     """
@@ -104,18 +104,18 @@ class Judged:
     trace: Trace
     monitor: Monitor
     verdict: Verdict
-    drove: Verdict
+    executed: Verdict
     foreseen: Mask | None
 
     @property
     def marked(self) -> set[str]:
         """Requirements whose violations are marked: all rules for runs, else those tagged `@safety`."""
-        names = {judgement.name for judgement in self.drove if "safety" in judgement.rule.tags}
+        names = {judgement.name for judgement in self.executed if "safety" in judgement.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
-        return names if names and not ruled else {judgement.name for judgement in self.drove}
+        return names if names and not ruled else {judgement.name for judgement in self.executed}
 
 
-def judged_in(trace: Trace, agents: int, *, system: Path) -> Judged:
+def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
     """Judge the first `agents` of a trace by its own specification.
 
     Raises:
@@ -123,24 +123,24 @@ def judged_in(trace: Trace, agents: int, *, system: Path) -> Judged:
     """
     first = {name: values[:agents] for name, values in trace.data.items()}
     monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
-    verdict = drove = monitor.check(seen)
+    verdict = executed = monitor.check(seen)
     if trace.meta.judge_text:
-        drove = monitor_of(trace, system=system, drives=True).check(seen)
-    return Judged(seen, monitor, verdict, drove, as_foreseen(trace, agents))
+        executed = monitor_of(trace, system=system, drives=True).check(seen)
+    return SceneVerdicts(seen, monitor, verdict, executed, model_consistent(trace, agents))
 
 
-def strip_of(judged: Judged, decisions: NDArray[np.int64] | None) -> Strip:
+def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins and of the decisions, (frames, agents)."""
     rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
     times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
     if judged.foreseen is not None:
         margins = {name: least(rho, judged.foreseen) for name, rho in rows.items()}
         if _known(margins) >= ENOUGH * _known(every):
-            return Strip(times, margins, decisions, AS_FORESEEN, units)
+            return Strip(times, margins, decisions, CONSISTENT_ONLY, units)
     return Strip(times, every, decisions, units=units)
 
 
-def as_foreseen(trace: Trace, agents: int) -> Mask | None:
+def model_consistent(trace: Trace, agents: int) -> Mask | None:
     """Mask of model-consistent samples: the world follows the model for the length of a plan.
 
     Returns:
@@ -219,11 +219,11 @@ def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> li
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:
-    """Mask of marked agents in a film, (frames, agents): during a violation, and blinking after it.
+    """Mask of marked agents in an animation, (frames, agents): during a violation, and blinking after it.
 
     Args:
         events: violations.
-        frames: instants of the film.
+        frames: instants of the animation.
         agents: number of agents in it.
         names: requirements that count; None: all.
     """

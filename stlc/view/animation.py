@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, MissingError
 from stlc.files import atomic_path, write_atomic
-from stlc.view.style import PAPER, look, new_figure
+from stlc.view.style import PAPER, new_figure, picture_style
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 240
 MAX_BYTES = 4_000_000
 LONGEST = 16.0
-"""Maximum duration of a film in seconds; longer recordings are sped up."""
+"""Maximum duration of an animation in seconds; longer recordings are sped up."""
 DPI, FINE = 100, 2
 """Dots per inch of a GIF, and how many times as many a video and a still have."""
 QUALITY = 86
@@ -38,7 +38,7 @@ QUALITY = 86
 
 
 @dataclass(frozen=True, slots=True)
-class Film:
+class Animation:
     """A drawing for each of a number of instants.
 
     Attributes:
@@ -61,16 +61,16 @@ class Film:
 
     @property
     def speed(self) -> int:
-        """Speed of the film as a multiple of real time."""
-        return speed_of(self.frames, self.dt)
+        """Speed of the animation as a multiple of real time."""
+        return speed_up(self.frames, self.dt)
 
 
 Command: TypeAlias = tuple[Any, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Taped:
-    """A film as drawing commands.
+class VectorAnimation:
+    """An animation as drawing commands.
 
     Attributes:
         width, height: of the picture, in dots.
@@ -105,13 +105,13 @@ class Taped:
         }
 
 
-def in_the_dark(tapes: Sequence[Taped], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Colour -> colour in the dark scheme; empty if a tape has images, or colours outside the palette."""
-    known = all(tape.colors <= dark.keys() and not tape.pictured for tape in tapes)
+def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
+    """Colour -> colour in the dark scheme; empty if any has images, or colours outside the palette."""
+    known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}
 
 
-def wipe(axes: Axes) -> None:
+def clear_artists(axes: Axes) -> None:
     """Remove all artists; much faster than clearing the axes."""
     for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.images):
         artist.remove()
@@ -119,23 +119,23 @@ def wipe(axes: Axes) -> None:
     axes.ignore_existing_data_limits = True
 
 
-def speed_of(frames: int, dt: float) -> int:
-    """Smallest integer speed-up at which the film lasts at most `LONGEST`."""
+def speed_up(frames: int, dt: float) -> int:
+    """Smallest integer speed-up at which the animation lasts at most `LONGEST`."""
     return max(1, int(np.ceil(frames * dt / LONGEST)))
 
 
-def save_film(
-    film: Film,
+def save_animation(
+    animation: Animation,
     gif: Path,
     mp4: Path | None = None,
     *,
     max_frames: int = MAX_FRAMES,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write `film` as a GIF and as a video; every instant is drawn once.
+    """Write `animation` as a GIF and as a video; every instant is drawn once.
 
     Args:
-        film: to write.
+        animation: to write.
         gif: path of the GIF, smaller in width where it would exceed `max_bytes`.
         mp4: path of the video.
         max_frames: more instants are subsampled evenly.
@@ -144,13 +144,13 @@ def save_film(
     Raises:
         MissingError: R201, a file cannot be written; R301, there is no ffmpeg for the video.
     """
-    stride = max(1, -(-film.frames // max_frames))
-    milliseconds = max(20, round(1000 * stride * film.dt / film.speed))
+    stride = max(1, -(-animation.frames // max_frames))
+    milliseconds = max(20, round(1000 * stride * animation.dt / animation.speed))
     fine = FINE if mp4 is not None else 1
     small: list[Image] = []
     with ExitStack() as stack:
         write: Callable[[Image], None] | None = None
-        for picture in frames_in(film, range(0, film.frames, stride), fine * DPI):
+        for picture in frames_in(animation, range(0, animation.frames, stride), fine * DPI):
             if mp4 is not None:
                 write = write or stack.enter_context(video(mp4, picture.size, milliseconds))
                 write(picture)
@@ -158,18 +158,18 @@ def save_film(
     write_atomic(gif, fitting(small, milliseconds, max_bytes))
 
 
-def save_still(film: Film, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
-    """Write instant `at` of `film` (default: its `moment`) as PNG or WebP."""
-    write_atomic(path, still_bytes(film, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
+def save_still(animation: Animation, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
+    """Write instant `at` of `animation` (default: its `moment`) as PNG or WebP."""
+    write_atomic(path, still_bytes(animation, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
     return path
 
 
 def still_bytes(
-    film: Film, kind: Literal["png", "webp"] = "webp", *, at: int | None = None, dpi: int = DPI
+    animation: Animation, kind: Literal["png", "webp"] = "webp", *, at: int | None = None, dpi: int = DPI
 ) -> bytes:
-    """File content of one instant of `film` (default: its `moment`)."""
-    index = min(film.frames - 1, film.moment if at is None else at)
-    (picture,) = frames_in(film, range(index, index + 1), dpi)
+    """File content of one instant of `animation` (default: its `moment`)."""
+    index = min(animation.frames - 1, animation.moment if at is None else at)
+    (picture,) = frames_in(animation, range(index, index + 1), dpi)
     buffer = io.BytesIO()
     if kind == "webp":
         picture.save(buffer, format="webp", quality=QUALITY)
@@ -178,19 +178,19 @@ def still_bytes(
     return buffer.getvalue()
 
 
-def frames_in(film: Film, indices: range, dpi: int) -> Iterator[Image]:
+def frames_in(animation: Animation, indices: range, dpi: int) -> Iterator[Image]:
     """The instants as RGB images."""
     from PIL import Image
 
-    with look():
-        figure = new_figure(*film.size)
+    with picture_style():
+        figure = new_figure(*animation.size)
         figure.set_dpi(dpi)
         figure.set_facecolor(PAPER)
-        turn = film.begin(figure)
+        turn = animation.begin(figure)
         canvas: Any = figure.canvas
         for index in indices:
             turn(index)
-            if not film.draws:
+            if not animation.draws:
                 canvas.draw()
             yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stlc.view.animate import animate, current, film_name, film_of
+from stlc.view.run_animation import animate, animation_name, animation_of, current
 
 WORLD = """
 class Dots:
@@ -41,9 +41,9 @@ def frame_count(path):
 
 
 def test_a_world_draws_its_scene(seen):
-    film = film_of(seen)
-    assert film.frames == 7
-    assert film.dt == pytest.approx(0.1)
+    animation = animation_of(seen)
+    assert animation.frames == 7
+    assert animation.dt == pytest.approx(0.1)
     path = animate(seen).gif
     assert path.name == "traffic.gif"
     assert frame_count(path) == 7
@@ -66,7 +66,7 @@ def test_without_a_world_signals_are_shown(seen, damage, recording):
             (seen.path / "dots.py").write_text(WORLD.replace('scene["x"]', 'scene["y"]'))
         case _:
             (seen.path / "scene.npz").write_bytes(b"nothing")
-    assert film_of(seen).frames == recording.samples
+    assert animation_of(seen).frames == recording.samples
 
 
 STAGED = """
@@ -79,11 +79,11 @@ STAGED = """
 def test_robots_are_drawn_by_their_world_where_there_is_no_pybullet(seen, monkeypatch):
     (seen.path / "dots.py").write_text(WORLD + STAGED)
     monkeypatch.setattr("stlc.view.bullet.available", lambda: False)
-    assert film_of(seen).frames == 7
+    assert animation_of(seen).frames == 7
 
 
 def test_a_run_without_a_deployment_has_no_film(trained):
-    assert film_of(trained) is None
+    assert animation_of(trained) is None
     assert animate(trained) is None
     assert not list(trained.path.glob("*.gif"))
 
@@ -99,4 +99,4 @@ def test_an_animation_is_current_until_there_is_a_newer_recording(seen):
 
 def test_a_hostile_name_stays_in_the_folder(seen):
     seen.update({"spec": "../../etc/passwd"})
-    assert film_name(seen) == "etc-passwd"
+    assert animation_name(seen) == "etc-passwd"
