@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 import torch
 
-from stlc.dynamics.model.memory import keep_freed_memory
+from stlc.controller.training.loop import keep_freed_memory
 
 _SLICE = 0.01
 """Minimum duration of one measurement in seconds."""

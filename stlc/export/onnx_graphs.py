@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
-    from stlc.dynamics.declaration.columns import ControlDecl
+    from stlc.dynamics.schema.names import ControlDecl
 
 
 # --------------------------------------------------------------------------------------------- rollout

@@ -131,12 +131,13 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
     Raises Failed: E203 for another unit, E205 for a value unknown before the trajectory begins.
     """
     here = scope.extended({}, samplers=True)
-    values = [evaluate(expr, here) for _ in columns]
-    first = values[0]
-    if isinstance(first, VectorValue):
-        if len(first.items) != len(columns):
-            message = f"this has {len(first.items)} components, not {len(columns)}"
-            scope.fail(Diagnostic("E205", message, expr.span))
+    first = evaluate(expr, here)
+    if not isinstance(first, VectorValue):
+        values = [first, *(evaluate(expr, here) for _ in columns[1:])]  # one draw for each component
+    elif len(first.items) != len(columns):
+        message = f"this has {len(first.items)} components, not {len(columns)}"
+        scope.fail(Diagnostic("E205", message, expr.span))
+    else:
         values = list(first.items)
     need = Expectation("a parameter is a number")
     numbers = [loose_number(value, expr, need, scope) for value in values]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import sys
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,7 +21,6 @@ from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, load_task, spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
-from stlc.dynamics.model.memory import keep_freed_memory
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -42,6 +44,24 @@ SAVE_EVERY = 500
 """Maximum number of steps between checkpoints."""
 SAVE_SECONDS = 10.0
 """Maximum seconds between checkpoints: the loss from a kill."""
+
+
+@cache
+def keep_freed_memory() -> bool:
+    """Tell the C library not to return freed memory to the operating system; True on success.
+
+    A rollout allocates and frees the same few arrays of some 100 kB in every step. By default glibc returns
+    them, and mapping and clearing their pages again takes as long as the rollout itself. The setting affects
+    the whole process, so programs (`stlc train`) call this, not imports.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return False
+    trim_threshold, mmap_threshold = -1, -3  # of <malloc.h>; 32 MB is the most that glibc accepts
+    return bool(mallopt(mmap_threshold, 32 * 2**20)) and bool(mallopt(trim_threshold, 2**31 - 1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,35 +1,44 @@
-"""The sections `state`, `param` and `control`: columns with units and ranges."""
+"""Sections that declare names: `time`, `const`, `def`, `state`, `param` and `control`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from fractions import Fraction
+from typing import get_args
 
 from stlc.compile.analysis.ranges import usual_range
+from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.declare import MAX_COMPONENTS
-from stlc.compile.frontend.scope import column_entries, member_entries
+from stlc.compile.frontend.scope import Definition, Known, column_entries, constant_value, member_entries
+from stlc.compile.frontend.values import VectorValue
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.declaration.motion import Assign, shared_draws, state_assigns
-from stlc.dynamics.schema.names import Context, Names, base_name, component_names, unit_text
+from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
+from stlc.dynamics.model.algebra import add, multiply
+from stlc.dynamics.model.integrators import INTEGRATORS
+from stlc.dynamics.schema.expressions import SECOND, written
+from stlc.dynamics.schema.names import Context, ControlDecl, Names, Squash, component_names
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.record import (
     EXPRESSION,
     FLAG,
     OF,
+    SECONDS,
+    STEPS,
     VECTOR,
     integer,
     items_of,
     key,
     raw,
     read,
+    reads,
     values_of,
     word,
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
+from stlc.grammar import ast
 from stlc.signature import Column, Role
-from stlc.units import Unit
+from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 
-Squash: TypeAlias = Literal["tanh", "clip", "angle"]
 Ranges = tuple[tuple[float, float], ...]
 
 _RANGE = raw({"type": "array", "prefixItems": [VECTOR, VECTOR], "minItems": 2, "maxItems": 2})
@@ -38,25 +47,29 @@ _ENUM = raw({"type": ["array", "object"]})
 _FORMULA = raw(EXPRESSION)
 
 
+@reads({"type": "string"})
+def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
+    """Read a unit."""
+    text = cx.reader.text(node, "`unit`")
+    try:
+        return None if text is None else parse_unit(text)
+    except ValueError as error:
+        advice = (
+            CELSIUS if means_celsius(text or "") else "a unit is a product of powers, for example `m/s^2`"
+        )
+        cx.reader.report("S103", str(error), node.span, advice)
+        return None
+
+
 @dataclass(frozen=True, slots=True)
-class ControlDecl:
-    """One control input, or one component of a vector of them.
+class Clockwork:
+    """The section `time`; a horizon of 0 means unknown."""
 
-    Attributes:
-        name: as written.
-        unit: of the stored numbers.
-        low: lower end of its range, in `unit`.
-        high: upper end.
-        squash: map from a network output to a value in the range.
-        levels: the values for searches; if empty the range is sampled evenly.
-    """
-
-    name: str
-    unit: Unit
-    low: float
-    high: float
-    squash: Squash = "tanh"
-    levels: tuple[float, ...] = ()
+    dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
+    horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
+    integrator: str = key(word(INTEGRATORS.names), "integration method", "euler")
+    substeps: int = key(integer(high=1000), "integration steps within one step", 1)
+    discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
 
 
 @dataclass(repr=False, eq=False)
@@ -101,19 +114,74 @@ class ControlKeys:
     size: int | None = key(_SIZE, "components of a vector")
 
 
+# ------------------------------------------------------------- time, constants, definitions
+
+
+def read_time(node: Node | None, cx: Context) -> Clockwork:
+    """Read the section `time`; `dt` becomes a name."""
+    if node is None:
+        return Clockwork()
+    first = node.get("dt") if isinstance(node, Mapping) else None
+    silent = replace(cx.here, reader=Reader(cx.reader.source))
+    clock = read(Clockwork, replace(cx, dt=silent.duration(first, "`dt`") or cx.dt), node, "`time`")
+    cx.names.entries["dt"] = Known(constant_value(float(clock.dt), SECOND), "the step")
+    return clock
+
+
+def read_constants(node: Node | None, cx: Context) -> None:
+    """Read the section `const`: numbers and vectors with units; later ones may use earlier ones."""
+    names = cx.names
+    for entry in cx.reader.entries(node, "`const`"):
+        name = entry.key.text
+        if not names.declare(entry.key, "constant", cx.reader):
+            continue
+        where = f"the constant `{name}`"
+        numbers = cx.plain.here.numbers(entry.value, where)
+        if numbers is None:
+            names.entries[name] = Known(constant_value(1.0), "constant")
+            continue
+        vector = len(numbers) > 1 or isinstance(entry.value, Sequence)
+        called = component_names(name, len(numbers) if vector else None)
+        for component, number in zip(called, numbers, strict=True):
+            if number.constant is None:
+                cx.reader.wrong(entry.value, where, "a number that is known now")
+                break
+            known = absolute(number).constant or 0.0
+            names.constants[component] = (known, Unit() if number.bare else number.unit)
+        names.place_components(name, called)
+        value = VectorValue(numbers) if vector else numbers[0]
+        names.entries[name] = Known(value, "constant", entry.key.span)
+
+
+def read_definitions(node: Node | None, cx: Context) -> None:
+    """Read the section `def`: named sub-expressions, numbers or formulas; unused ones are checked too."""
+    parsed: list[ast.Expr] = []
+    for entry in cx.reader.entries(node, "`def`"):
+        name = entry.key.text
+        if not cx.names.declare(entry.key, "definition", cx.reader):
+            continue
+        expr = cx.plain.here.parse(entry.value, f"the definition `{name}`")
+        if expr is not None:
+            parsed.append(expr)
+            cx.names.entries[name] = Definition(name, expr, about="definition", span=entry.key.span)
+    here = cx.plain.here
+    for expr in parsed:
+        here.check(expr)
+
+
 # ---------------------------------------------------------------------------------- states
 
 
-def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, StateKeys]:
+def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
     """Read the section `state`; return the keys of every state."""
+    reader, names = cx.reader, cx.names
     if node is None:
         reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
     described: dict[str, StateKeys] = {}
     for entry in reader.entries(node, "`state`"):
         names.declare(entry.key, "state", reader)
         where = f"the state `{entry.key.text}`"
-        cx = Context.of(reader, names)
-        given = values_of(StateKeys, cx, entry.value, where, OF)
+        given = values_of(StateKeys, cx.plain, entry.value, where, OF)
         keys = described[entry.key.text] = StateKeys(**given)
         if keys.clamp and keys.ends is None:
             message, advice = f"{where} is clamped but has no range", "add `range: [low, high]`"
@@ -122,16 +190,11 @@ def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, St
             message = f"the timer `{entry.key.text}` is a single number"
             reader.report("S103", message, entry.place("size"), "declare one a timer")
         role: Role = "env" if keys.role == "env" else "state"
-        columns = _columns(entry.key.text, keys, where, cx)
-        _add(tuple(replace(each, role=role, fact=each.fact or keys.clamp) for each in columns), names)
+        columns = _columns(entry.key.text, keys, where, cx.plain)
+        names.columns += (replace(each, role=role, fact=each.fact or keys.clamp) for each in columns)
+        names.place_components(entry.key.text, [column.name for column in columns])
     name_columns(names, "state")
     return described
-
-
-def _add(columns: tuple[Column, ...], names: Names) -> None:
-    """Add the columns of one state; the components of a vector have the same source location."""
-    names.columns.extend(columns)
-    names.place_components(base_name(columns[0].name), [column.name for column in columns])
 
 
 def name_columns(names: Names, about: str) -> None:
@@ -147,16 +210,16 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
     if keys.enum is not None:
         labels = _members(keys.enum, where, cx.reader)
         values = [value for _, value in labels] or [0.0]
-        ends = min(values), max(values)
-        return tuple(Column(each, keys.unit, "enum", "state", *ends, labels, fact=True) for each in called)
-    if keys.boolean:
-        return tuple(Column(each, keys.unit, "bool", "state", 0.0, 1.0, (), fact=True) for each in called)
-    bounds = _ranges(keys, where, cx)
-    if bounds is None:
-        return tuple(Column(each, keys.unit) for each in called)
-    return tuple(
-        Column(each, keys.unit, low=low, high=high) for each, (low, high) in zip(called, bounds, strict=True)
-    )
+        shared = Column("", keys.unit, "enum", "state", min(values), max(values), labels, fact=True)
+    elif keys.boolean:
+        shared = Column("", keys.unit, "bool", "state", 0.0, 1.0, (), fact=True)
+    else:
+        bounds = _ranges(keys, where, cx) or ((None, None),) * len(called)
+        return tuple(
+            Column(each, keys.unit, low=low, high=high)
+            for each, (low, high) in zip(called, bounds, strict=True)
+        )
+    return tuple(replace(shared, name=each) for each in called)
 
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
@@ -198,29 +261,70 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
     return tuple(zip(lows, highs, strict=True))
 
 
+# ---------------------------------------------------------------------------------- timers
+
+
+def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
+    """Read the flow and the resets of states with `timer: up | down`, `run`, `reset_when` and `to`."""
+    flows: list[Assign] = []
+    jumps: list[JumpDecl] = []
+    for name, keys in states.items():
+        where = f"the timer `{name}`"
+        if keys.timer is None:
+            for called, node in (("run", keys.run), ("reset_when", keys.reset_when), ("to", keys.to)):
+                if node is not None:
+                    message = f"`{called}` needs `timer: up` or `timer: down` in {where}"
+                    cx.reader.report("S102", message, node.span)
+        elif not cx.names.vector(name):
+            unit = cx.names.group(name)[0].unit
+            flows += _timer_flow(name, keys, unit, cx)
+            guard = cx.here.formula(keys.reset_when, f"`reset_when` of {where}")
+            value = ir.Const(0.0) if keys.to is None else cx.here.stored(keys.to, where, unit)
+            if guard is not None and value is not None:
+                reset = Assign(name, value, written(keys.to))
+                jumps.append(JumpDecl(f"reset {name}", guard, (reset,), text=written(keys.reset_when)))
+    return flows, jumps
+
+
+def _timer_flow(name: str, keys: StateKeys, unit: Unit, cx: Context) -> tuple[Assign, ...]:
+    """Derivative (or next value) of one timer; empty where its condition is invalid."""
+    where = f"the timer `{name}`"
+    direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
+    run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
+    if run is None:
+        return ()
+    speed = ir.Const((1.0 if direction == "up" else -1.0) / unit.scale)
+    rate: ir.Num = speed if run == ir.Truth(True) else ir.Op("mul", (speed, ir.Indicator(run)))
+    if cx.discrete:
+        rate = add(ir.Signal(name), multiply(ir.Const(float(cx.dt)), rate))
+    return (Assign(name, rate, f"timer {direction}"),)
+
+
 # ------------------------------------------------------------------------------ parameters
 
 
-def read_params(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
+def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
     """Read the section `param`: columns after the states, and their distributions, in order.
 
     `r: {unit: m, range: [0.6, 1.2]}` is uniform on its range; `draw` gives another distribution, and may
     stand alone: `r: normal(1 m, 0.1 m)`. Later parameters may read earlier ones.
     """
+    names = cx.names
     found: list[Assign] = []
     drawn: frozenset[str] = frozenset()
-    for entry in reader.entries(node, "`param`"):
-        if not names.declare(entry.key, "parameter", reader):
+    for entry in cx.reader.entries(node, "`param`"):
+        name = entry.key.text
+        if not names.declare(entry.key, "parameter", cx.reader):
             continue
-        cx = Context.of(reader, names).drawing({}, drawn)
-        keys = _param_keys(entry, cx)
-        columns = tuple(
-            replace(column, role="env")
-            for column in _columns(entry.key.text, keys, f"the parameter `{entry.key.text}`", cx)
-        )
-        _add(columns, names)
+        here = cx.drawing({}, drawn)
+        keys = _param_keys(entry, here)
+        columns = [
+            replace(each, role="env") for each in _columns(name, keys, f"the parameter `{name}`", here)
+        ]
+        names.columns += columns
+        names.place_components(name, [column.name for column in columns])
         if keys.draw is not None:
-            assigns = shared_draws(state_assigns(Entry(entry.key, keys.draw), "`param`", cx))
+            assigns = shared_draws(state_assigns(Entry(entry.key, keys.draw), "`param`", here))
         else:
             assigns = tuple(Assign(column.name, *_even(column)) for column in columns)
         found.extend(assigns)
@@ -270,36 +374,29 @@ def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
 # -------------------------------------------------------------------------------- controls
 
 
-def read_controls(node: Node | None, reader: Reader, names: Names) -> None:
+def read_controls(node: Node | None, cx: Context) -> None:
     """Read the section `control`."""
+    reader, names = cx.reader, cx.names
     if node is None:
         advice = "control: {u: {range: [-1, 1]}}"
         reader.report("S102", "the file lacks `control`", reader.source.span(0, 1), advice)
     for entry in reader.entries(node, "`control`"):
         names.declare(entry.key, "control", reader)
         name = entry.key.text
-        where, cx = f"the control `{name}`", Context.of(reader, names)
-        keys = read(ControlKeys, cx, entry.value, where, OF)
+        where, here = f"the control `{name}`", cx.plain
+        keys = read(ControlKeys, here, entry.value, where, OF)
         if keys.ends is None:
             advice = f"{name}: {{range: [-1, 1]}}"
             reader.report("S204", f"{where} has no range", entry.key.span, advice, label="needs bounds")
-        controls = _controls(name, keys, where, cx)
-        names.controls.extend(controls)
-        names.place_components(name, [control.name for control in controls])
+        called = component_names(name, keys.size)
+        bounds = _ranges(keys, where, here) or ((-1.0, 1.0),) * len(called)
+        common = max(low for low, _ in bounds), min(high for _, high in bounds)
+        levels = read_levels(keys.levels, where, keys.unit, common, here)
+        for each, ends in zip(called, bounds, strict=True):
+            names.controls.append(ControlDecl(each, keys.unit, *ends, keys.squash, levels))
+        names.place_components(name, called)
     columns = [Column(c.name, c.unit, "real", "input", c.low, c.high, (), fact=True) for c in names.controls]
     names.entries |= column_entries(columns, about="control")
-
-
-def _controls(name: str, keys: ControlKeys, where: str, cx: Context) -> tuple[ControlDecl, ...]:
-    """One control, or the components of a vector."""
-    called = component_names(name, keys.size)
-    bounds = _ranges(keys, where, cx) or ((-1.0, 1.0),) * len(called)
-    low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
-    kept = read_levels(keys.levels, where, keys.unit, (low, high), cx)
-    return tuple(
-        ControlDecl(each, keys.unit, *ends, keys.squash, kept)
-        for each, ends in zip(called, bounds, strict=True)
-    )
 
 
 def read_levels(

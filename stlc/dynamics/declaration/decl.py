@@ -12,12 +12,12 @@ from pathlib import Path
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
-from stlc.dynamics.declaration.columns import ControlDecl
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import InitDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
+from stlc.dynamics.schema.names import ControlDecl
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.units import Unit

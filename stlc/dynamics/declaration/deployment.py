@@ -83,7 +83,7 @@ class BackupDecl:
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
     """Read the section `backup`, or that of a scenario; prefixes end at the horizon."""
-    backup, horizon = read(BackupDecl, cx, node, label), cx.clock.horizon
+    backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
     if lengths is not None and 0 < horizon < max(backup.lengths):
         cx.reader.report("S103", f"`T0` goes beyond the horizon of {horizon} steps", lengths.span)
@@ -272,7 +272,7 @@ def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
         columns = states_of(entry, label, cx)
         if not columns:
             continue
-        unit = columns[0].unit if cx.clock.discrete else rate_unit(columns[0].unit)
+        unit = columns[0].unit if cx.discrete else rate_unit(columns[0].unit)
         values = here.stored_each(entry.value, f"`{entry.key.text}`", unit, len(columns))
         text = written(entry.value)
         found.extend(Assign(c.name, value, text) for c, value in zip(columns, values or (), strict=False))

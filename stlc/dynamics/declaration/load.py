@@ -5,19 +5,24 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping as MappingType
 from collections.abc import Sequence as SequenceType
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
+    Clockwork,
     ControlKeys,
     ParamKeys,
     StateKeys,
     name_columns,
+    read_constants,
     read_controls,
+    read_definitions,
     read_params,
     read_states,
+    read_time,
+    read_timers,
 )
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import (
@@ -36,20 +41,11 @@ from stlc.dynamics.declaration.motion import (
     read_flow,
     read_jumps,
     read_latches,
-    read_timers,
     shared_draws,
     state_assigns,
 )
 from stlc.dynamics.model.algebra import names_in
-from stlc.dynamics.schema.names import (
-    Clockwork,
-    Context,
-    Names,
-    base_name,
-    read_constants,
-    read_definitions,
-    read_time,
-)
+from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.record import (
     EXPRESSION,
@@ -66,6 +62,7 @@ from stlc.dynamics.schema.record import (
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
 from stlc.files import beside, read_source
 from stlc.registry import closest
+from stlc.signature import Signature
 from stlc.source import Source
 
 VERSION = 1
@@ -133,10 +130,7 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
     """Parse a system file's text; relative paths start from the folder of `path`."""
     reader = Reader(source)
-    root = load_yaml(source, sink=reader.findings)
-    root, bases = extended(root, reader)
-    root = overridden(root, overrides or {}, reader)
-    found = read(SystemKeys, Context.of(reader, Names()), root, "a system file")
+    found, bases = _sections(source, overrides or {}, reader)
     version = reader.integer(found.stlc, "`stlc`")
     if found.stlc is not None and version not in (None, VERSION):
         message, advice = f"schema version {version} is not known", f"this release reads `stlc: {VERSION}`"
@@ -145,20 +139,15 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
         assert found.plugin is not None
         message, label = f"{_PLUGIN} is not supported by this version", "not acted on, so it is refused"
         reader.report("E015", message, first_line(found.plugin.span), label=label)
-    decl = _declaration(found, reader, source, path, overrides or {})
+    decl = _declaration(found, reader, path, overrides or {})
     reader.close()
-    return _with_feedback(replace(decl, bases=bases))
-
-
-def _with_feedback(decl: SystemDecl) -> SystemDecl:
-    """Add the requested feedback to the declaration. Raises SystemFileError (S205)."""
-    asked = decl.policy.feedback
-    if asked is None:
+    decl = replace(decl, bases=bases)
+    if decl.policy.feedback is None:
         return decl
     from stlc.dynamics.model.feedback import NoFeedbackError, closed
 
     try:
-        return closed(decl, asked)
+        return closed(decl, decl.policy.feedback)
     except NoFeedbackError as error:
         advice = "give a `gain`, another point of operation (`around`), or leave `feedback` out"
         finding = Diagnostic(
@@ -167,35 +156,39 @@ def _with_feedback(decl: SystemDecl) -> SystemDecl:
         raise SystemFileError(finding) from None
 
 
+def _sections(
+    source: Source, overrides: MappingType[str, str], reader: Reader
+) -> tuple[SystemKeys, tuple[Source, ...]]:
+    """Sections of a file merged with the files that it extends and with `overrides`; texts of those files."""
+    root, bases = extended(load_yaml(source, sink=reader.findings), reader)
+    root = overridden(root, overrides, reader)
+    return read(SystemKeys, Context.of(reader, Names()), root, "a system file"), bases
+
+
 def _declaration(
-    found: SystemKeys, reader: Reader, source: Source, path: Path, overrides: MappingType[str, str]
+    found: SystemKeys, reader: Reader, path: Path, overrides: MappingType[str, str]
 ) -> SystemDecl:
     """Read all sections, in the order in which names are declared."""
     named = _named(found, reader)
-    names, clock = named.names, named.clock
-    cx = Context.of(reader, names, clock)
+    names, cx = named.cx.names, named.cx
     timer_flow, timer_jumps = read_timers(named.states, cx)
     flow = (*timer_flow, *read_flow(found.flow, cx))
     jumps = (*read_jumps(found.jump, cx), *timer_jumps)
-    _report_idle(found.control, reader, names, flow, jumps)
-    clamped = [each for each in names.columns if each.kind == "real" and each.fact]
+    _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
     folder = path.parent
-    if found.spec is not None and found.spec.span.source != source:
+    if found.spec is not None and found.spec.span.source != reader.source:
         folder = Path(found.spec.span.source.name).parent
+    clamped = [each for each in names.columns if each.kind == "real" and each.fact]
     return SystemDecl(
         name=reader.name(found.name, "`name`") or path.stem,
         doc=" ".join((reader.text(found.doc, "`doc`") or "").split()),
         path=path,
-        source=source,
+        source=reader.source,
         spec=Path(os.path.normpath(folder / spec)) if spec else None,
-        dt=clock.dt,
-        horizon=clock.horizon,
-        substeps=clock.substeps,
-        integrator=clock.integrator,
-        discrete=clock.discrete,
+        **asdict(named.clock),
         constants=MappingProxyType(names.constants),
-        signature=names.signature,
+        signature=Signature(tuple(names.columns)),
         controls=tuple(names.controls),
         flow=flow,
         jumps=jumps,
@@ -217,19 +210,19 @@ def _declaration(
 
 
 def _report_idle(
-    node: Node | None, reader: Reader, names: Names, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
+    node: Node | None, cx: Context, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
 ) -> None:
     """Report W603 for controls that have no effect."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
-    read = {name for num in moved for name in names_in(num)}
-    read |= {name for jump in jumps for name in names_in(jump.guard)}
-    known = {entry.key.text: entry.key.span for entry in reader.entries(node, "`control`")}
-    for control in names.controls:
-        span = known.get(control.name) or known.get(base_name(control.name))
-        if control.name not in read and span is not None:
+    used = {name for num in (*moved, *(jump.guard for jump in jumps)) for name in names_in(num)}
+    known = {entry.key.text: entry.key.span for entry in cx.reader.entries(node, "`control`")}
+    for control in cx.names.controls:
+        base = base_name(control.name)
+        span = known.get(control.name) or known.get(base)
+        if control.name not in used and span is not None:
             message = f"the control `{control.name}` has no effect: no flow and no jump reads it"
-            advice = f"`{base_name(control.name)}: ~` takes one away that an extended file has"
-            reader.report("W603", message, span, advice)
+            advice = f"`{base}: ~` takes one away that an extended file has"
+            cx.reader.report("W603", message, span, advice)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,14 +230,14 @@ class _Named:
     """Contents of the sections that declare names.
 
     Attributes:
-        names: all declared names.
-        clock: time step and horizon.
+        cx: context that knows all declared names, and the time step.
+        clock: the section `time`.
         states: keys of each state, timers among them.
         drawn: parameters and latches, drawn before the states.
         functions: external functions.
     """
 
-    names: Names
+    cx: Context
     clock: Clockwork
     states: dict[str, StateKeys]
     drawn: tuple[Assign, ...]
@@ -253,24 +246,24 @@ class _Named:
 
 def _named(found: SystemKeys, reader: Reader) -> _Named:
     """Read the sections that declare names, in order."""
-    names = Names()
-    read_constants(found.const, reader, names)
-    clock = Clockwork() if found.time is None else read_time(found.time, reader, names)
-    states = read_states(found.state, reader, names)
-    drawn = read_params(found.param, reader, names) + read_latches(found.jump, reader, names)
-    name_columns(names, "state")
-    read_controls(found.control, reader, names)
-    functions = read_functions(found.functions, Context.of(reader, names))
-    read_definitions(found.def_, reader, names)
-    return _Named(names, clock, states, drawn, functions)
+    cx = Context.of(reader, Names())
+    read_constants(found.const, cx)
+    clock = read_time(found.time, cx.plain)
+    cx = replace(cx, dt=clock.dt, horizon=clock.horizon, discrete=clock.discrete)
+    states = read_states(found.state, cx)
+    drawn = read_params(found.param, cx) + read_latches(found.jump, cx)
+    name_columns(cx.names, "state")
+    read_controls(found.control, cx)
+    functions = read_functions(found.functions, cx.plain)
+    read_definitions(found.def_, cx)
+    return _Named(cx.plain, clock, states, drawn, functions)
 
 
 @dataclass(frozen=True, slots=True)
 class MovingParts:
-    """Names, time, and the sections `flow` and `jump` of a valid declaration."""
+    """Context, and the sections `flow` and `jump`, of a valid declaration."""
 
-    names: Names
-    clock: Clockwork
+    cx: Context
     flow: Node | None
     jump: Node | None
 
@@ -278,11 +271,8 @@ class MovingParts:
 def moving_parts(decl: SystemDecl) -> MovingParts:
     """Parts of a file that determine the motion of its states."""
     reader = Reader(decl.source)
-    root, _ = extended(load_yaml(decl.source, sink=reader.findings), reader)
-    root = overridden(root, decl.overrides, reader)
-    found = read(SystemKeys, Context.of(reader, Names()), root, "a system file")
-    named = _named(found, reader)
-    return MovingParts(named.names, named.clock, found.flow, found.jump)
+    found, _ = _sections(decl.source, decl.overrides, reader)
+    return MovingParts(_named(found, reader).cx, found.flow, found.jump)
 
 
 def _empty(node: Node | None) -> bool:
@@ -335,29 +325,17 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
     return merged, tuple(sources)
 
 
-def _merged(base: Mapping, own: Mapping) -> Mapping:
-    """Merge one document over another, section by section and entry by entry."""
+def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
+    """Merge one document over another, entry by entry; with `sections` also the mappings within."""
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
-        if _removes(entry, base):
-            result = result.without(entry.key.text)
+        key, value, old = entry.key, entry.value, base.get(entry.key.text)
+        if old is not None and isinstance(value, Scalar) and value.is_null:
+            result = result.without(key.text)
+        elif sections and isinstance(old, Mapping) and isinstance(value, Mapping):
+            result = result.replaced(key, _merged(old, value, sections=False))
         else:
-            result = result.replaced(entry.key, _section(base.get(entry.key.text), entry.value))
-    return result
-
-
-def _removes(entry: Entry, base: Mapping) -> bool:
-    """True if an entry removes one of the extended file: `brake: ~`."""
-    return isinstance(entry.value, Scalar) and entry.value.is_null and base.get(entry.key.text) is not None
-
-
-def _section(base: Node | None, own: Node) -> Node:
-    if not isinstance(base, Mapping) or not isinstance(own, Mapping):
-        return own
-    result = Mapping(own.span, base.entries, base.size)
-    for entry in own.entries:
-        removed = _removes(entry, base)
-        result = result.without(entry.key.text) if removed else result.replaced(entry.key, entry.value)
+            result = result.replaced(key, value)
     return result
 
 

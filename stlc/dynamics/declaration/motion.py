@@ -6,14 +6,13 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import sampler_names
-from stlc.dynamics.model.algebra import add, map_parts, multiply
+from stlc.dynamics.model.algebra import map_parts
 from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context, Names, base_name
-from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.names import Context
+from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import (
     FLAG,
     FORMULA,
@@ -28,11 +27,9 @@ from stlc.dynamics.schema.record import (
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, as_bool
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.registry import closest
 from stlc.signature import Column
 from stlc.units import Unit
-
-if TYPE_CHECKING:
-    from stlc.dynamics.declaration.columns import StateKeys
 
 _SAMPLERS = frozenset(sampler_names())
 
@@ -121,8 +118,8 @@ def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
     columns = cx.names.group(name)
     if columns:
         return columns
-    states = list(dict.fromkeys(base_name(column.name) for column in cx.names.columns))
-    near = cx.reader.near(name, states)
+    states = cx.names.states
+    near = closest(name, states)
     guess = f"did you mean `{near}`?" if near else f"states: {', '.join(states)}"
     cx.reader.report("S202", f"{where} sets `{name}`, which is not a state", entry.key.span, guess)
     return ()
@@ -144,12 +141,12 @@ def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
         if not columns:
             continue
         first = columns[0]
-        if first.kind != "real" and not cx.clock.discrete:
+        if first.kind != "real" and not cx.discrete:
             kind = "true or false" if first.kind == "bool" else "an enum"
             message = f"`flow` sets `{entry.key.text}`, which is {kind}"
             cx.reader.report("S203", message, entry.key.span, "change it with a jump or an event")
             continue
-        if cx.clock.discrete:
+        if cx.discrete:
             where, unit = f"the next `{entry.key.text}`", first.unit
         else:
             where, unit = f"the derivative of `{entry.key.text}`", rate_unit(first.unit)
@@ -195,7 +192,7 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
     return tuple(found)
 
 
-def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
+def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
     """Add a state for every jump with `once` that records whether it has happened; initially false."""
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
@@ -205,11 +202,11 @@ def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assig
         written_name = item.get("name")
         name = written_name.text if isinstance(written_name, Scalar) else f"jump {index + 1}"
         latch = latch_name(name)
-        if names.group(latch) or latch in names.places:
-            reader.report("E102", f"`{latch}` remembers the jump `{name}`, and is declared", once.span)
+        if cx.names.group(latch) or latch in cx.names.places:
+            cx.reader.report("E102", f"`{latch}` remembers the jump `{name}`, and is declared", once.span)
             continue
-        names.places[latch] = once.span
-        names.columns.append(Column(latch, Unit(), "bool", "state", 0.0, 1.0, (), fact=True))
+        cx.names.places[latch] = once.span
+        cx.names.columns.append(Column(latch, Unit(), "bool", "state", 0.0, 1.0, (), fact=True))
         found.append(Assign(latch, ir.Const(0.0), "false"))
     return tuple(found)
 
@@ -217,49 +214,6 @@ def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assig
 def latch_name(jump: str) -> str:
     """Name of the state that records whether a jump has happened."""
     return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
-
-
-# ---------------------------------------------------------------------------------- timers
-
-
-def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-    """Read states written as `timer: up | down` with `run`, `reset_when` and `to`."""
-    flows: list[Assign] = []
-    jumps: list[JumpDecl] = []
-    for name, keys in states.items():
-        column = cx.names.group(name)[0]
-        where = f"the timer `{name}`"
-        if keys.timer is None:
-            for called, node in (("run", keys.run), ("reset_when", keys.reset_when), ("to", keys.to)):
-                if node is not None:
-                    message = f"`{called}` needs `timer: up` or `timer: down` in {where}"
-                    cx.reader.report("S102", message, node.span)
-            continue
-        if not cx.names.vector(name):
-            flow, jump = _timer(column, keys, where, cx)
-            flows += flow
-            jumps += jump
-    return tuple(flows), tuple(jumps)
-
-
-def _timer(column: Column, keys: StateKeys, where: str, cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
-    """Flow and resets of one timer."""
-    assert keys.timer is not None
-    direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
-    run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
-    flows: list[Assign] = []
-    if run is not None:
-        speed = ir.Const((1.0 if direction == "up" else -1.0) / column.unit.scale)
-        rate: ir.Num = speed if run == ir.Truth(True) else ir.Op("mul", (speed, ir.Indicator(run)))
-        if cx.clock.discrete:
-            rate = add(ir.Signal(column.name), multiply(ir.Const(float(cx.clock.dt)), rate))
-        flows.append(Assign(column.name, rate, f"timer {direction}"))
-    guard = cx.here.formula(keys.reset_when, f"`reset_when` of {where}")
-    value = ir.Const(0.0) if keys.to is None else cx.here.stored(keys.to, where, column.unit)
-    if guard is None or value is None:
-        return flows, []
-    reset = Assign(column.name, value, written(keys.to))
-    return flows, [JumpDecl(f"reset {column.name}", guard, (reset,), text=written(keys.reset_when))]
 
 
 # ------------------------------------------------------------------------- shared samplers

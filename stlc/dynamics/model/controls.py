@@ -7,7 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from stlc.dynamics.declaration.columns import ControlDecl
+from stlc.dynamics.schema.names import ControlDecl
 
 EPS = 1e-6
 """Offset that keeps the gradient of an angle finite where both components are 0."""

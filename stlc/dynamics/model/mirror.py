@@ -18,8 +18,8 @@ from stlc.compile.semantics.switch import Hard
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from stlc.dynamics.declaration.columns import ControlDecl
     from stlc.dynamics.declaration.motion import Assign
+    from stlc.dynamics.schema.names import ControlDecl
 
 HARD = Hard()
 

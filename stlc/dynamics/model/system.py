@@ -18,7 +18,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.declaration.columns import ControlDecl
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.describe import describe
 from stlc.dynamics.declaration.learning import START
@@ -33,6 +32,7 @@ from stlc.dynamics.model.rollout import Columns, Stepper
 from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
+from stlc.dynamics.schema.names import ControlDecl
 from stlc.files import find_system
 
 HARD = Hard()

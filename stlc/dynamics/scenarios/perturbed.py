@@ -8,8 +8,8 @@ these numbers, and constants that a condition also reads, are exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from stlc.compile.frontend.scope import Definition, Entry, Known
@@ -20,10 +20,8 @@ from stlc.dynamics.declaration.load import moving_parts
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
 from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.expressions import Expressions
-from stlc.dynamics.schema.names import Context, Names, base_name
+from stlc.dynamics.schema.names import Names, base_name
 from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.yaml_nodes import Node
 from stlc.grammar import ast
 from stlc.grammar.traverse import children, descendants
 from stlc.units import SYMBOLS
@@ -63,19 +61,21 @@ class Perturbable:
 def perturbable(decl: SystemDecl) -> Perturbable:
     """Dynamics of a declaration with a factor at every uncertain number."""
     parts = moving_parts(decl)
-    names = parts.names
+    names = parts.cx.names
     used, listed = _UsedNumbers(names), decl.test.uncertain
 
     def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-        cx = Context.of(Reader(decl.source), rewriting, parts.clock)  # its findings are dropped
+        cx = replace(parts.cx, reader=Reader(decl.source), names=rewriting).plain  # its findings are dropped
         return read_flow(parts.flow, cx), read_jumps(parts.jump, cx)
 
-    read(_RewritingNames.of(names, used.look))
+    read(replace(names, rewrite=used.record))
     chosen = used.computed_with - used.compared if listed is None else frozenset(listed)
     texts = {_factor(name): name for name in sorted(chosen)}
     if listed is None:
         texts |= {_place(each): each.span.text for each in used.literals.values()}
-    rewriting = _RewritingNames.of(names, used.rewritten if listed is None else _as_it_is)
+    rewriting = replace(
+        names, entries=dict(names.entries), rewrite=used.rewritten if listed is None else None
+    )
     for name in chosen:
         rewriting.entries[name] = _times(names.entries[name], ir.Signal(_factor(name)))
     for factor in texts:
@@ -146,36 +146,27 @@ def _scaled(number: Number, factor: ir.Num) -> Number:
 
 # -------------------------------------------------------------------- rewriting of expressions
 
-Rewrite = Callable[[ast.Expr], ast.Expr]
+_COMPUTED: Mapping[type[ast.Node], tuple[str, ...]] = {
+    ast.Neg: ("operand",),
+    ast.Vector: ("items",),
+    ast.Binary: ("left", "right"),
+    ast.Index: ("base",),
+    ast.IfThenElse: ("yes", "no"),
+    ast.Call: ("args",),
+    ast.Arg: ("value",),
+}
+"""Class of an expression -> the fields whose numbers it computes with; those in other fields are exact."""
 
 
-def _as_it_is(expr: ast.Expr) -> ast.Expr:
-    return expr
-
-
-@dataclass
-class _RewritingNames(Names):
-    """Names whose expressions are rewritten before they are resolved."""
-
-    rewrite: Rewrite = field(default=_as_it_is)
-
-    @classmethod
-    def of(cls, names: Names, rewrite: Rewrite) -> _RewritingNames:
-        return cls(names.constants, names.columns, names.controls, dict(names.entries), names.places, rewrite)
-
-    def expressions(self, reader: Reader) -> Expressions:
-        """Compiler of expressions in which the perturbed names are replaced."""
-        return _RewritingExpressions(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
-
-
-@dataclass(frozen=True, slots=True)
-class _RewritingExpressions(Expressions):
-    rewrite: Rewrite = field(default=_as_it_is)
-
-    def parse(self, node: Node | None, where: str) -> ast.Expr | None:
-        """The syntax tree of a field, rewritten."""
-        expr = Expressions.parse(self, node, where)
-        return None if expr is None else self.rewrite(expr)
+def _computed(node: ast.Node) -> tuple[str, ...]:
+    """Fields whose numbers an expression computes with."""
+    match node:
+        case ast.Binary(op="%" | "^"):
+            return ("left",)
+        case ast.Call(func=ast.Name(name="ind")) | ast.Arg(name=str()):
+            return ()
+        case _:
+            return _COMPUTED.get(type(node), ())
 
 
 class _UsedNumbers:
@@ -188,74 +179,50 @@ class _UsedNumbers:
         self.compared: set[str] = set()
         self.literals: dict[str, ast.Quantity] = {}
 
-    def look(self, expr: ast.Expr) -> ast.Expr:
-        """Record an expression and return it unchanged."""
+    def record(self, expr: ast.Expr) -> ast.Expr:
+        """Record the numbers of an expression and return it unchanged."""
         self.rewritten(expr)
         return expr
 
-    def rewritten(self, expr: ast.Expr, *, called: bool = False) -> ast.Expr:
-        """Add a factor to each number that an expression computes with; definitions are expanded."""
-        match expr:
+    def rewritten(self, node: Any, *, called: bool = False) -> Any:
+        """Add a factor to each number that an expression computes with; definitions are expanded.
+
+        Args:
+            node: an expression, or an argument of a call.
+            called: whether it is within a call, where literals are exact.
+        """
+        match node:
             case ast.Quantity(span=span, value=value):
-                if called or not value or _is_point(expr):
-                    return expr
-                self.literals[_place(expr)] = expr
-                return ast.Binary(span, "*", expr, ast.Name(span, _place(expr)))
+                if called or not value or _is_point(node):
+                    return node
+                self.literals[_place(node)] = node
+                return ast.Binary(span, "*", node, ast.Name(span, _place(node)))
             case ast.Name(name=name):
                 found = self.names.entries.get(name)
                 if isinstance(found, Definition):
                     return self.rewritten(found.body, called=called)
                 self.computed_with |= {name} & self.constants
-                return expr
-        inside, changed = called or isinstance(expr, ast.Call), {}
-        for part, computes in _parts(expr):
-            if computes:
-                changed[id(part)] = self.rewritten(part, called=inside)
-            else:
+                return node
+        inside, done, changed = called or isinstance(node, ast.Call), set(), {}
+        for field in _computed(node):
+            value = getattr(node, field)
+            parts = value if isinstance(value, tuple) else (value,)
+            done |= set(map(id, parts))
+            again = tuple(self.rewritten(part, called=inside) for part in parts)
+            changed[field] = again if isinstance(value, tuple) else again[0]
+        for part in children(node):
+            if id(part) not in done:
                 self._compare(part)
-        return _with_parts(expr, changed)
+        return replace(node, **changed)
 
     def _compare(self, part: ast.Node) -> None:
+        """Record the constants that a condition, an exponent or an index reads."""
         for node in descendants(part):
             if isinstance(node, ast.Name):
                 found = self.names.entries.get(node.name)
                 self.compared |= {node.name} & self.constants
                 if isinstance(found, Definition):
                     self._compare(found.body)
-
-
-def _parts(expr: ast.Expr) -> Iterator[tuple[Any, bool]]:
-    """Parts of an expression, and whether it computes with them."""
-    match expr:
-        case ast.Neg(operand=operand):
-            yield operand, True
-        case ast.Vector(items=items):
-            yield from ((item, True) for item in items)
-        case ast.Binary(left=left, right=right, op=op):
-            yield from ((left, True), (right, op in "+-*/"))
-        case ast.Index(base=base, index=index):
-            yield from ((base, True), (index, False))
-        case ast.IfThenElse(cond=cond, yes=yes, no=no):
-            yield from ((cond, False), (yes, True), (no, True))
-        case ast.Call(func=ast.Name(name=name), args=args):
-            yield from ((arg.value, name != "ind" and arg.name is None) for arg in args)
-        case _:
-            yield from ((child, False) for child in children(expr))
-
-
-def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
-    """Expression with some of its parts replaced."""
-
-    def put(value: Any) -> Any:
-        match value:
-            case tuple():
-                return tuple(map(put, value))
-            case ast.Arg():
-                return replace(value, value=put(value.value))
-            case _:
-                return changed.get(id(value), value)
-
-    return replace(expr, **{each.name: put(getattr(expr, each.name)) for each in fields(expr)})
 
 
 # -------------------------------------------------------------------------- the perturbed system

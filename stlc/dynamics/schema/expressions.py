@@ -29,7 +29,7 @@ from stlc.grammar.parse.parser import parse_expr
 from stlc.source import Span
 from stlc.units import Unit, parse_unit, same_dims
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", bound="Number | tuple[Number, ...] | ir.Formula")
 SECOND = parse_unit("s")
 MAX_STEPS = 100_000
 _ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
@@ -48,20 +48,21 @@ class Expressions:
         reader: where findings go.
         scope: meaning of names.
         ready: columns that have a value here; None for all.
-        amounts: whether numbers are increments of columns: differences, where those are points of a scale.
+        amounts: whether numbers are increments of columns; of a temperature in degC, a difference.
+        rewrite: change of every parsed expression before it is resolved; None leaves it as written.
     """
 
     reader: Reader
     scope: Scope
     ready: frozenset[str] | None = None
     amounts: bool = False
+    rewrite: Callable[[ast.Expr], ast.Expr] | None = None
 
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
         """The compiler with additional names."""
-        scope = self.scope.extended(entries, samplers=samplers)
-        return Expressions(self.reader, scope, ready, self.amounts)
+        return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 
     # ------------------------------------------------------------------ parsing
 
@@ -80,36 +81,29 @@ class Expressions:
             return None
         attribute = _ATTRIBUTE.search(span.text)
         if attribute:
-            self._attribute(span, attribute)
+            start = span.start
+            self.reader.add(
+                Diagnostic(
+                    "S201",
+                    "attributes and their calls are not part of the expression language",
+                    Span(span.source, start + attribute.start(1), start + attribute.end(1)),
+                    note=("expressions are parsed, never evaluated as Python",),
+                )
+            )
             return None
         try:
-            return parse_expr(span.source, span.start, span.end)
+            expr = parse_expr(span.source, span.start, span.end)
         except StlcError as error:
             self.reader.add(*(replace(finding, code="S201") for finding in error.diagnostics))
             return None
-
-    def _attribute(self, span: Span, found: re.Match[str]) -> None:
-        """Report an attribute access, which the language does not have."""
-        place = Span(span.source, span.start + found.start(1), span.start + found.end(1))
-        finding = Diagnostic(
-            "S201",
-            "attributes and their calls are not part of the expression language",
-            place,
-            note=("expressions are parsed, never evaluated as Python",),
-        )
-        self.reader.add(finding)
+        return expr if self.rewrite is None else self.rewrite(expr)
 
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
         """Number of a field, in SI units from the zero of its unit."""
         expr = self.parse(node, where)
-        if expr is None:
-            return None
-        number = self._typed(resolve_number, expr)
-        if number is not None and not self._known(names_in(number.num), expr.span):
-            return None
-        return number
+        return None if expr is None else self._typed(resolve_number, expr)
 
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
         """Components of a field, as from `number`: one expression, or a list of them."""
@@ -118,11 +112,7 @@ class Expressions:
             found = tuple(number for number in each if number is not None)
             return found if found and len(found) == len(each) else None
         expr = self.parse(node, where)
-        if expr is None:
-            return None
-        numbers = self._typed(resolve_numbers, expr)
-        read = frozenset().union(*(names_in(number.num) for number in numbers or ()))
-        return numbers if self._known(read, expr.span) else None
+        return None if expr is None else self._typed(resolve_numbers, expr)
 
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
         """State formula of a field."""
@@ -131,10 +121,7 @@ class Expressions:
 
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
         """State formula of an expression."""
-        formula = self._typed(resolve_state_formula, expr)
-        if formula is not None and not self._known(names_in(formula), expr.span):
-            return None
-        return formula
+        return self._typed(resolve_state_formula, expr)
 
     def check(self, expr: ast.Expr) -> None:
         """Report errors in an expression of any sort."""
@@ -158,27 +145,25 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """Result of a resolver of the compiler; None with its findings reported."""
+        """Result of a resolver of the compiler; None with its findings, or S202 for columns without value."""
         sink: list[Diagnostic] = []
         try:
-            return resolve(expr, replace(self.scope, sink=sink))
+            found = resolve(expr, replace(self.scope, sink=sink))
         except StlcError as error:
             sink.extend(finding for finding in error.diagnostics if finding not in sink)
             return None
         finally:
             self._report(sink)
+        early = sorted(_columns(found) - self.ready) if self.ready is not None else []
+        if early:
+            listed = ", ".join(f"`{name}`" for name in early)
+            self.reader.report("S202", f"{listed} has no value yet", expr.span, "draw it on an earlier line")
+            return None
+        return found
 
     def _report(self, findings: Sequence[Diagnostic]) -> None:
         """Report findings of the compiler under the codes of system files."""
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
-
-    def _known(self, names: frozenset[str], span: Span) -> bool:
-        """True if all columns have a value here."""
-        early = sorted(names - self.ready) if self.ready is not None else []
-        if early:
-            listed = ", ".join(f"`{name}`" for name in early)
-            self.reader.report("S202", f"{listed} has no value yet", span, "draw it on an earlier line")
-        return not early
 
     # --------------------------------------------------------------------- values
 
@@ -219,7 +204,9 @@ class Expressions:
             if unit.offset and number.sense == "difference":
                 self._report((difference_for_point(number, unit, place),))
                 return None
-            return in_stored_unit(number, unit)
+            return (
+                number.num if number.bare else stored(number, unit)
+            )  # a bare number is in the column's unit
         message = f"{where} is in [{unit}], this is in [{number.unit}]"
         self.reader.report("E203", message, first_line(node.span), label=f"[{number.unit}]")
         return None
@@ -303,9 +290,11 @@ class Expressions:
         return number.flexible or number.bare or not unit.text or same_dims(number.unit, unit)
 
 
-def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
-    """Number converted from SI to the unit of a column; a bare number is in that unit already."""
-    return number.num if number.bare else stored(number, unit)
+def _columns(found: Number | tuple[Number, ...] | ir.Formula) -> frozenset[str]:
+    """Columns that a number, several numbers or a formula read."""
+    if isinstance(found, tuple):
+        return frozenset().union(*map(_columns, found))
+    return names_in(found.num if isinstance(found, Number) else found)
 
 
 def written(node: Node | None) -> str:

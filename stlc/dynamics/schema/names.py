@@ -1,45 +1,51 @@
-"""Names of a system file: time, constants, states, controls and definitions."""
+"""Declared names of a system file, and the context in which its values are read."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import Literal, TypeAlias
 
-from stlc.compile.frontend.arithmetic import absolute
-from stlc.compile.frontend.scope import Definition, Entry, Known, Scope, constant_value, enforced
-from stlc.compile.frontend.values import Number, VectorValue
+from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
+from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Label, SystemFileError
-from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.schema.expressions import SECOND, Expressions
 from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.record import FLAG, SECONDS, STEPS, integer, key, read, reads, word
-from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence
+from stlc.dynamics.schema.yaml_nodes import Scalar
 from stlc.grammar import ast
-from stlc.signature import Column, Signature
+from stlc.signature import Column
 from stlc.source import Span
-from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
+from stlc.units import Unit
 
-if TYPE_CHECKING:
-    from stlc.dynamics.declaration.columns import ControlDecl
+Squash: TypeAlias = Literal["tanh", "clip", "angle"]
 
 
 @dataclass(frozen=True, slots=True)
-class Clockwork:
-    """The section `time`; a horizon of 0 means unknown."""
+class ControlDecl:
+    """One control input, or one component of a vector of them.
 
-    dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
-    horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
-    integrator: str = key(word(INTEGRATORS.names), "integration method", "euler")
-    substeps: int = key(integer(high=1000), "integration steps within one step", 1)
-    discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
+    Attributes:
+        name: as written.
+        unit: of the stored numbers.
+        low: lower end of the range, in `unit`.
+        high: upper end of the range.
+        squash: map from a network output to a value in the range.
+        levels: values for searches; if empty, the range is sampled evenly.
+    """
+
+    name: str
+    unit: Unit
+    low: float
+    high: float
+    squash: Squash = "tanh"
+    levels: tuple[float, ...] = ()
 
 
 def base_name(column: str) -> str:
-    """Name of the vector that a column is a component of; else its own name."""
+    """Name of the vector that a column is a component of; for other columns their own name."""
     return column.partition("[")[0]
 
 
@@ -58,6 +64,7 @@ class Names:
         controls: the inputs, in order.
         entries: all names for expressions.
         places: name -> where it is declared.
+        rewrite: change of every parsed expression before it is resolved; None leaves it as written.
     """
 
     constants: dict[str, tuple[float, Unit]] = field(default_factory=dict)
@@ -65,17 +72,12 @@ class Names:
     controls: list[ControlDecl] = field(default_factory=list)
     entries: dict[str, Entry] = field(default_factory=dict)
     places: dict[str, Span] = field(default_factory=dict)
-
-    @property
-    def signature(self) -> Signature:
-        """The state columns."""
-        return Signature(tuple(self.columns))
+    rewrite: Callable[[ast.Expr], ast.Expr] | None = None
 
     def expressions(self, reader: Reader) -> Expressions:
         """Compiler of expressions that knows all declared names."""
-        return Expressions(
-            reader, Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
-        )
+        scope = Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
+        return Expressions(reader, scope, rewrite=self.rewrite)
 
     def group(self, name: str) -> tuple[Column, ...]:
         """Columns of a state: one, or the components of a vector; empty for other names."""
@@ -125,23 +127,27 @@ class Context:
     Attributes:
         reader: collects findings.
         names: all declared names.
-        clock: the time step and horizon.
-        here: compiler of this section's expressions.
+        here: compiler of the section's expressions.
+        dt: time step, s.
+        horizon: planning horizon in steps; 0 where it is unknown.
+        discrete: whether `flow` holds next values instead of derivatives.
     """
 
     reader: Reader
     names: Names
-    clock: Clockwork
     here: Expressions
+    dt: Fraction = Fraction(1, 10)
+    horizon: int = 0
+    discrete: bool = False
 
     @staticmethod
-    def of(reader: Reader, names: Names, clock: Clockwork | None = None) -> Context:
+    def of(reader: Reader, names: Names) -> Context:
         """Context of a section whose expressions read all names and draw nothing."""
-        return Context(reader, names, clock or Clockwork(), names.expressions(reader))
+        return Context(reader, names, names.expressions(reader))
 
     @property
     def plain(self) -> Context:
-        """The context without the names that `here` adds."""
+        """The context with the names declared by now, and no others."""
         return replace(self, here=self.names.expressions(self.reader))
 
     @property
@@ -157,68 +163,3 @@ class Context:
     def amounts(self) -> Context:
         """The context where numbers are increments of columns."""
         return replace(self, here=replace(self.here, amounts=True))
-
-
-def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
-    """Read the section `time`; `dt` becomes a name."""
-    first = node.get("dt") if isinstance(node, Mapping) else None
-    scratch = Expressions(Reader(reader.source), names.expressions(reader).scope)
-    dt = scratch.duration(first, "`dt`") or Clockwork().dt
-    clock = read(Clockwork, Context.of(reader, names, Clockwork(dt)), node, "`time`")
-    names.entries["dt"] = Known(constant_value(float(clock.dt), SECOND), "the step")
-    return clock
-
-
-def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
-    """Read the section `const`: numbers and vectors with units; later ones may use earlier ones."""
-    for entry in reader.entries(node, "`const`"):
-        name = entry.key.text
-        if not names.declare(entry.key, "constant", reader):
-            continue
-        where = f"the constant `{name}`"
-        numbers = names.expressions(reader).numbers(entry.value, where)
-        if numbers is None:
-            names.entries[name] = Known(constant_value(1.0), "constant")
-            continue
-        vector = len(numbers) > 1 or isinstance(entry.value, Sequence)
-        called = component_names(name, len(numbers) if vector else None)
-        for component, number in zip(called, numbers, strict=True):
-            if number.constant is None:
-                reader.wrong(entry.value, where, "a number that is known now")
-                break
-            known = absolute(number).constant or 0.0
-            names.constants[component] = (known, Unit() if number.bare else number.unit)
-        names.place_components(name, called)
-        value = VectorValue(numbers) if vector else numbers[0]
-        names.entries[name] = Known(value, "constant", entry.key.span)
-
-
-@reads({"type": "string"})
-def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
-    """Read a unit."""
-    text = cx.reader.text(node, "`unit`")
-    try:
-        return None if text is None else parse_unit(text)
-    except ValueError as error:
-        advice = (
-            CELSIUS if means_celsius(text or "") else "a unit is a product of powers, for example `m/s^2`"
-        )
-        cx.reader.report("S103", str(error), node.span, advice)
-        return None
-
-
-def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
-    """Read the section `def`: named sub-expressions, numbers or formulas; unused ones are checked too."""
-    written: list[ast.Expr] = []
-    for entry in reader.entries(node, "`def`"):
-        if not names.declare(entry.key, "definition", reader):
-            continue
-        expr = names.expressions(reader).parse(entry.value, f"the definition `{entry.key.text}`")
-        if expr is not None:
-            written.append(expr)
-            names.entries[entry.key.text] = Definition(
-                entry.key.text, expr, about="definition", span=entry.key.span
-            )
-    here = names.expressions(reader)
-    for expr in written:
-        here.check(expr)

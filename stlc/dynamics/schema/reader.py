@@ -88,11 +88,6 @@ class Reader:
             f"{guess}keys of {where}: {', '.join(known)}",
         )
 
-    @staticmethod
-    def near(name: str, candidates: Iterable[str]) -> str | None:
-        """Candidate that `name` is probably a misspelling of."""
-        return closest(name, candidates)
-
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
         """Items of a sequence."""
         if node is None or (isinstance(node, Scalar) and node.is_null):

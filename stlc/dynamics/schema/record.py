@@ -145,7 +145,7 @@ NAME = Kind(
 FLAG = Kind(lambda cx, node, label: cx.reader.flag(node, label), {"type": "boolean"})
 SECONDS = Kind(lambda cx, node, label: cx.here.duration(node, label), EXPRESSION)
 """A positive time, as a fraction of seconds."""
-STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.clock.dt), EXPRESSION)
+STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.dt), EXPRESSION)
 """A positive number of steps, given as a number or as a time."""
 FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 

@@ -10,7 +10,7 @@ import pytest
 CODE = """
 import resource
 import torch
-from stlc.dynamics.model.memory import keep_freed_memory
+from stlc.controller.training.loop import keep_freed_memory
 
 torch.set_num_threads(1)
 assert keep_freed_memory() and keep_freed_memory()
