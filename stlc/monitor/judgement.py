@@ -10,14 +10,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.pipeline import CompiledRequirement
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.prepared import Prepared
+from stlc.monitor.signals import Gap, Signals
+from stlc.monitor.values import Record
 from stlc.registry import closest
 
 Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """Signals laid out for the evaluation of requirements.
+
+    Attributes:
+        compiled: the specification, compiled for the time step of the signals.
+        rules: the requirements to evaluate.
+        signals: source of the columns.
+        record: the columns, and their array library.
+    """
+
+    compiled: Compiled
+    rules: tuple[CompiledRequirement, ...]
+    signals: Signals
+    record: Record
+
+    @property
+    def horizon(self) -> int | None:
+        """Value of `T` in steps; None where unknown."""
+        return self.compiled.grid.horizon
+
+    @property
+    def dt(self) -> float | None:
+        """Time step in seconds; None where unknown."""
+        return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
+
+    @property
+    def gaps(self) -> dict[str, Gap]:
+        """Gaps in the needed signals."""
+        return self.signals.gaps
+
+    def time(self, sample: int) -> float:
+        """Time of a sample in seconds; its number where the time step is unknown."""
+        return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
+
+    def moment(self, sample: int) -> str:
+        """Time of a sample in words: `t = 4.6 s`."""
+        return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +288,11 @@ class Verdict:
         return self.statuses.count("satisfied")
 
 
+def beside(moment: str, start: str) -> str:
+    """Return an instant and, where it differs, the start of its window: `t = 4.6 s (window from 2 s)`."""
+    return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
+
+
 def unknown_requirement(name: str, names: list[str]) -> UsageError:
     """U101: no requirement is called `name`."""
     near = closest(name, names)
@@ -257,13 +303,6 @@ def unknown_requirement(name: str, names: list[str]) -> UsageError:
 
 def _status(violated: bool, satisfied: bool) -> Status:
     return "violated" if violated else "satisfied" if satisfied else "inconclusive"
-
-
-def _together(statuses: tuple[Status, ...]) -> Status:
-    """Status of all requirements on one trace."""
-    if "out of scope" in statuses:
-        return "out of scope"
-    return _status("violated" in statuses, {*statuses} <= {"satisfied"})
 
 
 def _known(status: Status) -> bool | None:

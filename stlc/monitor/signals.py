@@ -1,11 +1,14 @@
-"""Conversion of given signals to columns `(time, batch)` for the evaluator."""
+"""Signals that requirements read: options for reading them from a file, and their columns for the evaluator.
+
+A column is an array `(time, batch)`.
+"""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -13,12 +16,18 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.diagnostics import Diagnostic, TraceError
-from stlc.monitor.needs import Need
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import columns as columns_of
+from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.pipeline import Compiled, CompiledRequirement
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.escape import visible
+from stlc.grammar import ast
 from stlc.registry import closest
-from stlc.signature import Column
+from stlc.signature import Column, Kind
 from stlc.source import Span
-from stlc.trace import Trace
+from stlc.trace import AS_IT_IS, Reading, Trace
+from stlc.trace.enums import TRUTH, Words
 from stlc.units import SYMBOLS, Unit, same_dims
 
 Given: TypeAlias = Mapping[str, Any]
@@ -30,6 +39,91 @@ CLOCK = "t"
 UNNAMED = "the signals"
 
 _COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
+_KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
+
+
+# ------------------------------------------------------------------ signals that are read
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Signal that requirements read.
+
+    Attributes:
+        column: as the specification declares it.
+        by: names of the requirements.
+        span: of its declaration.
+        parameter: it is a `param`, for which a value may be given instead.
+    """
+
+    column: Column
+    by: tuple[str, ...]
+    span: Span | None = None
+    parameter: bool = False
+
+
+def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[Need, ...]:
+    """Return the signals that `rules` read, in the order of the specification.
+
+    Raises:
+        UsageError: E107, they call functions that are not loaded.
+    """
+    _require_functions(compiled, rules)
+    read = [(rule.name, columns_of(rule.formula)) for rule in rules]
+    spans = {
+        item.name: item.name_span for item in compiled.spec.items if isinstance(item, (ast.Signal, ast.Param))
+    }
+    parameters = {each.column.name for each in compiled.typed.parameters}
+    found = []
+    for column in compiled.signature.columns:
+        if by := tuple(rule for rule, names in read if column.name in names):
+            base = match["name"] if (match := _COMPONENT.fullmatch(column.name)) else column.name
+            found.append(Need(column, by, spans.get(base), column.name in parameters))
+    return tuple(found)
+
+
+def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> None:
+    parts = (part for rule in rules for num in numbers(rule.formula) for part in subexpressions(num))
+    missing = dict.fromkeys(
+        part.name for part in parts if isinstance(part, ir.Extern) and part.function is None
+    )
+    if not missing:
+        return
+    places = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Extern)}
+    help_ = ("--system FILE names the system that does; its functions are Python code, and loading runs it",)
+    message = "`{}` is a function from outside, and nobody provides it here"
+    raise UsageError(*(Diagnostic("E107", message.format(n), places.get(n), help=help_) for n in missing))
+
+
+def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
+    """Return the options for reading a file of the signals that `spec` declares.
+
+    Args:
+        spec: the specification; gives the kinds of the signals and the values of their words.
+        asked: names in the file, of signals or of their columns (`from "…"`), and the grid.
+    """
+    signals = [item for item in spec.items if isinstance(item, ast.Signal)]
+    columns = {item.name: item.column for item in signals if item.column}
+
+    def column(name: str) -> str:
+        """The column of a signal, or of a component of one: `p[0]` of `p from "q"` is `q[0]`."""
+        base, bracket, index = name.partition("[")
+        return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
+
+    worth: dict[str, Words] = {"bool": TRUTH}
+    worth |= {item.name: dict(item.members) for item in spec.items if isinstance(item, ast.Enum)}
+    kinds: dict[str, Kind] = {}
+    words: dict[str, Words] = {}
+    for item in signals:
+        name = item.column or item.name
+        words[name] = {} if item.type is None else worth.get(item.type.name, {})
+        if item.type is not None:
+            kinds[name] = _KINDS.get(item.type.name, "enum")
+    names = {column(name): there for name, there in asked.names.items()}
+    return replace(asked, names=names, kinds=kinds, words=words)
+
+
+# ------------------------------------------------------------------------------- columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +153,14 @@ class Signals:
         """Number of traces."""
         return int(np.prod(self.shape, dtype=np.int64))
 
+    @property
+    def gaps(self) -> dict[str, Gap]:
+        """Gaps of the columns with unknown samples; for NumPy arrays only."""
+        if self.ops is not NUMPY:
+            return {}
+        found = {name: Gap().with_more(np.isnan(values)) for name, values in self.env.items()}
+        return {name: gap for name, gap in found.items() if gap.samples}
+
     def like_given(self, values: Array) -> Array:
         """Reshape (time, batch) to (…, time)."""
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
@@ -79,63 +181,49 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
         TraceError: E601, a signal is missing; E604, one holds infinity (NumPy only);
             E605, arrays or units do not fit together.
     """
-    name = given.name if isinstance(given, Trace) else UNNAMED
-    data: Given = {CLOCK: given.times, **given.data} if isinstance(given, Trace) else given
+    trace = given if isinstance(given, Trace) else None
+    name = UNNAMED if trace is None else trace.name
+    data: Given = given if not isinstance(given, Trace) else {CLOCK: given.times, **given.data}
     found = {need.column.name: _find(data, need.column.name) for need in needs}
-    there = {**data, **given.extras} if isinstance(given, Trace) else data
+    there = data if trace is None else {**data, **trace.extras}
     missing = [_missing(need, there, name) for need in needs if found[need.column.name] is None]
     if missing:
         raise TraceError(*missing)
-    arrays = found or _any_one(data)
-    tensors = _tensors(arrays)
+    if not found:  # the numbers of traces and samples are those of any signal, preferably not of a vector
+        any_one = min(data, key=lambda key: (key == CLOCK, np.ndim(data[key])), default=None)
+        found = {} if any_one is None else {any_one: _find(data, any_one)}
+    torch = sys.modules.get("torch")  # not imported to find out
+    tensors = [] if torch is None else [key for key, x in found.items() if isinstance(x, torch.Tensor)]
     if tensors and plain:
-        arrays = {key: _as_numpy(values) for key, values in arrays.items()}
+        found |= {key: found[key].detach().cpu().numpy() for key in tensors}
         tensors = []
-    shape, samples = _common_shape(arrays, name)
+    shape, samples = _common_shape(found, name)
     if tensors:
         from stlc.compile.backends.torch.ops import TORCH
 
-        return Signals(_torch_columns(arrays, tensors, (*shape, samples)), shape, samples, TORCH, name)
-    columns = _numpy_columns(arrays, (*shape, samples))
+        given_tensors = [found[key] for key in tensors]
+        return Signals(_torch_columns(found, given_tensors, (*shape, samples)), shape, samples, TORCH, name)
+    columns = {key: _numpy_column(values, (*shape, samples)) for key, values in found.items()}
     signals = Signals(columns, shape, samples, NUMPY, name)
-    if isinstance(given, Trace):
-        columns = _in_units(columns, needs, given)
-        signals = Signals(columns, (given.traces,), samples, NUMPY, name, given.dt, given.t0)
+    if trace is not None:
+        columns = _in_units(columns, needs, trace)
+        signals = Signals(columns, (trace.traces,), samples, NUMPY, name, trace.dt, trace.t0)
     _check_finite(signals, needs)
     return signals
 
 
-def _any_one(data: Given) -> dict[str, Any]:
-    """A signal that gives the numbers of traces and samples where none is read, preferably not a vector."""
-    names = sorted(data, key=lambda name: (name == CLOCK, np.ndim(data[name])))
-    return {name: _find(data, name) for name in names[:1]}
-
-
-def _tensors(arrays: Mapping[str, Any]) -> list[Any]:
-    """The torch tensors among the arrays; torch is not imported to find out."""
-    torch = sys.modules.get("torch")
-    return [] if torch is None else [v for v in arrays.values() if isinstance(v, torch.Tensor)]
-
-
-def _as_numpy(values: Any) -> Any:
-    return values.detach().cpu().numpy() if _tensors({"": values}) else values
-
-
-# -------------------------------------------------------------------- finding them
-
-
 def _find(data: Given, name: str) -> Any:
-    """The array of a signal; `q[0]` is also a component of a vector `q`."""
-    if name in data:
-        values = data[name]
-        return values if hasattr(values, "shape") else np.asarray(values, dtype=np.float64)
-    match = _COMPONENT.fullmatch(name)
-    if match is None or match["name"] not in data:
-        return None
-    vector = data[match["name"]]
-    vector = vector if hasattr(vector, "shape") else np.asarray(vector, dtype=np.float64)
-    index = int(match["index"])
-    return vector[..., index] if vector.ndim >= 2 and index < vector.shape[-1] else None
+    """The array of a signal, or of a component `q[0]` of a vector `q`; None where there is none."""
+    index = None
+    if name not in data:
+        match = _COMPONENT.fullmatch(name)
+        if match is None or match["name"] not in data:
+            return None
+        name, index = match["name"], int(match["index"])
+    values = data[name] if hasattr(data[name], "shape") else np.asarray(data[name], dtype=np.float64)
+    if index is None:
+        return values
+    return values[..., index] if values.ndim >= 2 and index < values.shape[-1] else None
 
 
 def _missing(need: Need, data: Given, name: str) -> Diagnostic:
@@ -180,15 +268,9 @@ def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...]
     return shape, samples
 
 
-# ------------------------------------------------------------------ laying them out
-
-
-def _numpy_columns(arrays: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Array]:
-    def column(values: Any) -> Array:
-        full = np.broadcast_to(np.asarray(values, dtype=np.float64), shape)
-        return np.ascontiguousarray(full.reshape(-1, shape[-1]).T)
-
-    return {name: column(values) for name, values in arrays.items()}
+def _numpy_column(values: Any, shape: tuple[int, ...]) -> Array:
+    full = np.broadcast_to(np.asarray(values, dtype=np.float64), shape)
+    return np.ascontiguousarray(full.reshape(-1, shape[-1]).T)
 
 
 def _torch_columns(
@@ -309,9 +391,8 @@ class Gap:
         return Gap(self.samples + int(np.count_nonzero(unknown)), first, offset + int(rows[-1]))
 
 
-def gaps_of(signals: Signals) -> dict[str, Gap]:
-    """Gaps of the columns; for NumPy arrays only."""
-    if signals.ops is not NUMPY:
-        return {}
-    found = {name: Gap().with_more(np.isnan(values)) for name, values in signals.env.items()}
-    return {name: gap for name, gap in found.items() if gap.samples}
+def gap_text(name: str, gap: Gap, samples: int, moments: tuple[str, str]) -> str:
+    """Return in words which samples of a signal are unknown: `… at 2 of 60 samples (t = 8 s to 9 s)`."""
+    first, last = moments
+    where = first if gap.samples == 1 else f"{first} to {last.removeprefix('t = ')}"
+    return f"`{visible(name)}` is unknown at {gap.samples:,} of {samples:,} samples ({where})"

@@ -29,11 +29,8 @@ from stlc.monitor.instants import (
     rules_at,
     starts_of,
 )
-from stlc.monitor.judgement import Bools, Judgement, Status, Verdict, unknown_requirement
-from stlc.monitor.needs import Need, needs_of
-from stlc.monitor.prepared import Prepared
-from stlc.monitor.reading import reading_of
-from stlc.monitor.signals import Given, arrange
+from stlc.monitor.judgement import Bools, Judgement, Prepared, Status, Verdict, unknown_requirement
+from stlc.monitor.signals import Given, Need, arrange, needs_of, reading_of
 from stlc.monitor.values import Ends, Record, by_truth
 from stlc.source import Source
 from stlc.trace import Trace, load_trace

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.signature import Column, Kind, Signature
 from stlc.trace.enums import Words, in_numbers, wordless
-from stlc.trace.formats.registry import WRITTEN, format_of, needed, read_recording
+from stlc.trace.formats.registry import SUFFIXES, WRITTEN, format_of, needed, unreadable
 from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import CLOCK, EXTRA, ClockGroup, Recording, absent, fit
 from stlc.trace.resample import ResampleGrid, resampled, usual_step
@@ -122,6 +123,21 @@ AS_IT_IS = Reading()
 
 
 # ----------------------------------------------------------------------- reading
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a file of any format.
+
+    Raises:
+        UsageError: U102, no such file.
+        MissingError: R301, the format needs a package that is not installed.
+        TraceError: the file cannot be read (E603) or does not fit together (E605).
+    """
+    if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
+        why = f"its suffix is none of {' '.join(SUFFIXES)}"
+        raise unreadable(path, why, advice="give it the suffix of its format")
+    found: Recording = format_of(path).function("read")(path)
+    return found
 
 
 def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:

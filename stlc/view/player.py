@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import script_json
 from stlc.jsontext import dumps
-from stlc.monitor.prepared import beside
+from stlc.monitor.judgement import beside
 from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_bytes
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table

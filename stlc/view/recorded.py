@@ -11,7 +11,7 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.monitor.explain.report import Cause, explain_all
-from stlc.monitor.prepared import beside
+from stlc.monitor.judgement import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged

@@ -9,7 +9,7 @@ import pytest
 import stlc
 from stlc.cli.framework.app import main
 from stlc.diagnostics import TraceError
-from stlc.monitor.reading import reading_of
+from stlc.monitor.signals import reading_of
 from stlc.trace import Reading
 
 SPEC = """

@@ -179,7 +179,7 @@ def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trac
 
 def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
     """Reading options of files: names and grid; with a monitor also the types of signals."""
-    from stlc.monitor.reading import reading_of
+    from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
 
     asked = Reading(question.names, question.resample, question.dt, question.max_gap)

@@ -26,7 +26,8 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import visible
 from stlc.files import find_spec, read_source
-from stlc.monitor.prepared import beside, gap_text
+from stlc.monitor.judgement import beside
+from stlc.monitor.signals import gap_text
 from stlc.source import Source
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.judgement import Judgement, Verdict
-from stlc.monitor.prepared import beside, gap_text
+from stlc.monitor.judgement import Judgement, Verdict, beside
+from stlc.monitor.signals import gap_text
 
 
 def describe_result(result: Checked, *, color: bool) -> str:

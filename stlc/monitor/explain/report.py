@@ -13,8 +13,7 @@ from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
 from stlc.monitor.instants import window_of
-from stlc.monitor.judgement import Judgement, Verdict
-from stlc.monitor.prepared import Prepared
+from stlc.monitor.judgement import Judgement, Prepared, Verdict
 from stlc.monitor.values import Record
 from stlc.signature import Column
 from stlc.source import Span
@@ -23,7 +22,7 @@ _MOST_LABELS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class SignalValue:
     """Value of a signal at the instant that decides.
 
     Attributes:
@@ -66,7 +65,7 @@ class Cause:
     time: float
     predicate: str
     span: Span
-    readings: tuple[Reading, ...]
+    readings: tuple[SignalValue, ...]
     place: Label
     labels: tuple[Label, ...]
     because: str
@@ -157,9 +156,9 @@ class _Words:
     written: ast.Expr
     definitions: dict[str, ast.Expr]
 
-    def readings(self, blame: CauseNode) -> tuple[Reading, ...]:
+    def readings(self, blame: CauseNode) -> tuple[SignalValue, ...]:
         """The signals that the predicates of the tree read, each at the instants where they do."""
-        seen: dict[tuple[str, int], Reading] = {}
+        seen: dict[tuple[str, int], SignalValue] = {}
         read = self.subject.compiled.signature
         for leaf in blame.leaves:
             for name, later in _in_order(leaf):
@@ -169,7 +168,7 @@ class _Words:
                 value = float(self.record.env[name][sample, 0])
                 when = f" at {self.subject.moment(sample)}" if later else ""
                 text = f"{name} = {shown(value, read[name])}{when}"
-                seen.setdefault((name, sample), Reading(name, value, read[name].unit.text, text))
+                seen.setdefault((name, sample), SignalValue(name, value, read[name].unit.text, text))
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:

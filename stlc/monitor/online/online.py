@@ -16,14 +16,13 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
-from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.online.bounds import Bounds, Tracker, TrackingOptions
 from stlc.monitor.online.history import SampleHistory
 from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.tally import Flags, JudgedInstants, Tally
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Trackers
-from stlc.monitor.signals import Gap, arrange, not_finite
+from stlc.monitor.signals import Gap, Need, arrange, needs_of, not_finite
 from stlc.trace import Trace
 
 Floats: TypeAlias = NDArray[np.float64]

@@ -13,11 +13,10 @@ from stlc.compile.ir.support import history, reach
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.judgement import Judgement, Prepared, Verdict
 from stlc.monitor.online.bounds import Floats
 from stlc.monitor.online.history import SampleHistory
 from stlc.monitor.online.streams import endless, looks_on
-from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
 

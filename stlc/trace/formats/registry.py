@@ -17,13 +17,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from zipfile import is_zipfile
+from typing import Any
 
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, TraceError, UsageError
-
-if TYPE_CHECKING:
-    from stlc.trace.recording import Recording
 
 MAX_BYTES = 4_000_000_000
 _ROOM = 500_000_000
@@ -77,21 +73,6 @@ def format_of(path: Path) -> Format:
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
-
-
-def read_recording(path: Path) -> Recording:
-    """Read a file of any format.
-
-    Raises:
-        UsageError: U102, no such file.
-        MissingError: R301, the format needs a package that is not installed.
-        TraceError: the file cannot be read (E603) or does not fit together (E605).
-    """
-    if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
-        why = f"its suffix is none of {' '.join(SUFFIXES)}"
-        raise unreadable(path, why, advice="give it the suffix of its format")
-    found: Recording = format_of(path).function("read")(path)
-    return found
 
 
 # ------------------------------------------------------------------------ shared by readers
