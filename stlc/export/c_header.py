@@ -18,9 +18,10 @@ import torch
 from torch import nn
 
 from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
-from stlc.compile.backends.c.numbers import Leaf, NumberWriter, Untranslatable, literal
+from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.backends.numbers import Leaf, Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended

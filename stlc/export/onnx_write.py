@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, GraphBody, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import torch
 
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_header
 from stlc.export.c_header import public, weights

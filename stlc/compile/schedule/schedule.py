@@ -260,25 +260,6 @@ def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
-    """Loop body: the steps inside a `freeze`, or of a table of formulas of one shape.
-
-    Attributes:
-        index: name of the index in the language of the back end.
-        bound: step numbers of the frozen values, in the order of their bindings.
-        steps: recomputed in every iteration.
-        own: step numbers of all values in the loop, in order of allocation.
-        root: step number of an iteration's result.
-    """
-
-    index: str
-    bound: tuple[int, ...]
-    steps: tuple[Step, ...]
-    own: tuple[int, ...]
-    root: int
-
-
-@dataclass(frozen=True, slots=True)
 class Step:
     """Value to compute.
 
@@ -286,15 +267,12 @@ class Step:
         node: formula, or a computation specific to a back end.
         run: instants.
         args: step numbers of the operands; None for an operand that is not needed at any instant.
-        inner: loop body for each instant of a `freeze`, or each row of a table; None where the back end
-            evaluates it itself.
         number: step number.
     """
 
     node: Any
     run: IndexRange
     args: tuple[int | None, ...]
-    inner: Loop | None = None
     number: int = 0
 
     @property

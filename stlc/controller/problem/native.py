@@ -17,7 +17,7 @@ from torch import Tensor
 
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import Motion, emit
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.native import Adjoint, Climb, Kernel, ObjectiveSlopes, Stop, load, never, why_none
 from stlc.toolchain import compiler
 

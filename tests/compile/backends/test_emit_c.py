@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import subprocess
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from helpers.formula_strategies import NAMES
 
 from stlc import native
 from stlc.compile.backends.c.emit import emit
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.c.plan import Called, Frozen, Tabled
+from stlc.compile.backends.c.printer import FORMS
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.native import compiler
 
@@ -32,6 +35,10 @@ def test_every_function_equals_the_evaluator() -> None:
     rng = np.random.default_rng(1)
     trace = rng.normal(0, 2, (STEPS + 1, 200, 3))
     values_agree(rules, trace)
+
+
+def test_every_node_is_printed() -> None:
+    assert set(FORMS) == {*get_args(ir.Formula), Called, Frozen, Tabled} - {ir.Freeze}
 
 
 def test_what_has_no_c_form_is_said() -> None:

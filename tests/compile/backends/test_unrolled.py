@@ -11,7 +11,7 @@ from helpers.sheets import columns_on, computed
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.unrolled import written
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import Sheet
 from stlc.compile.ir import nodes as ir
 

@@ -10,10 +10,11 @@ import operator
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, TypeAlias, assert_never
+from typing import Any, TypeAlias
 
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.tape import GradientTape, Instr, Operand
+from stlc.compile.backends.numbers import Leaf, NumberEvaluator
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import key_of, leaves
@@ -79,7 +80,7 @@ class ArrayProgram:
 
     def _tape(self, *, exact: bool) -> tuple[GradientTape, dict[str, Operand]]:
         if exact not in self._tapes:
-            writer = _Writer(self._constants, exact=exact)
+            writer = _TapeWriter(self._constants, exact=exact)
             outputs = {name: writer.number(num) for name, num in self._outputs.items()}
             self._tapes[exact] = writer.tape, outputs
         return self._tapes[exact]
@@ -171,60 +172,35 @@ def _needed(tape: GradientTape, outputs: Any) -> list[int]:
     return sorted(wanted)
 
 
-class _Writer:
+class _TapeWriter(NumberEvaluator[Operand]):
     """Writer of numbers and state formulas to a tape.
 
     With `exact`, conditions are masks; otherwise margins passed to the switch.
     """
 
-    def __init__(
-        self, constants: Mapping[str, float], *, exact: bool, tape: GradientTape | None = None
-    ) -> None:
-        self.tape = GradientTape() if tape is None else tape
-        self.bound: dict[str, Operand] = {}
+    def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
+        super().__init__()
+        self.tape = GradientTape()
         self._constants = constants
         self._exact = exact
-        self._seen: dict[int, Operand] = {}
 
-    def number(self, num: ir.Num) -> Operand:
-        """Return the operand that holds `num`."""
-        operand = self._seen.get(id(num))
-        if operand is None:
-            operand = self._seen[id(num)] = self._number(num)
-        return operand
+    def _constant(self, value: float) -> Operand:
+        return float(value)
 
-    def _number(self, num: ir.Num) -> Operand:
-        match num:
-            case ir.Const(value):
-                return float(value)
-            case ir.Signal(name):
-                known = self.bound.get(name, self._constants.get(name))
-                return self.tape.emit("input", params=(name,)) if known is None else known
-            case ir.ShiftedSignal() | ir.FrozenVar():
-                return self.tape.emit("input", params=(key_of(num),))
-            case ir.Op(name, args):
-                return self._op(name, [self.number(arg) for arg in args])
-            case ir.Indicator(cond, sharpness):
-                return self._indicator(cond, sharpness)
-            case ir.Where(cond, yes, no):
-                return self._where(cond, self.number(yes), self.number(no))
-            case ir.Extern(_, args, output, ir.Body() as body):
-                return self._inlined(body, [self.number(arg) for arg in args], output)
-            case ir.Extern(name, args, output, function):
-                whole = self.tape.emit("extern", *map(self.number, args), params=(function or name,))
-                return self.tape.emit("pick", whole, params=(output,))
-            case _:
-                assert_never(num)
+    def _leaf(self, num: Leaf) -> Operand:
+        if isinstance(num, ir.Extern):
+            if isinstance(num.function, ir.Body):
+                inner = self.inlined(num.function, [self.number(arg) for arg in num.args])
+                return inner.number(num.function.outputs[num.output])
+            whole = self.tape.emit("extern", *map(self.number, num.args), params=(num.function or num.name,))
+            return self.tape.emit("pick", whole, params=(num.output,))
+        if isinstance(num, ir.Signal):
+            known = self.bound.get(num.name, self._constants.get(num.name))
+            if known is not None:
+                return known
+        return self.tape.emit("input", params=(key_of(num),))
 
-    def _inlined(self, body: ir.Body, args: list[Operand], output: int) -> Operand:
-        """Inline a function given as straight-line code; the tape shares common sub-expressions."""
-        inner = _Writer(self._constants, exact=self._exact, tape=self.tape)
-        inner.bound.update(zip(body.formals, args, strict=True))
-        for name, num in body.lets:
-            inner.bound[name] = inner.number(num)
-        return inner.number(body.outputs[output])
-
-    def _op(self, name: str, args: list[Operand]) -> Operand:
+    def _function(self, name: str, args: list[Operand]) -> Operand:
         function = FUNCTIONS[name]
         if function.array is None:
             return self.tape.call(name, *args)
@@ -239,7 +215,7 @@ class _Writer:
             return float(mask) if isinstance(mask, bool) else self.tape.number(mask)
         return self._weight(cond, sharpness)
 
-    def _where(self, cond: ir.Formula, yes: Operand, no: Operand) -> Operand:
+    def _choice(self, cond: ir.Formula, yes: Operand, no: Operand) -> Operand:
         if type(yes) is type(no) and yes == no:
             return yes
         if isinstance(yes, float) and isinstance(no, float):
@@ -284,20 +260,6 @@ class _Writer:
         if truth is None:
             return weight
         return self.tape.emit("settle", weight, float(truth) if isinstance(truth, bool) else truth)
-
-    def margin(self, cond: ir.Formula) -> Operand:
-        """Exact robustness of a state formula."""
-        match cond:
-            case ir.Truth(value):
-                return float("inf") if value else float("-inf")
-            case ir.Predicate(num, sign):
-                margin = self.number(num)
-                return margin if sign > 0 else self.tape.neg(margin)
-            case ir.BoolOp(op, items):
-                pick = self.tape.least if op == "and" else self.tape.greatest
-                return reduce(pick, [self.margin(item) for item in items])
-            case _:
-                raise TypeError(f"not a state formula: {type(cond).__name__}")
 
 
 def _strictness(cond: ir.Formula) -> set[bool]:

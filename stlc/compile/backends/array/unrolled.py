@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Value
 from stlc.compile.ir import nodes as ir

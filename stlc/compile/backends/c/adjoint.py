@@ -51,7 +51,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
     plan = plan_of(formulas, motion.steps + 1)
     printer = StepPrinter(plan, state_index(motion))
     blocks = [roots_in(plan)]
-    blocks += [printer.backward([step], {}) for step in reversed(plan.schedule.steps)]
+    blocks += [printer.backward([step]) for step in reversed(plan.schedule.steps)]
     states, controls, steps = len(motion.states), len(motion.controls), motion.steps
     return "\n".join(
         [
@@ -77,16 +77,12 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
     index = {name: i for i, name in enumerate(motion.states)}
     writer = SlopeWriter(place_in_step(motion), soft=True)
     for name, num in motion.lets:
-        writer.assign(name, writer.number(num))
-    seeds: dict[str, str] = {}
-    for name, num in motion.next.items():
-        if name not in fixed:
-            register = writer.number(num)
-            own = f"gx[{index[name]}][k + 1][j]"
-            seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
+        writer.bound[name] = writer.number(num)
+    outputs = [
+        (num, f"gx[{index[name]}][k + 1][j]") for name, num in motion.next.items() if name not in fixed
+    ]
     still = [f"gx[{i}][k][j] += gx[{i}][k + 1][j];" for name, i in index.items() if name not in motion.next]
-    lines, gathered = writer.backward(seeds)
-    return [*writer.lines, *lines, *(f"{place} += {value};" for place, value in gathered.items()), *still]
+    return [*writer.pulled(outputs), *still]
 
 
 UNCHECK = Frame(

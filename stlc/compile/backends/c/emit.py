@@ -9,10 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile.backends.c.climb import CLIMB
-from stlc.compile.backends.c.numbers import Leaf, NumberWriter
+from stlc.compile.backends.c.numbers import NumberWriter
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import Plan, Storage, plan_of
 from stlc.compile.backends.c.printer import StepPrinter
+from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 
 LANES = 16
@@ -118,7 +119,7 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
     """Return statements that fill the buffers of a plan and output the robustness of each formula."""
     printer = StepPrinter(plan, index)
-    return [*(printer.forward([step], {}) for step in plan.schedule.steps), _roots_out(plan)]
+    return [*(printer.forward([step]) for step in plan.schedule.steps), _roots_out(plan)]
 
 
 def _roots_out(plan: Plan) -> list[str]:
@@ -179,7 +180,7 @@ def _step(motion: Motion) -> list[str]:
     index = state_index(motion)
     writer = NumberWriter(place_in_step(motion))
     for name, num in motion.lets:
-        writer.assign(name, writer.number(num))
+        writer.bound[name] = writer.number(num)
     after = {name: writer.number(num) for name, num in motion.next.items()}
     moved = [
         f"x[{index[name]}][k + 1][j] = {value}; bad[j] += NAN_IN({value});" for name, value in after.items()

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias, assert_never
+from typing import Any, TypeAlias, TypeVar
 
 from stlc.compile.backends.c.numbers import LISTED
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import map_children
 
 LEAST = 8
 """Minimum number of members of a family."""
 
 Entry: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal
+N = TypeVar("N", bound=Any)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,43 +117,17 @@ def _entries(formula: ir.Formula) -> list[Entry]:
     return found
 
 
-def _changed(formula: ir.Formula, change: Callable[[Entry], ir.Num]) -> ir.Formula:
-    """Return the formula with each leaf that may differ replaced by `change(leaf)`."""
-    match formula:
-        case ir.Truth() | ir.Freeze():  # names of frozen values are unique: no other has this shape
-            return formula
-        case ir.Predicate(num):
-            return replace(formula, num=_number(num, change))
-        case ir.BoolOp(_, items):
-            return replace(formula, items=tuple(_changed(item, change) for item in items))
-        case ir.Temporal(_, _, body) | ir.PastTemporal(_, _, body) | ir.Shift(_, body) | ir.AtStart(body):
-            return replace(formula, body=_changed(body, change))
-        case ir.Until(_, _, left, right) | ir.Since(_, _, left, right):
-            return replace(formula, left=_changed(left, change), right=_changed(right, change))
-        case _:
-            assert_never(formula)
+def _changed(node: N, change: Callable[[Entry], ir.Num]) -> N:
+    """Return a formula or a number with each leaf that may differ replaced by `change(leaf)`."""
+    if isinstance(node, (ir.Freeze, ir.Extern)):
+        return node  # names of frozen values are unique; a call is computed once for its columns
+    if isinstance(node, (ir.Const, ir.Signal, ir.ShiftedSignal)):
+        shared = not isinstance(node, ir.Const) and (node.name == ir.ELAPSED or node.name.startswith(LISTED))
+        return node if shared else change(node)  # type: ignore[return-value]
 
+    def below(child: Any) -> Any:
+        return _changed(child, change)
 
-def _number(num: ir.Num, change: Callable[[Entry], ir.Num]) -> ir.Num:
-    match num:
-        case ir.Signal(name) | ir.ShiftedSignal(name) if name.startswith(
-            LISTED
-        ):  # an entry of the enclosing table
-            return num
-        case ir.Signal(ir.ELAPSED):
-            return num
-        case ir.Const() | ir.Signal() | ir.ShiftedSignal():
-            return change(num)
-        case ir.FrozenVar() | ir.Extern():  # a call is computed once for its columns
-            return num
-        case ir.Op("pow", (base, exponent)):  # compilers round some constant exponents differently
-            return ir.Op("pow", (_number(base, change), exponent))
-        case ir.Op(_, args):
-            return replace(num, args=tuple(_number(arg, change) for arg in args))
-        case ir.Indicator(cond):
-            return replace(num, cond=_changed(cond, change))
-        case ir.Where(cond, yes, no):
-            cond = _changed(cond, change)
-            return ir.Where(cond, _number(yes, change), _number(no, change))
-        case _:
-            assert_never(num)
+    if isinstance(node, ir.Op) and node.name == "pow":  # compilers round some constant exponents differently
+        return replace(node, args=(below(node.args[0]), node.args[1]))
+    return map_children(node, formulas=below, numbers=below)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import reduce
-from typing import TypeAlias, assert_never
 
+from stlc.compile.backends.numbers import Leaf, NumberEvaluator, Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, SHARED
 
@@ -18,38 +18,22 @@ LISTED = "\0"
 """Prefix of frozen values and columns that are table entries, followed by their C name."""
 
 
-class Untranslatable(Exception):  # noqa: N818 - not an error: another back end is used
-    """The IR has a node that a back end cannot express, such as a Python function of the system."""
-
-
-Leaf: TypeAlias = ir.Signal | ir.ShiftedSignal | ir.FrozenVar | ir.Extern
-
-
-class NumberWriter:
-    """Writer of numbers as C statements; equal numbers share a register.
+class NumberWriter(NumberEvaluator[str]):
+    """Writer of numbers as C statements; equal expressions share a register.
 
     Args:
         place: C expression of a column, a frozen value or an available function result; None for a function
             that must be inlined.
+
+    Attributes:
+        lines: the statements.
     """
 
     def __init__(self, place: Callable[[Leaf], str | None]) -> None:
+        super().__init__()
         self.lines: list[str] = []
         self._place = place
-        self._known: dict[ir.Num, str] = {}
         self._texts: dict[str, str] = {}
-        self._calls: dict[tuple[str, ...], list[str]] = {}
-
-    def number(self, num: ir.Num) -> str:
-        """Write the statements of a number; return its C name."""
-        known = self._known.get(num)
-        if known is None:
-            known = self._known[num] = self._number(num)
-        return known
-
-    def assign(self, name: str, value: str) -> None:
-        """Bind the environment entry `name` to the C expression `value`."""
-        self._known[ir.Signal(name)] = value
 
     def truth(self, cond: ir.Formula) -> str:
         """Exact truth of a condition as a C expression, 0 or 1; each predicate keeps its own strictness."""
@@ -64,58 +48,32 @@ class NumberWriter:
             case _:
                 raise Untranslatable(type(cond).__name__)
 
-    def _number(self, num: ir.Num) -> str:
-        match num:
-            case ir.Const(value):
-                return literal(value)
-            case ir.Op(name, args):
-                return self._op(name, [self.number(arg) for arg in args])
-            case ir.Indicator(cond):
-                return self._indicator(cond)
-            case ir.Where(cond, yes, no):
-                return self._choice(cond, self.number(yes), self.number(no))
-            case ir.FrozenVar(name) if name.startswith(LISTED):
-                return name.removeprefix(LISTED)
-            case ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar() | ir.Extern():
-                place = self._place(num)
-                return self._written_out(num) if place is None else self._load(place)
-            case _:
-                assert_never(num)
+    def _constant(self, value: float) -> str:
+        return literal(value)
+
+    def _leaf(self, num: Leaf) -> str:
+        if isinstance(num, ir.Signal) and num.name in self.bound:
+            return self.bound[num.name]
+        if isinstance(num, ir.FrozenVar) and num.name.startswith(LISTED):
+            return num.name.removeprefix(LISTED)
+        place = self._place(num)
+        if place is not None:
+            return self._load(place)
+        if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
+            raise Untranslatable(f"the function `{num.name}`")
+        inner = self.inlined(num.function, [self.number(arg) for arg in num.args])
+        return [inner.number(output) for output in num.function.outputs][num.output]
 
     def _load(self, place: str) -> str:
         return self._register(place)
 
-    def _written_out(self, num: Leaf) -> str:
-        if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
-            raise Untranslatable(f"the function `{num.name}`")
-        args = [self.number(arg) for arg in num.args]
-        return self._inlined(num.name, num.function, args)[num.output]
-
-    def _indicator(self, cond: ir.Formula) -> str:
+    def _indicator(self, cond: ir.Formula, sharpness: float | None) -> str:  # noqa: ARG002 - it is exact
         return self._register(f"(double){self.truth(cond)}")
 
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
         return self._register(f"{self.truth(cond)} ? {yes} : {no}")
 
-    def _inlined(self, name: str, body: ir.Body, args: list[str]) -> list[str]:
-        """Write the statements of a function given as straight-line code; return its components."""
-        outputs = self._calls.get((name, *args))
-        if outputs is None:
-            inner = self._inside()
-            for formal, arg in zip(body.formals, args, strict=True):
-                inner.assign(formal, arg)
-            for let, num in body.lets:
-                inner.assign(let, inner.number(num))
-            outputs = self._calls[name, *args] = [inner.number(output) for output in body.outputs]
-        return outputs
-
-    def _inside(self) -> NumberWriter:
-        """Return a writer with its own bindings that shares the registers."""
-        inner = NumberWriter(self._place)
-        inner.lines, inner._texts = self.lines, self._texts
-        return inner
-
-    def _op(self, name: str, args: list[str]) -> str:
+    def _function(self, name: str, args: list[str]) -> str:
         function = FUNCTIONS[name]
         if function.of_each is not None:
             name, args = function.of_each[1], [self._apply(function.of_each[0], [arg]) for arg in args]

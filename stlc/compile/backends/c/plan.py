@@ -13,7 +13,7 @@ from itertools import islice
 from typing import TypeAlias
 
 from stlc.compile.backends.c.families import Family, FamilyTable, families
-from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of, reach_of
 from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
@@ -21,7 +21,6 @@ from stlc.compile.schedule.schedule import (
     PICKS,
     IndexRange,
     Instant,
-    Loop,
     LoopIndex,
     Pick,
     Schedule,
@@ -73,16 +72,50 @@ class Called:
 
 
 @dataclass(frozen=True, slots=True)
+class Loop:
+    """Loop body.
+
+    Attributes:
+        index: C name of the index.
+        steps: recomputed in every iteration.
+        own: step numbers of all values in the loop, in order of allocation.
+        root: step number of an iteration's result.
+    """
+
+    index: str
+    steps: tuple[Step, ...]
+    own: tuple[int, ...]
+    root: int
+
+
+@dataclass(frozen=True, slots=True)
+class Frozen:
+    """Step of a `freeze`: a loop over its instants.
+
+    Attributes:
+        node: the formula.
+        bound: step numbers of the frozen values, in the order of their bindings.
+        loop: body of the loop.
+    """
+
+    node: ir.Freeze
+    bound: tuple[int, ...]
+    loop: Loop
+
+
+@dataclass(frozen=True, slots=True)
 class Tabled:
-    """Step whose inner steps run for every row of a table.
+    """Step of a family of formulas: a loop over the rows of its table.
 
     Attributes:
         table: parameters of each row.
         pick: extremum over the rows at each instant; None: the first value of each row is kept.
+        loop: body of the loop.
     """
 
     table: FamilyTable
     pick: Pick | None
+    loop: Loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,8 +279,8 @@ class _Planner(Scheduler):
         with self._inside([*self.scopes, _Scope(read=table.names, table=True)]) as inner:
             root = self._needed(family.shape, run)
         self._loops += 1
-        loop = Loop(f"p{self._loops}", (), tuple(inner.steps), tuple(inner.own), root)
-        return self.add(Step(Tabled(table, pick), run, (), loop, number))
+        loop = Loop(f"p{self._loops}", tuple(inner.steps), tuple(inner.own), root)
+        return self.add(Step(Tabled(table, pick, loop), run, (), number))
 
     def _freeze(self, node: ir.Freeze, run: IndexRange) -> int:
         for _, num in node.bindings:
@@ -258,8 +291,8 @@ class _Planner(Scheduler):
         with self._inside([*self.scopes, _Scope(read=read)]) as inner:
             bound = tuple(self.number(_FIRST) for _ in node.bindings)
             root = self._needed(node.body, IndexRange(now, now))
-        loop = Loop(now.text, bound, tuple(inner.steps), tuple(inner.own), root)
-        return self.add(Step(node, run, (), loop, number))
+        loop = Loop(now.text, tuple(inner.steps), tuple(inner.own), root)
+        return self.add(Step(Frozen(node, bound, loop), run, (), number))
 
     def _check(self, num: ir.Num, run: IndexRange) -> None:
         """Schedule the calls of a number. Raises Untranslatable for samples outside of the plan."""

@@ -1,86 +1,36 @@
 """C code of a schedule's steps, forward and adjoint, over columns filled by a rollout.
 
-The innermost loop runs over trajectories and is vectorized. `gb7` is the gradient with respect to buffer
-`b7`, `gx` that with respect to the columns. The first of equal extrema gets the gradient. Loop bodies are
-recomputed in the adjoint, only for iterations with a nonzero gradient.
+A class per kind of step (`FORMS`) prints both. The innermost loop runs over trajectories and is vectorized.
+`gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to the columns. The gradient of an
+extremum goes to the first of equal operands. Loop bodies are recomputed in the adjoint, only for iterations
+with a nonzero gradient. Windows that all end or all begin with the trace are computed by one recursion.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import assert_never
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeAlias
 
-from stlc.compile.backends.c.numbers import LISTED, Leaf, NumberWriter, literal
-from stlc.compile.backends.c.plan import Buffer, Called, Plan, Tabled, call_of
+from stlc.compile.backends.c.numbers import LISTED, NumberWriter, literal
+from stlc.compile.backends.c.plan import Buffer, Called, Frozen, Loop, Plan, Tabled, call_of
 from stlc.compile.backends.c.slopes import SlopeWriter
-from stlc.compile.backends.c.windows import Macro, WindowStep, loop, windowed, windowed_back
+from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import leaves
-from stlc.compile.schedule.schedule import PICKS, IndexRange, Loop, Pick, Step, neutral
+from stlc.compile.schedule.schedule import PICKS, IndexRange, Pick, Step, earliest, neutral
+
+Macro: TypeAlias = Literal["MIN", "MAX"]
 
 _MACRO: Mapping[Pick, Macro] = {"min": "MIN", "max": "MAX"}
+_WORST: Mapping[Macro, str] = {"MIN": "INFINITY", "MAX": "(-INFINITY)"}
+_DUAL: Mapping[Macro, Macro] = {"MIN": "MAX", "MAX": "MIN"}
+_LESS: Mapping[Macro, str] = {"MIN": "<", "MAX": ">"}
 
-Frozen = Mapping[str, Buffer]
+HeldBuffers: TypeAlias = Mapping[str, Buffer]
 """Name of a frozen value -> its buffer."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """C expressions of a number's leaves at sample `k`, in lane `j`.
-
-    Attributes:
-        plan: the plan.
-        index: index of each state among the columns.
-        held: buffers of the frozen values.
-        indices: C name of a clamped sample index -> its C expression; independent of the lane.
-    """
-
-    plan: Plan
-    index: Mapping[str, int]
-    held: Frozen = field(default_factory=dict)
-    indices: dict[str, str] = field(default_factory=dict)
-
-    def __call__(self, leaf: Leaf) -> str | None:
-        """Return the C expression of a leaf; None for a function that must be inlined."""
-        match leaf:
-            case ir.Signal(name):
-                return column(self.index, name, "k")
-            case ir.ShiftedSignal(name, steps, clamped):
-                return column(self.index, name, self._index(steps, clamped=clamped))
-            case ir.FrozenVar(name):
-                return self.held[name][0]
-            case ir.Extern(_, args, output):
-                key = call_of(leaf)
-                if key is None:
-                    return None
-                first = args[0]
-                index = "k" if isinstance(first, ir.Signal) else self._later(first)
-                return self.plan.buffers[self.plan.calls[key] + output][index]
-            case _:
-                assert_never(leaf)
-
-    def _later(self, leaf: ir.Num) -> str:
-        assert isinstance(leaf, ir.ShiftedSignal)
-        return self._index(leaf.steps, clamped=leaf.clamped)
-
-    def _index(self, steps: int, *, clamped: bool) -> str:
-        """Index of the sample `steps` later; a clamped one stays within the plan."""
-        index, last = f"k + ({steps})", self.plan.samples - 1
-        if not clamped:
-            return index
-        name = f"{'after' if steps > 0 else 'before'}{abs(steps)}"
-        self.indices[name] = f"{index} < {last} ? {index} : {last}" if steps > 0 else f"LATER({index}, 0)"
-        return name
-
-    def head(self, run: IndexRange) -> str:
-        """Head of a loop over samples, with declarations of the indices used in it."""
-        return " ".join([f"{loop(run)} {{", self.heads()])
-
-    def heads(self) -> str:
-        """Declarations of the clamped indices."""
-        return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,268 +40,101 @@ class StepPrinter:
     Attributes:
         plan: that the steps belong to.
         index: index of each state among the columns.
+        held: buffers of the frozen values.
     """
 
     plan: Plan
     index: Mapping[str, int]
+    held: HeldBuffers = field(default_factory=dict)
 
-    def forward(self, steps: Sequence[Step], held: Frozen) -> list[str]:
+    def forward(self, steps: Sequence[Step]) -> list[str]:
         """Return statements that fill the buffers of all steps."""
-        return [line for step in steps for line in self._forward(step, held)]
+        return [line for step in steps for line in self._form(step).forward()]
 
-    def backward(self, steps: Sequence[Step], held: Frozen) -> list[str]:
+    def backward(self, steps: Sequence[Step]) -> list[str]:
         """Return statements that propagate the gradient back through all steps."""
-        return [line for step in reversed(steps) for line in self._backward(step, held)]
+        return [line for step in reversed(steps) for line in self._form(step).backward()]
 
-    def _forward(self, step: Step, held: Frozen) -> list[str]:
-        out, run, args = self._out(step), step.run, self._args(step)
-        match step.node:
-            case ir.Truth(value):
-                return _filled(out, run, math.inf if value else -math.inf)
-            case ir.Predicate():
-                return self._margin(step, step.node, held)
-            case ir.BoolOp(op):
-                # one operand per statement: nested macros double in length
-                pick = _MACRO[PICKS[op]]
-                rest = " ".join(f"most = {pick}(most, {item['k']});" for item in args[1:])
-                return [f"{loop(run)} LANE {{ double most = {args[0]['k']}; {rest} {out['k']} = most; }}"]
-            case ir.Temporal(op) | ir.PastTemporal(op) | ir.Until(op) | ir.Since(op):
-                return windowed(self._window(step)) if args else _filled(out, run, neutral(PICKS[op]))
-            case ir.Shift(steps, _, outside):
-                beyond = math.inf if outside else -math.inf
-                return self._shifted(step, steps, beyond) if args else _filled(out, run, beyond)
-            case ir.AtStart():
-                return [f"{loop(run)} LANE {out['k']} = {args[0][0]};"]
-            case Called():
-                return self._called(step, step.node)
-            case ir.Freeze():
-                return self._frozen(step, held)
-            case Tabled():
-                lines = self.forward(_loop_of(step).steps, held)
-                return [*self._table_head(step, step.node), *lines, *self._gathered(step, step.node), "}}"]
-            case _:
-                assert_never(step.node)
-
-    def _backward(self, step: Step, held: Frozen) -> list[str]:
-        out, run, args = self._out(step), step.run, self._args(step)
-        match step.node:
-            case ir.Truth():
-                return []
-            case ir.Predicate():
-                return self._margin_back(step, step.node, held)
-            case ir.BoolOp():
-                return _joined_back(out, run, args)
-            case ir.Temporal() | ir.PastTemporal() | ir.Until() | ir.Since():
-                return windowed_back(self._window(step)) if args else []
-            case ir.Shift(steps):
-                return self._shifted_back(step, steps) if args else []
-            case ir.AtStart():
-                return [f"{loop(run)} LANE g{args[0][0]} += g{out['k']};"]
-            case Called():
-                return self._called_back(step, step.node)
-            case ir.Freeze():
-                return self._frozen_back(step, step.node, held)
-            case Tabled():
-                return self._tabled_back(step, step.node, held)
-            case _:
-                assert_never(step.node)
-
-    def _out(self, step: Step) -> Buffer:
-        return self.plan.buffers[step.number]
-
-    def _args(self, step: Step) -> tuple[Buffer, ...]:
-        return tuple(self.plan.buffers[number] for number in step.operands)
-
-    # ------------------------------------------------------------------ predicates
-
-    def _margin(self, step: Step, node: ir.Predicate, held: Frozen) -> list[str]:
-        sight, out = Sight(self.plan, self.index, held), self._out(step)
-        writer = NumberWriter(sight)
-        margin = writer.number(node.num)
-        value = margin if node.sign > 0 else f"(-{margin})"
-        if node.guard:
-            value = f"({value} {'>' if node.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
-        body = " ".join([*writer.lines, f"bad[j] += NAN_IN({value});", f"{out['k']} = {value};"])
-        return [f"{sight.head(step.run)} LANE {{ {body} }} }}"]
-
-    def _margin_back(self, step: Step, node: ir.Predicate, held: Frozen) -> list[str]:
-        if node.guard or _fixed(node.num):
-            return []
-        sight = Sight(self.plan, self.index, held)
-        inner = _pulled(node.num, f"{'' if node.sign > 0 else '-'}g{self._out(step)['k']}", sight)
-        return [sight.head(step.run), *inner, "}"]
-
-    def _called(self, step: Step, node: Called) -> list[str]:
-        writer = NumberWriter(columns(self.index))
-        values = [writer.number(part) for part in node.components]
-        stores = [f"{out['k']} = {value};" for out, value in zip(self._outs(step, node), values, strict=True)]
-        return [f"{loop(step.run)} LANE {{ {' '.join([*writer.lines, *stores])} }}"]
-
-    def _called_back(self, step: Step, node: Called) -> list[str]:
-        writer = SlopeWriter(columns(self.index), soft=False)
-        seeds: dict[str, str] = {}
-        for out, part in zip(self._outs(step, node), node.components, strict=True):
-            register, own = writer.number(part), f"g{out['k']}"
-            seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
-        lines, gathered = writer.backward(seeds)
-        adds = [f"{place} += {value};" for place, value in gathered.items()]
-        return [f"{loop(step.run)} LANE {{", *writer.lines, *lines, *adds, "}"]
-
-    def _outs(self, step: Step, node: Called) -> tuple[Buffer, ...]:
-        return self.plan.buffers[step.number : step.number + len(node.components)]
-
-    # --------------------------------------------------------------- other samples
-
-    def _window(self, step: Step) -> WindowStep:
-        node, back = step.node, isinstance(step.node, (ir.PastTemporal, ir.Since))
-        pick, last = _MACRO[PICKS[node.op]], self.plan.samples - 1
-        return WindowStep(self._out(step), step.run, pick, node.window, back, self._args(step), last)
-
-    def _shifted(self, step: Step, steps: int, outside: float) -> list[str]:
-        out, body = self._out(step)["k"], self._args(step)[0]
-        there, last = f"k + ({steps})", self.plan.samples - 1
-        return [
-            f"{loop(step.run)}",
-            f"  if ({there} < 0 || {there} > {last}) LANE {out} = {literal(outside)};",
-            f"  else LANE {out} = {body[there]};",
-        ]
-
-    def _shifted_back(self, step: Step, steps: int) -> list[str]:
-        out, body = self._out(step)["k"], self._args(step)[0]
-        there, last = f"k + ({steps})", self.plan.samples - 1
-        return [
-            f"{loop(step.run)}",
-            f"  if ({there} >= 0 && {there} <= {last}) LANE g{body[there]} += g{out};",
-        ]
-
-    # ----------------------------------------------------------------------- loops
-
-    def _frozen(self, step: Step, held: Frozen) -> list[str]:
-        inner, out = _loop_of(step), self._out(step)
-        return [
-            _turns(step),
-            *(f"  {line}" for line in self._frozen_inside(step, held)),
-            f"  LANE {out[inner.index]} = {self.plan.buffers[inner.root][inner.index]};",
-            "}",
-        ]
-
-    def _frozen_inside(self, step: Step, held: Frozen) -> list[str]:
-        """Statements of one iteration: bind the frozen values, then run the steps."""
-        inner, lines = _loop_of(step), []
-        for number, (_, num) in zip(inner.bound, step.node.bindings, strict=True):
-            sight = Sight(self.plan, self.index, held)
-            writer = NumberWriter(sight)
-            value = writer.number(num)
-            body = " ".join([*writer.lines, f"{self.plan.buffers[number][0]} = {value};"])
-            lines.append(f"{{ const int k = {inner.index}; {sight.heads()} LANE {{ {body} }} }}")
-        return [*lines, *self.forward(inner.steps, self._held_in(step, held))]
-
-    def _held_in(self, step: Step, held: Frozen) -> Frozen:
-        names = (name for name, _ in step.node.bindings)
-        bound = (self.plan.buffers[number] for number in _loop_of(step).bound)
-        return {**held, **dict(zip(names, bound, strict=True))}
-
-    def _frozen_back(self, step: Step, node: ir.Freeze, held: Frozen) -> list[str]:
-        inner = _loop_of(step)
-        index, seed, bound = inner.index, f"g{self._out(step)[inner.index]}", []
-        for number, (_, num) in zip(inner.bound, node.bindings, strict=True):
-            sight = Sight(self.plan, self.index, held)
-            back = _pulled(num, f"g{self.plan.buffers[number][0]}", sight)
-            bound += [f"{{ const int k = {index}; {sight.heads()}", *back, "}"]
-        return [
-            _turns(step),
-            f"int matters = 0; LANE matters |= {seed} != 0.0;",
-            "if (!matters) continue;",
-            *self._frozen_inside(step, held),
-            *self._blank(step),
-            f"LANE g{self.plan.buffers[inner.root][index]} += {seed};",
-            *self.backward(inner.steps, self._held_in(step, held)),
-            *bound,
-            "}",
-        ]
-
-    def _blank(self, step: Step) -> list[str]:
-        """Statements that zero the gradients of buffers that each iteration recomputes."""
-        own = (self.plan.buffers[number] for number in _loop_of(step).own)
-        return [f"memset(g{each.name}, 0, sizeof(double) * {each.rows} * LANES);" for each in own]
-
-    def _table_head(self, step: Step, node: Tabled) -> list[str]:
-        """The table and the head of the loop over its rows, closed by two braces."""
-        table, row = node.table, _loop_of(step).index
-        places = {name: [self.index[state] for state in states] for name, states in table.columns.items()}
-        return [
-            "{",
-            *_listed("double", row, {name: map(literal, values) for name, values in table.constants.items()}),
-            *_listed("int", row, {name: map(str, values) for name, values in places.items()}),
-            f"for (int {row} = 0; {row} < {table.rows}; ++{row}) {{",
-            *(f"const double {name} = d{row}[{row}][{i}];" for i, name in enumerate(table.constants)),
-            *(f"const int {name} = i{row}[{row}][{i}];" for i, name in enumerate(table.columns)),
-        ]
-
-    def _gathered(self, step: Step, node: Tabled) -> list[str]:
-        """Accumulate the value of a table row into the step's buffer."""
-        out, row, body = self._out(step), _loop_of(step).index, self.plan.buffers[_loop_of(step).root]
-        if node.pick is None:
-            return [f"LANE {out[row]} = {body[0]};"]
-        here = out["k"]
-        return [
-            f"if ({row} == 0) {loop(step.run)} LANE {here} = {body['k']};",
-            f"else {loop(step.run)} LANE {here} = {_MACRO[node.pick]}({here}, {body['k']});",
-        ]
-
-    def _tabled_back(self, step: Step, node: Tabled, held: Frozen) -> list[str]:
-        """Adjoint of a table, row by row: recompute, propagate for lanes whose extremum the row attains."""
-        inner, out = _loop_of(step), self._out(step)
-        root = self.plan.buffers[inner.root]
-        seeds = f"{loop(step.run)} LANE" if node.pick else "LANE"
-        own, body = (out["k"], root["k"]) if node.pick else (out[inner.index], root[0])
-        asked = f"matters[j] += fabs(g{own});"
-        hits = [
-            f"const double part = {body} == {own} ? g{own} : 0.0;",
-            f"g{own} -= part; g{body} += part; matters[j] += fabs(part);",
-        ]
-        one = [f"g{body} += g{own};", asked]
-        return [
-            *self._table_head(step, node),
-            "double matters[LANES] = {0}, any = 0.0;",
-            *self.forward(inner.steps, held),
-            *self._blank(step),
-            f"{seeds} {{ {' '.join(hits if node.pick else one)} }}",
-            "LANE any += matters[j];",
-            "if (any == 0.0) continue;",
-            *self.backward(inner.steps, held),
-            "}}",
-        ]
+    def _form(self, step: Step) -> StepForm:
+        return FORMS[type(step.node)](self, step)
 
 
-def _loop_of(step: Step) -> Loop:
-    assert step.inner is not None
-    return step.inner
+class StepForm(ABC):
+    """C code of one step, forward and adjoint."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        self.printer, self.plan, self.step = printer, printer.plan, step
+        self.node: Any = step.node
+        self.run = step.run
+        self.out = self.plan.buffers[step.number]
+        self.args = tuple(self.plan.buffers[number] for number in step.operands)
+        self.last = self.plan.samples - 1
+
+    @abstractmethod
+    def forward(self) -> list[str]:
+        """Return statements that compute the values."""
+
+    @abstractmethod
+    def backward(self) -> list[str]:
+        """Return statements that propagate the gradient of the values to the operands."""
+
+    def filled(self, value: float) -> list[str]:
+        """Return statements that give all instants one value."""
+        return [f"{loop(self.run)} LANE {self.out['k']} = {literal(value)};"]
 
 
-def _turns(step: Step) -> str:
-    """Head of the loop over the instants of a `freeze`."""
-    index, run = _loop_of(step).index, step.run
-    return f"for (int {index} = {run.start}; {index} <= {run.last}; ++{index}) {{"
+def loop(run: IndexRange, *, back: bool = False) -> str:
+    """Return the head of a loop over instants `k`."""
+    if back:
+        return f"for (int k = {run.last}; k >= {run.start}; --k)"
+    return f"for (int k = {run.start}; k <= {run.last}; ++k)"
 
 
-def _filled(out: Buffer, run: IndexRange, value: float) -> list[str]:
-    return [f"{loop(run)} LANE {out['k']} = {literal(value)};"]
+def _indented(lines: Iterable[str], by: int = 2) -> list[str]:
+    return [" " * by + line for line in lines]
 
 
-def _joined_back(out: Buffer, run: IndexRange, args: Sequence[Buffer]) -> list[str]:
-    lines = [f"{loop(run)} LANE {{", f"double left = g{out['k']};"]
-    for item in args:
-        lines += [
-            f"{{ const int hit = {item['k']} == {out['k']};",
-            f"g{item['k']} += hit ? left : 0.0; left = hit ? 0.0 : left; }}",
-        ]
-    return [*lines, "}"]
+# ---------------------------------------------------------------------- numbers
 
 
-def _fixed(num: ir.Num) -> bool:
-    """True if a number depends only on the first sample and the sample count, so that its gradient is 0."""
-    return any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """C expressions of a number's leaves at sample `k`, in lane `j`.
+
+    Attributes:
+        printer: of the step that holds the number.
+        indices: C name of a clamped sample index -> its C expression; independent of the lane.
+    """
+
+    printer: StepPrinter
+    indices: dict[str, str] = field(default_factory=dict)
+
+    def __call__(self, leaf: Leaf) -> str | None:
+        """Return the C expression of a leaf; None for a function that must be inlined."""
+        if isinstance(leaf, ir.FrozenVar):
+            return self.printer.held[leaf.name][0]
+        if not isinstance(leaf, ir.Extern):
+            return column(self.printer.index, leaf.name, self._instant(leaf))
+        key, plan = call_of(leaf), self.printer.plan
+        return (
+            None if key is None else plan.buffers[plan.calls[key] + leaf.output][self._instant(leaf.args[0])]
+        )
+
+    def _instant(self, leaf: ir.Num) -> str:
+        """Index of the sample at which a column is read; a clamped one stays within the plan."""
+        if not isinstance(leaf, ir.ShiftedSignal):
+            return "k"
+        steps, last = leaf.steps, self.printer.plan.samples - 1
+        index = f"k + ({steps})"
+        if not leaf.clamped:
+            return index
+        name = f"{'after' if steps > 0 else 'before'}{abs(steps)}"
+        self.indices[name] = f"{index} < {last} ? {index} : {last}" if steps > 0 else f"LATER({index}, 0)"
+        return name
+
+    def heads(self) -> str:
+        """Declarations of the clamped indices."""
+        return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
 def _pulled(num: ir.Num, seed: str, sight: Sight) -> list[str]:
@@ -381,9 +164,411 @@ def column(index: Mapping[str, int], name: str, k: str) -> str:
     return f"x[{where}][{k}][j]"
 
 
-def columns(index: Mapping[str, int]) -> Callable[[Leaf], str | None]:
-    """Return the C expressions of columns at sample `k`; None for other leaves, which are inlined."""
-    return lambda leaf: column(index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
+class _Margin(StepForm):
+    """Predicate."""
+
+    def forward(self) -> list[str]:
+        node, sight = self.node, Sight(self.printer)
+        writer = NumberWriter(sight)
+        margin = writer.number(node.num)
+        value = margin if node.sign > 0 else f"(-{margin})"
+        if node.guard:
+            value = f"({value} {'>' if node.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
+        body = " ".join([*writer.lines, f"bad[j] += NAN_IN({value});", f"{self.out['k']} = {value};"])
+        return [f"{loop(self.run)} {{ {sight.heads()} LANE {{ {body} }} }}"]
+
+    def backward(self) -> list[str]:
+        """Propagate the gradient, which is 0 where a number depends only on the sample count."""
+        num, sign = self.node.num, "" if self.node.sign > 0 else "-"
+        counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
+        if self.node.guard or counted:
+            return []
+        sight = Sight(self.printer)
+        inner = _pulled(num, f"{sign}g{self.out['k']}", sight)
+        return [f"{loop(self.run)} {{ {sight.heads()}", *inner, "}"]
+
+
+class _Call(StepForm):
+    """All components of a function of columns, at all samples."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.parts: list[ir.Extern] = self.node.components
+        self.outs = self.plan.buffers[step.number : step.number + len(self.parts)]
+
+    def _place(self, leaf: Leaf) -> str | None:
+        """C expression of a column at sample `k`; None for other leaves, which are inlined."""
+        return column(self.printer.index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
+
+    def forward(self) -> list[str]:
+        writer = NumberWriter(self._place)
+        values = map(writer.number, self.parts)
+        stores = [f"{out['k']} = {value};" for out, value in zip(self.outs, values, strict=True)]
+        return [f"{loop(self.run)} LANE {{ {' '.join([*writer.lines, *stores])} }}"]
+
+    def backward(self) -> list[str]:
+        writer = SlopeWriter(self._place, soft=False)
+        lines = writer.pulled((part, f"g{out['k']}") for out, part in zip(self.outs, self.parts, strict=True))
+        return [f"{loop(self.run)} LANE {{", *lines, "}"]
+
+
+# ---------------------------------------------- values of the operands at one instant
+
+
+class _Constant(StepForm):
+    """Truth constant."""
+
+    def forward(self) -> list[str]:
+        return self.filled(math.inf if self.node.value else -math.inf)
+
+    def backward(self) -> list[str]:
+        return []
+
+
+class _Extremum(StepForm):
+    """`and` or `or`; one operand per statement, since nested macros double in length."""
+
+    def forward(self) -> list[str]:
+        pick, (first, *others) = _MACRO[PICKS[self.node.op]], self.args
+        rest = " ".join(f"most = {pick}(most, {item['k']});" for item in others)
+        return [f"{loop(self.run)} LANE {{ double most = {first['k']}; {rest} {self.out['k']} = most; }}"]
+
+    def backward(self) -> list[str]:
+        lines = [f"{loop(self.run)} LANE {{", f"double left = g{self.out['k']};"]
+        for item in self.args:
+            lines += [
+                f"{{ const int hit = {item['k']} == {self.out['k']};",
+                f"g{item['k']} += hit ? left : 0.0; left = hit ? 0.0 : left; }}",
+            ]
+        return [*lines, "}"]
+
+
+class _AtStart(StepForm):
+    """Value at the first sample."""
+
+    def forward(self) -> list[str]:
+        return [f"{loop(self.run)} LANE {self.out['k']} = {self.args[0][0]};"]
+
+    def backward(self) -> list[str]:
+        return [f"{loop(self.run)} LANE g{self.args[0][0]} += g{self.out['k']};"]
+
+
+class _Shifted(StepForm):
+    """Value some samples later or earlier."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.there = f"k + ({self.node.steps})"
+
+    def forward(self) -> list[str]:
+        outside, there = math.inf if self.node.outside else -math.inf, self.there
+        if not self.args:
+            return self.filled(outside)
+        return [
+            loop(self.run),
+            f"  if ({there} < 0 || {there} > {self.last}) LANE {self.out['k']} = {literal(outside)};",
+            f"  else LANE {self.out['k']} = {self.args[0][there]};",
+        ]
+
+    def backward(self) -> list[str]:
+        if not self.args:
+            return []
+        there, seed = self.there, f"g{self.out['k']}"
+        within = f"{there} >= 0 && {there} <= {self.last}"
+        return [loop(self.run), f"  if ({within}) LANE g{self.args[0][there]} += {seed};"]
+
+
+# ---------------------------------------------------------------------- windows
+
+
+class _Windowed(StepForm):
+    """Extremum over a window, or `until` and its dual and mirrors.
+
+    The value at an instant is a loop over its window (`_scan`). Windows to the end or from the start of the
+    trace are computed by a recursion, with the value at the preceding instant (`_step`).
+    """
+
+    lanes = ""
+    """" LANE" if the adjoint of a window branches by lane."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.back = isinstance(self.node, (ir.PastTemporal, ir.Since))
+        self.pick = _MACRO[PICKS[self.node.op]]
+        self.window: ir.Window = self.node.window
+        self.before = self.out["k - 1" if self.back else "k + 1"]
+        self.recursive = self.window.hi is None and not self.run.single
+
+    @abstractmethod
+    def _scan(self) -> list[str]: ...
+
+    @abstractmethod
+    def _step(self) -> str: ...
+
+    @abstractmethod
+    def _scan_back(self) -> list[str]: ...
+
+    @abstractmethod
+    def _step_back(self) -> list[str]: ...
+
+    def forward(self) -> list[str]:
+        if not self.args:
+            return self.filled(neutral(PICKS[self.node.op]))
+        if not self.recursive:
+            return [f"{loop(self.run)} {{", *_indented(self._scan()), "}"]
+        empty = self._empty(f"LANE {self.out['k']} = {_WORST[self.pick]};")
+        return [*self._recursion(self._scan()), *empty, f"  else LANE {self.out['k']} = {self._step()};", "}"]
+
+    def backward(self) -> list[str]:
+        if not self.args:
+            return []
+        lines = self._scan_back()
+        if not self.recursive:
+            return [f"{loop(self.run)}{self.lanes} {{", *_indented(lines), "}"]
+        if self.lanes:
+            lines = ["LANE {", *_indented(lines), "}"]
+        head = [*self._recursion(lines, reverse=True), *self._empty("continue;")]
+        return [*head, "  else LANE {", *_indented(self._step_back(), 4), "  }", "}"]
+
+    def _recursion(self, lines: list[str], *, reverse: bool = False) -> list[str]:
+        """Head of the recursion, with statements for its first instant; `reverse`: in opposite direction."""
+        first = self.run.start if self.back else self.run.last
+        head = loop(self.run, back=self.back if reverse else not self.back)
+        return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
+
+    def _empty(self, statement: str) -> list[str]:
+        """The branch of instants whose past window is before the trace."""
+        late = self.back and earliest(self.run.start) < self.window.lo
+        return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
+
+    def _ends(self) -> tuple[str, str]:
+        """C expressions of the first and last sample of the window of `k`."""
+        lo, hi = self.window.lo, self.window.hi
+        if self.back:
+            return "0" if hi is None else f"LATER(k - {hi}, 0)", f"k - {lo}"
+        return f"k + {lo}", f"{self.last}" if hi is None else f"k + {hi}"
+
+
+class _WindowExtremum(_Windowed):
+    """Extremum of one operand over a window."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.next = f"k {'-' if self.back else '+'} {self.window.lo}"
+        """Sample that the window gains in a step of the recursion."""
+
+    def _scan(self) -> list[str]:
+        (first, stop), out, pick = self._ends(), self.out["k"], self.pick
+        return [
+            f"LANE {out} = {_WORST[pick]};",
+            f"for (int i = {first}; i <= {stop}; ++i) LANE {out} = {pick}({out}, {self.args[0]['i']});",
+        ]
+
+    def _step(self) -> str:
+        return f"{self.pick}({self.before}, {self.args[0][self.next]})"
+
+    def _scan_back(self) -> list[str]:
+        (first, stop), out, body = self._ends(), self.out["k"], self.args[0]["i"]
+        return [
+            f"double left[LANES]; LANE left[j] = g{out};",
+            f"for (int i = {first}; i <= {stop}; ++i) LANE {{",
+            f"  const int hit = {body} == {out};",
+            f"  g{body} += hit ? left[j] : 0.0; left[j] = hit ? 0.0 : left[j];",
+            "}",
+        ]
+
+    def _step_back(self) -> list[str]:
+        out, gained = self.out["k"], self.args[0][self.next]
+        return [
+            f"const int hit = {gained} == {out};",
+            f"g{gained} += hit ? g{out} : 0.0;",
+            f"g{self.before} += hit ? 0.0 : g{out};",
+        ]
+
+
+class _Until(_Windowed):
+    """`until` for MAX, `release` for MIN, and their mirrors in the past."""
+
+    lanes = " LANE"
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.dual = _DUAL[self.pick]
+        self.recursive = self.recursive and not self.window.lo
+
+    def _outwards(self) -> tuple[str, str]:
+        """Loop heads from `k` to the near end of the window, and on to its far end."""
+        first, stop = self._ends()
+        if self.back:
+            return f"for (int i = k; i > LATER({stop}, -1); --i)", f"for (int i = {stop}; i >= {first}; --i)"
+        return f"for (int i = k; i < {first}; ++i)", f"for (int i = {first}; i <= {stop}; ++i)"
+
+    def _scan(self) -> list[str]:
+        out, pick, dual = self.out["k"], self.pick, self.dual
+        held = f"held[j] = {dual}(held[j], {self.args[0]['i']});"
+        near, far = self._outwards()
+        return [
+            f"double held[LANES]; LANE {{ {out} = {_WORST[pick]}; held[j] = {_WORST[dual]}; }}",
+            *([f"{near} LANE {held}"] if self.window.lo else []),
+            f"{far} LANE {{",
+            f"  {held}",
+            f"  const double met = {dual}({self.args[1]['i']}, held[j]);",
+            f"  {out} = {pick}({out}, met);",
+            "}",
+        ]
+
+    def _step(self) -> str:
+        """`u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual."""
+        reached = f"{self.pick}({self.args[1]['k']}, {self.before})"
+        return f"{self.dual}({self.args[0]['k']}, {reached})"
+
+    def _scan_back(self) -> list[str]:
+        """Gradient at the first instant that attains the value: to its right or to the worst left side."""
+        out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
+        near, far = self._outwards()
+        worse = f"if ({left['i']} {less} {left['worst']}) worst = i;"
+        return [
+            f"if (g{out} == 0.0) continue;",
+            "int worst = k;",
+            *([f"{near} {worse}"] if self.window.lo else []),
+            f"{far} {{",
+            f"  {worse}",
+            f"  const int held = {left['worst']} {less} {right['i']};",
+            f"  if ((held ? {left['worst']} : {right['i']}) == {out}) {{",
+            f"    if (held) g{left['worst']} += g{out}; else g{right['i']} += g{out};",
+            "    break;",
+            "  }",
+            "}",
+        ]
+
+    def _step_back(self) -> list[str]:
+        out, left, right = self.out["k"], self.args[0]["k"], self.args[1]["k"]
+        return [
+            f"const double own = g{out};",
+            f"const int held = {left} == {out}, met = {right} == {out};",
+            f"g{left} += held ? own : 0.0;",
+            f"g{right} += !held & met ? own : 0.0;",
+            f"g{self.before} += !held & !met ? own : 0.0;",
+        ]
+
+
+# ------------------------------------------------------------------------ loops
+
+
+class _Repeated(StepForm):
+    """Step whose body is a loop of other steps."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        self.loop: Loop = self.node.loop
+        self.root = self.plan.buffers[self.loop.root]
+
+    def _blank(self) -> list[str]:
+        """Statements that zero the gradients of buffers that each iteration recomputes."""
+        own = (self.plan.buffers[number] for number in self.loop.own)
+        return [f"memset(g{each.name}, 0, sizeof(double) * {each.rows} * LANES);" for each in own]
+
+
+class _FreezeLoop(_Repeated):
+    """`freeze`: an iteration per instant binds the frozen values, then runs the steps."""
+
+    def __init__(self, printer: StepPrinter, step: Step) -> None:
+        super().__init__(printer, step)
+        index = self.loop.index
+        self.bound = [
+            (self.plan.buffers[number], num)
+            for number, (_, num) in zip(self.node.bound, self.node.node.bindings, strict=True)
+        ]
+        names = (name for name, _ in self.node.node.bindings)
+        held = dict(zip(names, (buffer for buffer, _ in self.bound), strict=True))
+        self.inner = replace(printer, held={**printer.held, **held})
+        self.head = f"for (int {index} = {self.run.start}; {index} <= {self.run.last}; ++{index}) {{"
+
+    def _iteration(self) -> list[str]:
+        lines = []
+        for buffer, num in self.bound:
+            sight = Sight(self.printer)
+            writer = NumberWriter(sight)
+            value = writer.number(num)
+            body = " ".join([*writer.lines, f"{buffer[0]} = {value};"])
+            lines.append(f"{{ const int k = {self.loop.index}; {sight.heads()} LANE {{ {body} }} }}")
+        return [*lines, *self.inner.forward(self.loop.steps)]
+
+    def forward(self) -> list[str]:
+        index = self.loop.index
+        result = f"  LANE {self.out[index]} = {self.root[index]};"
+        return [self.head, *_indented(self._iteration()), result, "}"]
+
+    def backward(self) -> list[str]:
+        index, bound = self.loop.index, []
+        seed = f"g{self.out[index]}"
+        for buffer, num in self.bound:
+            sight = Sight(self.printer)
+            back = _pulled(num, f"g{buffer[0]}", sight)
+            bound += [f"{{ const int k = {index}; {sight.heads()}", *back, "}"]
+        return [
+            self.head,
+            f"int matters = 0; LANE matters |= {seed} != 0.0;",
+            "if (!matters) continue;",
+            *self._iteration(),
+            *self._blank(),
+            f"LANE g{self.root[index]} += {seed};",
+            *self.inner.backward(self.loop.steps),
+            *bound,
+            "}",
+        ]
+
+
+class _TableLoop(_Repeated):
+    """Family of formulas: an iteration per row of its table."""
+
+    def _head(self) -> list[str]:
+        """The table and the head of the loop over its rows, closed by two braces."""
+        table, row, index = self.node.table, self.loop.index, self.printer.index
+        constants = {name: map(literal, values) for name, values in table.constants.items()}
+        columns = {name: [str(index[state]) for state in states] for name, states in table.columns.items()}
+        return [
+            "{",
+            *_listed("double", row, constants),
+            *_listed("int", row, columns),
+            f"for (int {row} = 0; {row} < {table.rows}; ++{row}) {{",
+            *(f"const double {name} = d{row}[{row}][{i}];" for i, name in enumerate(table.constants)),
+            *(f"const int {name} = i{row}[{row}][{i}];" for i, name in enumerate(table.columns)),
+        ]
+
+    def forward(self) -> list[str]:
+        row, here, body = self.loop.index, self.out["k"], self.root["k"]
+        if self.node.pick is None:
+            gathered = [f"LANE {self.out[row]} = {self.root[0]};"]
+        else:
+            gathered = [
+                f"if ({row} == 0) {loop(self.run)} LANE {here} = {body};",
+                f"else {loop(self.run)} LANE {here} = {_MACRO[self.node.pick]}({here}, {body});",
+            ]
+        return [*self._head(), *self.printer.forward(self.loop.steps), *gathered, "}}"]
+
+    def backward(self) -> list[str]:
+        """Row by row: recompute, then propagate for lanes whose extremum the row attains."""
+        if self.node.pick is None:
+            own, body = self.out[self.loop.index], self.root[0]
+            seeds = f"LANE {{ g{body} += g{own}; matters[j] += fabs(g{own}); }}"
+        else:
+            own, body = self.out["k"], self.root["k"]
+            seeds = (
+                f"{loop(self.run)} LANE {{ const double part = {body} == {own} ? g{own} : 0.0; "
+                f"g{own} -= part; g{body} += part; matters[j] += fabs(part); }}"
+            )
+        return [
+            *self._head(),
+            "double matters[LANES] = {0}, any = 0.0;",
+            *self.printer.forward(self.loop.steps),
+            *self._blank(),
+            seeds,
+            "LANE any += matters[j];",
+            "if (any == 0.0) continue;",
+            *self.printer.backward(self.loop.steps),
+            "}}",
+        ]
 
 
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
@@ -392,3 +577,20 @@ def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[s
         return []
     rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]
     return [f"static const {kind} {kind[0]}{row}[{len(rows)}][{len(entries)}] = {{", *rows, "};"]
+
+
+FORMS: Mapping[type, Callable[[StepPrinter, Step], StepForm]] = {
+    ir.Truth: _Constant,
+    ir.Predicate: _Margin,
+    ir.BoolOp: _Extremum,
+    ir.Temporal: _WindowExtremum,
+    ir.PastTemporal: _WindowExtremum,
+    ir.Until: _Until,
+    ir.Since: _Until,
+    ir.Shift: _Shifted,
+    ir.AtStart: _AtStart,
+    Called: _Call,
+    Frozen: _FreezeLoop,
+    Tabled: _TableLoop,
+}
+"""Class of a step's node -> its C code; `ir.Freeze` is scheduled as `Frozen`."""

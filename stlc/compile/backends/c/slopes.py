@@ -6,10 +6,10 @@ of `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import reduce
+from collections.abc import Callable, Iterable, Mapping
 
-from stlc.compile.backends.c.numbers import Leaf, NumberWriter
+from stlc.compile.backends.c.numbers import NumberWriter
+from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 
@@ -54,32 +54,27 @@ class SlopeWriter(NumberWriter):
         gathered = {f"g{place}": f"d{name}" for name, place in self._inputs.items()}
         return lines, gathered
 
-    def margin(self, cond: ir.Formula) -> str:
-        """Write the exact robustness of a state formula; return its C name."""
-        match cond:
-            case ir.Predicate(num, sign):
-                value = self.number(num)
-                return value if sign > 0 else self._apply("neg", [value])
-            case ir.BoolOp(op, items):
-                pick = "min" if op == "and" else "max"
-                return reduce(lambda a, b: self._apply(pick, [a, b]), map(self.margin, items))
-            case _:
-                return "0.0"
+    def pulled(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
+        """Return statements that compute numbers and add the gradients of their columns.
+
+        Args:
+            outputs: each number, with the C expression of the derivative of the output with respect to it.
+        """
+        seeds: dict[str, str] = {}
+        for num, own in outputs:
+            register = self.number(num)
+            seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
+        lines, gathered = self.backward(seeds)
+        return [*self.lines, *lines, *(f"{place} += {value};" for place, value in gathered.items())]
 
     def _load(self, place: str) -> str:
         register = super()._load(place)
         self._inputs[register] = place
         return register
 
-    def _inside(self) -> SlopeWriter:
-        inner = SlopeWriter(self._place, soft=self._soft)
-        inner.lines, inner._texts = self.lines, self._texts
-        inner._slopes, inner._inputs, inner._constants = self._slopes, self._inputs, self._constants
-        return inner
-
-    def _indicator(self, cond: ir.Formula) -> str:
+    def _indicator(self, cond: ir.Formula, sharpness: float | None) -> str:
         margin = self.margin(cond) if self._soft else ""
-        register = super()._indicator(cond)
+        register = super()._indicator(cond, sharpness)
         self._remember(register, [(margin, f"bump({margin}, slope)")] if self._soft else [])
         return register
 

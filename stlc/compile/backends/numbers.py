@@ -1,0 +1,98 @@
+"""Evaluation of numbers, common to the back ends: traversal, sharing, and inlining of functions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from copy import copy
+from typing import Any, Generic, Self, TypeAlias, TypeVar
+
+from stlc.compile.ir import nodes as ir
+
+
+class Untranslatable(Exception):  # noqa: N818 - not an error: another back end is used
+    """The IR has a node that a back end cannot express, such as a Python function of the system."""
+
+
+Leaf: TypeAlias = ir.Signal | ir.ShiftedSignal | ir.FrozenVar | ir.Extern
+V = TypeVar("V")
+
+
+class NumberEvaluator(ABC, Generic[V]):
+    """Evaluator of numbers to registers of a tape or names in C; back ends define the abstract methods.
+
+    Attributes:
+        bound: name of a signal -> its value, which replaces the column of that name.
+    """
+
+    def __init__(self) -> None:
+        self.bound: dict[str, V] = {}
+        self._seen: dict[int, tuple[ir.Num, V]] = {}
+        self._calls: dict[tuple[Any, ...], Self] = {}
+
+    def number(self, num: ir.Num) -> V:
+        """Return the value of a number, evaluated once."""
+        seen = self._seen.get(id(num))
+        if seen is None:
+            seen = self._seen[id(num)] = num, self._number(num)  # holds `num`, so that its id stays unique
+        return seen[1]
+
+    def margin(self, cond: ir.Formula) -> V:
+        """Return the exact robustness of a state formula."""
+        return self.number(margin_of(cond))
+
+    def _number(self, num: ir.Num) -> V:
+        match num:
+            case ir.Const(value):
+                return self._constant(value)
+            case ir.Op(name, args):
+                return self._function(name, [self.number(arg) for arg in args])
+            case ir.Indicator(cond, sharpness):
+                return self._indicator(cond, sharpness)
+            case ir.Where(cond, yes, no):
+                return self._choice(cond, self.number(yes), self.number(no))
+            case leaf:
+                return self._leaf(leaf)
+
+    def inlined(self, body: ir.Body, args: Sequence[V]) -> Self:
+        """Return the evaluator inside a function given as straight-line code, with its assignments bound."""
+        key = (id(body), *map(repr, args))
+        inner = self._calls.get(key)
+        if inner is None:
+            inner = self._calls[key] = copy(self)
+            inner.bound, inner._seen, inner._calls = dict(zip(body.formals, args, strict=True)), {}, {}
+            for name, num in body.lets:
+                inner.bound[name] = inner.number(num)
+        return inner
+
+    @abstractmethod
+    def _constant(self, value: float) -> V: ...
+
+    @abstractmethod
+    def _leaf(self, num: Leaf) -> V: ...
+
+    @abstractmethod
+    def _function(self, name: str, args: list[V]) -> V: ...
+
+    @abstractmethod
+    def _indicator(self, cond: ir.Formula, sharpness: float | None) -> V: ...
+
+    @abstractmethod
+    def _choice(self, cond: ir.Formula, yes: V, no: V) -> V: ...
+
+
+def margin_of(formula: ir.Formula) -> ir.Num:
+    """Return the robustness of a state formula as a number, with guards as ordinary predicates.
+
+    Raises:
+        Untranslatable: the formula is no state formula.
+    """
+    match formula:
+        case ir.Predicate(num, sign):
+            return num if sign > 0 else ir.Op("neg", (num,))
+        case ir.BoolOp(op, items):
+            return ir.Op("min" if op == "and" else "max", tuple(map(margin_of, items)))
+        case ir.Truth(value):
+            return ir.Const(float("inf") if value else float("-inf"))
+        case _:
+            raise Untranslatable(type(formula).__name__)
