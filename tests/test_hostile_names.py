@@ -152,10 +152,10 @@ def test_findings_are_as_many_as_there_are(layout: str, folder: Path, said: Said
 def test_hover_shows_names_and_comments_as_text() -> None:
     from markdown_it import MarkdownIt
 
-    from stlc.editor.document import Systems, look_at
+    from stlc.editor.document import Systems, analyse
     from stlc.editor.hover import hover
 
-    document_ = look_at(Source("h.stl", Path("h.stl").read_bytes().decode()), Systems())
+    document_ = analyse(Source("h.stl", Path("h.stl").read_bytes().decode()), Systems())
     reader = MarkdownIt("gfm-like", {"html": True, "linkify": False})
     for item in document_.spec.items:
         found = hover(document_, item.name_span.start + 1)

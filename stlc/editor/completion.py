@@ -24,9 +24,10 @@ from stlc.grammar.show.printer import own_name
 from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.units import SYMBOLS
 
-Kind: TypeAlias = Literal[
-    "keyword", "function", "unit", "tag", "type", "signal", "constant", "name", "member"
+OfferKind: TypeAlias = Literal[
+    "Keyword", "Function", "Unit", "Property", "Class", "Variable", "Constant", "Reference", "EnumMember"
 ]
+"""Names of completion item kinds of the language server protocol."""
 
 _PREFIX = re.compile(r"@?`?\w*\Z")
 _OF_MODULE = re.compile(r"(?<![\w.])`?([^\W\d]\w*)`?\s*\.\s*\Z")
@@ -34,7 +35,9 @@ _UNIT_PREFIX = re.compile(r"(?:[A-Za-zµ°Ω%][\w/^*·.°]*)?\Z")
 _SILENT = re.compile(r"""[^"\n]*(?:"[^"\n]*"[^"\n]*)*(?:(?:\#|//).*|"[^"\n]*)""")
 _PLAIN_WORDS = RESERVED | {*PRAGMAS, "as", "fn", "from"}
 _OPERATORS = {"AND": ("and",), "OR": ("or", "xor"), "IFF": ("iff",), "IMPLIES": ("implies",)}
-_KINDS: dict[str, Kind] = {"signal": "signal", "param": "signal", "const": "constant", "member": "member"}
+_KINDS: dict[str, OfferKind] = {
+    **{"signal": "Variable", "param": "Variable", "const": "Constant", "member": "EnumMember"}
+}
 _FIRST_UNITS = ("s", "steps", "ms", "min", "m", "m/s", "m/s^2", "rad", "deg", "1")
 
 
@@ -51,7 +54,7 @@ class Offer:
     """
 
     text: str
-    kind: Kind
+    kind: OfferKind
     detail: str = ""
     doc: str = ""
     order: int = 5
@@ -117,7 +120,7 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
     if "UNIT" in accepted:
         yield from _units()
     if "TIME_UNIT" in accepted:
-        yield from (Offer(unit, "unit", order=1) for unit in ("s", "ms", "us", "ns", "min", "h", "steps"))
+        yield from (Offer(unit, "Unit", order=1) for unit in ("s", "ms", "us", "ns", "min", "h", "steps"))
     if "NAME" not in accepted:
         return
     if "NUMBER" in accepted:
@@ -130,7 +133,7 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
 def _everything(document: Document, offset: int) -> Iterator[Offer]:
     yield from _names(document, offset)
     yield from _functions()
-    yield from (Offer(word, "keyword", doc=KEYWORDS.get(word, ""), order=7) for word in sorted(_preferred()))
+    yield from (Offer(word, "Keyword", doc=KEYWORDS.get(word, ""), order=7) for word in sorted(_preferred()))
 
 
 def _preferred() -> set[str]:
@@ -157,36 +160,36 @@ def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
         elif terminal.startswith("_") and terminal[1:].lower() in _PLAIN_WORDS:
             words.append(terminal[1:].lower())
     for word in words:
-        yield Offer(word, "keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
+        yield Offer(word, "Keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:
     """Value symbols in scope, nearest first."""
     for symbol in inside(document.spec, offset):
-        yield Offer(own_name(symbol.name), "name", about(document, symbol), order=1)
+        yield Offer(own_name(symbol.name), "Reference", about(document, symbol), order=1)
     for symbol in document.names.values.values():
-        kind = _KINDS.get(symbol.kind, "name")
+        kind = _KINDS.get(symbol.kind, "Reference")
         yield Offer(own_name(symbol.name), kind, summary(document, symbol), about(document, symbol), 2)
-    yield from (Offer(name, "constant", text, order=3) for name, text in BUILT_IN.items())
+    yield from (Offer(name, "Constant", text, order=3) for name, text in BUILT_IN.items())
 
 
 def _functions() -> Iterator[Offer]:
-    yield from (Offer(name, "function", doc=FUNCTIONS.get(name, ""), order=6) for name in callable_names())
+    yield from (Offer(name, "Function", doc=FUNCTIONS.get(name, ""), order=6) for name in callable_names())
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
     """Completions where only a name can stand: types, or undeclared states of the system."""
     words = [lexeme.text for lexeme in lexemes(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):
-        yield from (Offer(name, "type", text) for name, text in TYPES.items())
-        yield from (Offer(own_name(name), "type", "enum") for name in document.names.types)
+        yield from (Offer(name, "Class", text) for name, text in TYPES.items())
+        yield from (Offer(own_name(name), "Class", "enum") for name in document.names.types)
     elif document.system is not None and "signal" in words:
         declared = document.names.values
         for column in document.system.signature.columns:
             if column.name not in declared and "[" not in column.name:
                 unit = f" [{column.unit}]" if column.unit.text else ""
                 text = f"{own_name(column.name)}{unit}"
-                yield Offer(text, "signal", f"a state of {document.system.path.name}")
+                yield Offer(text, "Variable", f"a state of {document.system.path.name}")
 
 
 def _shared(document: Document, alias: str) -> Iterator[Offer]:
@@ -194,15 +197,15 @@ def _shared(document: Document, alias: str) -> Iterator[Offer]:
     for module in document.modules:
         if module.alias == alias:
             for item in shared(module):
-                kind: Kind = "function" if isinstance(item, ast.Def) else "name"
+                kind: OfferKind = "Function" if isinstance(item, ast.Def) else "Reference"
                 yield Offer(own_name(item.name), kind, "", about_shared(item, module.key))
 
 
 def _units() -> Iterator[Offer]:
     rest: Iterable[str] = (unit for unit in SYMBOLS if unit not in _FIRST_UNITS)
-    yield from (Offer(unit, "unit", order=1) for unit in _FIRST_UNITS)
-    yield from (Offer(unit, "unit", order=8) for unit in rest)
+    yield from (Offer(unit, "Unit", order=1) for unit in _FIRST_UNITS)
+    yield from (Offer(unit, "Unit", order=8) for unit in rest)
 
 
 def _tags() -> Iterator[Offer]:
-    yield from (Offer(f"@{name}", "tag", text) for name, text in sorted(TAGS.items()))
+    yield from (Offer(f"@{name}", "Property", text) for name, text in sorted(TAGS.items()))

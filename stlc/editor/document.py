@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.nodes import Window
 from stlc.compile.ir.support import reach
+from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
@@ -47,8 +48,8 @@ class Finding:
 
     Attributes:
         diagnostic: as on the command line.
-        span: its place, always in the edited text.
-        mild: it prevents training, not monitoring.
+        span: place in the edited text.
+        mild: whether it prevents training but not monitoring.
     """
 
     diagnostic: Diagnostic
@@ -63,9 +64,9 @@ class Document:
     Attributes:
         source: the text, under the path of its file.
         spec: syntax tree of the declarations without syntax errors.
-        unread: diagnostics of the others.
-        system: declaration of the system that it names, or None.
-        missing: the reason if the named system cannot be loaded.
+        unread: diagnostics of the declarations with syntax errors.
+        system: declaration of the system that the text names, or None.
+        missing: diagnostics of a named system that cannot be loaded.
     """
 
     source: Source
@@ -76,12 +77,12 @@ class Document:
 
     @cached_property
     def names(self) -> SymbolNames:
-        """Its symbols and their occurrences."""
+        """Symbols of the text and their occurrences."""
         return names_of(self.spec)
 
     @property
     def grid(self) -> Grid:
-        """Time step and horizon of its system."""
+        """Time step and horizon of the system; empty without one."""
         return Grid() if self.system is None else Grid(self.system.dt, self.system.horizon)
 
     @cached_property
@@ -100,19 +101,14 @@ class Document:
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings of `stlc lint`, in the order of the text.
-
-        Errors that prevent training but not monitoring are mild.
-        """
+        """Findings of `stlc lint`, in the order of the text."""
         found = [self._about_system(self.missing)] if self.missing else []
-        said = self.unread or lint(self.source, within=self._surroundings())
-        errors = {one.code for one in said if one.severity == "error"}
+        within = None if self.system is None else Surroundings(self.system.interface(), self.grid)
+        linted = self.unread or lint(self.source, within=within)
+        errors = {one.code for one in linted if one.severity == "error"}
         mild = bool(errors) and errors <= _ONLY_FOR_TRAINING
-        found += [replace(self._place(one), mild=mild and one.severity == "error") for one in said]
+        found += [replace(self._place(one), mild=mild and one.severity == "error") for one in linted]
         return tuple(sorted(found, key=lambda one: one.span.start))
-
-    def _surroundings(self) -> Surroundings | None:
-        return None if self.system is None else Surroundings(self.system.interface(), self.grid)
 
     def _place(self, finding: Diagnostic) -> Finding:
         """A finding placed in this text; one in another file is placed where that file is named."""
@@ -158,8 +154,8 @@ def _load(path: Path) -> SystemDecl | StlcError:
         return error
 
 
-def look_at(source: Source, systems: Systems) -> Document:
-    """Analyse a text."""
+def analyse(source: Source, systems: Systems) -> Document:
+    """Analyse a text with the system that it names."""
     spec, unread = read(source)
     if spec.system is None:
         return Document(source, spec, unread, None, ())
@@ -266,8 +262,8 @@ class Meaning:
     def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
         """The interval written at `span`, and its window in steps if the grid is known."""
         for formula in self.formulas.values():
-            for node in _temporal(formula):
-                if node.interval.span == span:
+            for node in nodes(formula):
+                if isinstance(node, typed.Temporal | typed.Until) and node.interval.span == span:
                     return node.interval, self._window(node)
         return None
 
@@ -314,19 +310,6 @@ def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
     return found
 
 
-def _temporal(formula: object) -> Iterator[typed.Temporal | typed.Until]:
-    """Every temporal operator of a formula."""
-    if isinstance(formula, tuple):
-        for part in formula:
-            yield from _temporal(part)
-    elif isinstance(formula, typed.Node):
-        if isinstance(formula, typed.Temporal | typed.Until):
-            yield formula
-        for one in fields(formula):
-            if one.name not in ("span", "interval", "num"):
-                yield from _temporal(getattr(formula, one.name))
-
-
 # ---------------------------------------------------------------------- modules
 
 
@@ -335,9 +318,9 @@ class Borrowed:
     """A name imported from a module: the part after the dot.
 
     Attributes:
-        span: of the name.
-        module: its module.
-        item: its declaration there; None where the module has no such name.
+        span: place of the name in the text.
+        module: the imported module.
+        item: declaration of the name in the module; None where it has no such name.
     """
 
     span: Span

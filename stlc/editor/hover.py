@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from fractions import Fraction
 
 from stlc.compile.frontend.modules import STD
@@ -18,6 +18,7 @@ from stlc.escape import markdown, markdown_code, screen
 from stlc.grammar import ast
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.grammar.show.printer import show
+from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 from stlc.signature import Column
 from stlc.source import Span
@@ -89,7 +90,7 @@ def _grid_value(word: str, grid: Grid) -> str:
 
 
 def duration(steps: int, grid: Grid) -> str:
-    """`2.5 s = 25 steps`."""
+    """A number of steps in seconds and in steps: `2.5 s = 25 steps`."""
     count = f"{steps} step{'' if steps == 1 else 's'}"
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
@@ -103,7 +104,7 @@ def about(document: Document, symbol: Symbol) -> str:
     parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
     if item is not None and item.doc and symbol.kind not in ("argument", "member"):
-        parts.append(_told(item.doc))
+        parts.append(_comment(item.doc))
     return "\n\n".join(parts)
 
 
@@ -112,7 +113,7 @@ def _code(item: ast.Item) -> str:
     return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
 
 
-def _told(doc: str) -> str:
+def _comment(doc: str) -> str:
     """A `##` comment with mark-up escaped."""
     return "\n".join(map(markdown, doc.split("\n")))
 
@@ -120,7 +121,7 @@ def _told(doc: str) -> str:
 def about_shared(item: ast.Item, key: str) -> str:
     """Hover text of a declaration in an imported file."""
     origin = "library std" if key == STD else markdown_code(key)
-    parts = [_code(item), f"from {origin}", _told(item.doc)]
+    parts = [_code(item), f"from {origin}", _comment(item.doc)]
     return "\n\n".join(filter(None, parts))
 
 
@@ -199,16 +200,12 @@ def _ahead(document: Document, name: str) -> str:
 # ------------------------------------------------------------------- temporal words
 
 
-def _temporal_at(node: object, offset: int) -> ast.Temporal | ast.Until | None:
+def _temporal_at(spec: ast.Spec, offset: int) -> ast.Temporal | ast.Until | None:
     """The innermost temporal operator with its word or interval under the cursor."""
-    found: ast.Temporal | ast.Until | None = None
-    for part in _parts(node):
-        if isinstance(part, ast.Node) and part.span.start <= offset <= part.span.end:
-            if isinstance(part, ast.Temporal | ast.Until) and _touches(part, offset):
-                found = part
-            found = _temporal_at(part, offset) or found
-        elif isinstance(part, tuple):
-            found = _temporal_at(part, offset) or found
+    found = None
+    for node in descendants(spec):
+        if isinstance(node, ast.Temporal | ast.Until) and _touches(node, offset):
+            found = node
     return found
 
 
@@ -220,13 +217,6 @@ def _touches(node: ast.Temporal | ast.Until, offset: int) -> bool:
 
 def _within(node: ast.Temporal | ast.Until, offset: int) -> bool:
     return node.interval is not None and node.interval.span.start <= offset <= node.interval.span.end
-
-
-def _parts(node: object) -> Iterator[object]:
-    if isinstance(node, tuple):
-        yield from node
-    elif isinstance(node, ast.Node):
-        yield from (getattr(node, one.name) for one in fields(node) if one.name not in ("span", "name_span"))
 
 
 def _about_temporal(document: Document, node: ast.Temporal | ast.Until) -> str:

@@ -23,7 +23,7 @@ class RenameError(Exception):
 
 
 _FROM_ELSEWHERE = ("module", "extern", "param")
-"""Kinds of symbols that other files may refer to by name; they cannot be renamed safely."""
+"""Kinds of symbols that other files may refer to by name, so that they cannot be renamed safely."""
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:

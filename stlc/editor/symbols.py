@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias, cast
 
 from stlc.grammar import ast
 from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.traverse import children, descendants
 from stlc.source import Span
 
 Kind: TypeAlias = Literal[
@@ -26,17 +27,10 @@ Kind: TypeAlias = Literal[
     "module",
 ]
 
-_KINDS: Mapping[type[ast.Item], Kind] = {
-    ast.Signal: "signal",
-    ast.Const: "const",
-    ast.Param: "param",
-    ast.Enum: "enum",
-    ast.Region: "region",
-    ast.Def: "def",
-    ast.Extern: "extern",
-    ast.Require: "require",
-    ast.Assume: "assume",
-}
+
+def _kind(item: ast.Item) -> Kind:
+    """Kind of a declaration: the keyword, which names the class of its node."""
+    return cast("Kind", type(item).__name__.lower())
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +39,9 @@ class Symbol:
 
     Attributes:
         name: without backticks.
-        kind: of what.
-        span: where its name is declared.
-        item: its declaration, or the one that contains it; None for a module and for a variable.
+        kind: sort of declaration.
+        span: place where the name is declared.
+        item: the declaration, or the one that contains it; None for a module and for a variable.
     """
 
     name: str
@@ -108,7 +102,7 @@ def names_of(spec: ast.Spec) -> SymbolNames:
         values.setdefault(symbol.name, symbol)
     for item in spec.items:
         space = {ast.Enum: types, ast.Require: rules, ast.Assume: rules}.get(type(item), values)
-        space.setdefault(item.name, Symbol(item.name, _KINDS[type(item)], item.name_span, item))
+        space.setdefault(item.name, Symbol(item.name, _kind(item), item.name_span, item))
         if isinstance(item, ast.Enum):
             for lexeme in _member_names(item):
                 member = _symbol(lexeme, "member", item.span, item)
@@ -127,7 +121,7 @@ def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
             found.extend(_arguments(item).values())
             found.extend(
                 symbol
-                for node in _nodes(item)
+                for node in descendants(item)
                 if node.span.start <= offset <= node.span.end
                 for symbol in _bound(node).values()
             )
@@ -201,7 +195,7 @@ def _all(spec: ast.Spec, names: SymbolNames) -> Iterator[Occurrence]:
 
 
 def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
-    own = Symbol(item.name, _KINDS[type(item)], item.name_span, item)
+    own = Symbol(item.name, _kind(item), item.name_span, item)
     yield Occurrence(item.name_span, own)
     if isinstance(item, ast.Enum):
         for lexeme in _member_names(item):
@@ -210,11 +204,11 @@ def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
     arguments = _arguments(item)
     yield from (Occurrence(symbol.span, symbol) for symbol in arguments.values())
     scope = {**names.values, **arguments}
-    for part in _parts(item):
+    for part in children(item):
         yield from _uses(part, scope, names)
 
 
-def _uses(node: object, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
+def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
     """Occurrences of bound names in a part of a declaration, without built-in names."""
     match node:
         case ast.Name(span, name, quoted):
@@ -232,15 +226,11 @@ def _uses(node: object, scope: Scope, names: SymbolNames) -> Iterator[Occurrence
             yield from _named_arguments(args, scope[name])
         case _:
             pass
-    bound = _bound(node) if isinstance(node, ast.Node) else {}
+    bound = _bound(node)
     yield from (Occurrence(symbol.span, symbol) for symbol in bound.values())
-    for part in _parts(node):
-        yield from _uses(part, {**scope, **bound} if _sees(node, part) else scope, names)
-
-
-def _sees(node: object, part: object) -> bool:
-    """True if the variables that a node binds are in scope in this part of it."""
-    return isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
+    for part in children(node):
+        inner = isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
+        yield from _uses(part, {**scope, **bound} if inner else scope, names)
 
 
 def _named_arguments(args: tuple[ast.Arg, ...], called: Symbol) -> Iterator[Occurrence]:
@@ -249,18 +239,3 @@ def _named_arguments(args: tuple[ast.Arg, ...], called: Symbol) -> Iterator[Occu
         if arg.name in formals:
             word = _words(arg.span)[0]
             yield Occurrence(arg.span.source.span(word.start, word.end), formals[arg.name])
-
-
-def _nodes(node: object) -> Iterator[ast.Node]:
-    for part in _parts(node):
-        if isinstance(part, ast.Node):
-            yield part
-        yield from _nodes(part)
-
-
-def _parts(node: object) -> Iterator[object]:
-    """Child nodes."""
-    if isinstance(node, tuple):
-        yield from node
-    elif isinstance(node, ast.Node):
-        yield from (getattr(node, one.name) for one in fields(node) if one.name not in ("span", "name_span"))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stlc.editor.document import Document, Systems, look_at
+from stlc.editor.document import Document, Systems, analyse
 from stlc.source import Source
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -17,7 +17,7 @@ TRAFFIC = ROOT / "specs/traffic.stl"
 
 @pytest.fixture
 def traffic() -> Document:
-    return look_at(Source(str(TRAFFIC), TRAFFIC.read_text(encoding="utf-8")), Systems())
+    return analyse(Source(str(TRAFFIC), TRAFFIC.read_text(encoding="utf-8")), Systems())
 
 
 @pytest.fixture
@@ -26,6 +26,6 @@ def write() -> Callable[[str], tuple[Document, int]]:
 
     def look(text: str) -> tuple[Document, int]:
         offset = max(text.find("│"), 0)
-        return look_at(Source("untitled:1", text.replace("│", "")), Systems()), offset
+        return analyse(Source("untitled:1", text.replace("│", "")), Systems()), offset
 
     return look

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.editor.completion import complete
-from stlc.editor.document import Systems, definition, look_at, outline
+from stlc.editor.document import Systems, analyse, definition, outline
 from stlc.editor.hover import hover
 from stlc.editor.rename import RenameError, rename
 from stlc.source import Source
@@ -21,7 +21,7 @@ SYSTEMS = Systems()
 
 
 def ask_everything(text: str, offset: int) -> None:
-    document = look_at(Source("untitled:1", text), SYSTEMS)
+    document = analyse(Source("untitled:1", text), SYSTEMS)
     for finding in document.findings:
         assert 0 <= finding.span.start <= finding.span.end <= len(text)
     found = hover(document, offset)

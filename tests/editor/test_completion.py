@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from stlc.editor.completion import complete
-from stlc.editor.document import Systems, look_at
+from stlc.editor.document import Systems, analyse
 from stlc.source import Source
 
 HEAD = "enum Mode { off = 0, on = 1 }\nsignal x [m] in [0, 9]\nsignal m : Mode\nconst c = 2 m\n"
@@ -72,7 +72,7 @@ def test_a_name_of_ones_own_is_not_guessed(write):
 def test_states_that_the_system_has(traffic):
     text = traffic.source.text.replace("state signal dx [m] in [-1, 10]", "state signal ")
     offset = text.index("state signal ", text.index("tau [s]")) + len("state signal ")
-    document = look_at(Source(traffic.source.name, text), Systems())
+    document = analyse(Source(traffic.source.name, text), Systems())
     assert [offer.text for offer in complete(document, offset).offers] == ["dx [m]"]
 
 

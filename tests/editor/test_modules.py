@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stlc.editor.completion import complete
-from stlc.editor.document import Document, Systems, definition, look_at
+from stlc.editor.document import Document, Systems, analyse, definition
 from stlc.editor.hover import hover
 from stlc.source import Source
 
@@ -22,7 +22,7 @@ def typed(tmp_path):
         head = 'import std\nimport "limits.stl" as m\nsignal x [m]\nsignal go : bool\n'
         offset = len(head) + text.index("│")
         path = tmp_path / "main.stl"
-        return look_at(Source(str(path), head + text.replace("│", "")), Systems()), offset
+        return analyse(Source(str(path), head + text.replace("│", "")), Systems()), offset
 
     return look
 
@@ -65,7 +65,7 @@ def test_a_name_that_the_file_does_not_have(typed):
 
 def test_a_file_that_is_not_there(tmp_path):
     text = 'import "nothing.stl" as m\nsignal x\nrequire r: x > m.top'
-    document = look_at(Source(str(tmp_path / "main.stl"), text), Systems())
+    document = analyse(Source(str(tmp_path / "main.stl"), text), Systems())
     assert document.modules == ()
     assert "E106" in {one.diagnostic.code for one in document.findings}
     assert hover(document, text.index("x >")) is not None

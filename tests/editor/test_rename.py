@@ -8,7 +8,7 @@ import pytest
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
-from stlc.editor.document import Systems, look_at
+from stlc.editor.document import Systems, analyse
 from stlc.editor.rename import RenameError, apply, can_rename, rename
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
@@ -99,7 +99,7 @@ def test_requirements_may_be_called_as_signals(write):
 def test_the_formulas_stay_whatever_is_renamed(path):
     """Every definition, constant, region, enum and argument of the six benchmarks, one after the other."""
     text = path.read_text(encoding="utf-8")
-    document = look_at(Source("untitled:1", text), Systems())
+    document = analyse(Source("untitled:1", text), Systems())
     before = formulas(text)
     assert before
     for one in document.names.occurrences[::2]:
