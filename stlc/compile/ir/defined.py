@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,25 +38,22 @@ class _Definedness(Analysis[Defined]):
     def constant(self) -> Defined:
         return np.ones(self.samples, dtype=bool)
 
-    def all_of(self, parts: Sequence[Defined]) -> Defined:
-        return reduce(np.logical_and, parts)
-
-    def ahead(self, body: Defined, window: ir.Window) -> Defined:
-        return _throughout(body, *self._future(window))
-
-    def back(self, body: Defined, window: ir.Window) -> Defined:
-        return _throughout(body, *self._past(window))
-
-    def until(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """Definedness of `until`; the left side is read from now on, and now in any case."""
-        (first, last), now = self._future(window), np.arange(self.samples)
-        return _throughout(left, now, np.maximum(last, now)) & _throughout(right, first, last)
-
-    def since(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """Definedness of `since`; neither side is read where the window lies before the trace."""
-        (first, last), now = self._past(window), np.arange(self.samples)
-        held = _throughout(left, np.where(last < 0, now + 1, first), now)
-        return held & _throughout(right, first, last)
+    def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
+        """Return where all read operands are defined; for an empty window none is read."""
+        if all(each == ir.NOW for each in offsets):
+            return reduce(np.logical_and, parts)
+        if len(parts) == 1:
+            return _throughout(parts[0], *self._instants(*offsets[0]))
+        ranges, now = [self._instants(*each) for each in offsets], np.arange(self.samples)
+        unread = ranges[-1].last < ranges[-1].first
+        return reduce(
+            np.logical_and,
+            (
+                _throughout(part, np.where(unread, now + 1, read.first), np.where(unread, now, read.last))
+                for part, read in zip(parts[:-1], ranges[:-1], strict=True)
+            ),
+            _throughout(parts[-1], *ranges[-1]),
+        )
 
     def shift(self, body: Defined, node: ir.Shift) -> Defined:
         there = np.arange(self.samples) + node.steps
@@ -66,18 +63,17 @@ class _Definedness(Analysis[Defined]):
     def at_start(self, body: Defined) -> Defined:
         return np.full(self.samples, body[0])
 
-    def _future(self, window: ir.Window) -> tuple[_Instants, _Instants]:
-        """First and last instant of each sample's future window."""
+    def _instants(self, first: int | None, last: int | None) -> _Ranges:
+        """First and last instant of a window at each sample; past windows are cut at the start."""
         now = np.arange(self.samples)
-        if window.hi is not None:
-            return now + window.lo, now + window.hi
-        beyond = now + window.lo >= self.samples
-        return now + window.lo, np.where(beyond, self.samples, self.samples - 1)
+        start = np.zeros_like(now) if first is None else np.maximum(now + first, 0)
+        end = np.where(start < self.samples, self.samples - 1, self.samples) if last is None else now + last
+        return _Ranges(start, end)
 
-    def _past(self, window: ir.Window) -> tuple[_Instants, _Instants]:
-        now = np.arange(self.samples)
-        first = np.zeros_like(now) if window.hi is None else np.maximum(now - window.hi, 0)
-        return first, now - window.lo
+
+class _Ranges(NamedTuple):
+    first: _Instants
+    last: _Instants
 
 
 def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:

@@ -6,9 +6,10 @@ common sub-expressions are found by equality.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 from stlc.source import Span
 
@@ -121,6 +122,37 @@ def at_first(column: Signal) -> ShiftedSignal:
 # --------------------------------------------------------------------- formulas
 
 
+class Offsets(NamedTuple):
+    """Instants relative to now, both ends included, at which an operator reads an operand.
+
+    Attributes:
+        first: least offset, negative in the past; None: from the start of the trace.
+        last: greatest offset; None: to the end of the trace.
+    """
+
+    first: int | None
+    last: int | None
+
+
+NOW = Offsets(0, 0)
+
+
+class Operator:
+    """Base of formulas whose value follows from their operands at instants relative to now.
+
+    Attributes:
+        names: the operator that is a minimum (over its window), and its dual, a maximum.
+    """
+
+    __slots__ = ()
+    names: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """Offsets of each operand, in field order; where the last operand has no instant, none is read."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """Window of steps lo..hi, both included, relative to now; `hi` None: to the end of the trace.
@@ -130,6 +162,30 @@ class Window:
 
     lo: int
     hi: int | None
+
+
+class Windowed(Operator):
+    """Base of operators with a window, over which the last operand is read.
+
+    Attributes:
+        back: the window lies in the past, cut at the start of the trace.
+    """
+
+    __slots__ = ()
+    op: str
+    window: Window
+    back: ClassVar[bool] = False
+
+    @property
+    def window_offsets(self) -> Offsets:
+        """The window as offsets."""
+        lo, hi = self.window.lo, self.window.hi
+        return Offsets(None if hi is None else -hi, -lo) if self.back else Offsets(lo, hi)
+
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """The window, for the one operand."""
+        return (self.window_offsets,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,18 +212,25 @@ class Predicate:
 
 
 @dataclass(frozen=True, slots=True)
-class BoolOp:
+class BoolOp(Operator):
     """min (`and`) or max (`or`) of at least two formulas."""
 
+    names: ClassVar = ("and", "or")
     op: Literal["and", "or"]
     items: tuple[Formula, ...]
     span: Span | None = field(default=None, compare=False, repr=False)
 
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """Now, for every item."""
+        return (NOW,) * len(self.items)
+
 
 @dataclass(frozen=True, slots=True)
-class Temporal:
+class Temporal(Windowed):
     """min (`always`) or max (`eventually`) over a window of the future."""
 
+    names: ClassVar = ("always", "eventually")
     op: Literal["always", "eventually"]
     window: Window
     body: Formula
@@ -175,9 +238,11 @@ class Temporal:
 
 
 @dataclass(frozen=True, slots=True)
-class PastTemporal:
+class PastTemporal(Windowed):
     """min (`historically`) or max (`once`) over a window of the past, cut at the start of the trace."""
 
+    names: ClassVar = ("historically", "once")
+    back: ClassVar = True
     op: Literal["historically", "once"]
     window: Window
     body: Formula
@@ -185,29 +250,42 @@ class PastTemporal:
 
 
 @dataclass(frozen=True, slots=True)
-class Until:
+class Until(Windowed):
     """sup over t' in the window of min(right(t'), inf over [t, t'] of left); `release` is its dual."""
 
+    names: ClassVar = ("release", "until")
     op: Literal["until", "release"]
     window: Window
     left: Formula
     right: Formula
     span: Span | None = field(default=None, compare=False, repr=False)
 
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """From now to the end of the window, and the window."""
+        return Offsets(0, self.window.hi), self.window_offsets
+
 
 @dataclass(frozen=True, slots=True)
-class Since:
+class Since(Windowed):
     """Mirror of `Until` in the past, with `left` required at both ends; `trigger` is its dual."""
 
+    names: ClassVar = ("trigger", "since")
+    back: ClassVar = True
     op: Literal["since", "trigger"]
     window: Window
     left: Formula
     right: Formula
     span: Span | None = field(default=None, compare=False, repr=False)
 
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """From the far end of the window to now, and the window."""
+        return Offsets(self.window_offsets.first, 0), self.window_offsets
+
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class Shift(Operator):
     """Value `steps` later (negative: earlier).
 
     `outside` is the value beyond the ends of the trace: None is undefined, as for windows; False is used by
@@ -220,6 +298,11 @@ class Shift:
     outside: bool | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
     weak: bool = False
+
+    @property
+    def offsets(self) -> tuple[Offsets, ...]:
+        """One instant."""
+        return (Offsets(self.steps, self.steps),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,3 +328,13 @@ class AtStart:
 Formula: TypeAlias = (
     Truth | Predicate | BoolOp | Temporal | PastTemporal | Until | Since | Shift | Freeze | AtStart
 )
+
+OPERATORS: Mapping[str, Any] = MappingProxyType(
+    {name: kind for kind in get_args(Formula) if issubclass(kind, Operator) for name in kind.names}
+)
+"""Name of an operator -> its node."""
+
+DUAL: Mapping[str, Any] = MappingProxyType(
+    {name: dual for kind in OPERATORS.values() for name, dual in (kind.names, kind.names[::-1])}
+)
+"""Operator -> the operator of its negation."""

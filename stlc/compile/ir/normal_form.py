@@ -9,23 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
-from typing import Any, Literal, TypeAlias, assert_never
+from typing import Any, Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.nodes import DUAL
 from stlc.compile.ir.traverse import map_children
 
 Sign: TypeAlias = Literal[1, -1]
-
-DUAL: dict[str, Any] = {
-    "and": "or",
-    "always": "eventually",
-    "once": "historically",
-    "until": "release",
-    "since": "trigger",
-}
-DUAL |= {dual: op for op, dual in DUAL.items()}
-"""Operator -> the operator of its negation."""
 
 
 def flip(sign: Sign) -> Sign:
@@ -38,25 +29,24 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
 
     `not` remains before predicates, `since`, `rise`, `fall`, `prev`, `next` and `Recalled` nodes.
     """
+    op = getattr(formula, "op", "")
     match formula:
         case typed.Truth(_, value):
             return formula if sign > 0 else replace(formula, value=not value)
-        case typed.Predicate() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
-            inner = map_children(formula, formulas=normal)
-            return inner if sign > 0 else typed.Not(formula.span, inner)
         case typed.Not(_, body):
             return normal(body, flip(sign))
         case typed.Until(_, "unless"):
             return normal(_unless(formula), sign)
         case typed.Logic(_, "->" | "<->" | "xor"):
             return _implication(formula, sign)
-        case typed.Logic() | typed.Temporal() | typed.Until():
-            signed = formula if sign > 0 else replace(formula, op=DUAL[formula.op])
-            return map_children(signed, formulas=lambda part: normal(part, sign))
         case typed.Freeze():
             return map_children(formula, formulas=lambda part: normal(part, sign))
+        case _ if op in DUAL and op != "since":
+            signed = formula if sign > 0 else replace(formula, op=DUAL[op])
+            return map_children(signed, formulas=lambda part: normal(part, sign))
         case _:
-            assert_never(formula)
+            inner = map_children(formula, formulas=normal)
+            return inner if sign > 0 else typed.Not(formula.span, inner)
 
 
 def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:

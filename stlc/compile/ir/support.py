@@ -1,8 +1,8 @@
 """The support of a formula: lookback, lookahead and signals.
 
-All are bottom-up analyses: `Analysis` gives the value of a node from those of its operands, `fold` traverses.
-Windows of the past are cut at the start of the trace, so they never require missing samples; a window "to the
-end" requires only its start.
+`fold` evaluates an `Analysis` bottom-up: the value of a node follows from those of its operands and from the
+offsets at which the node reads them (`ir.Operator.offsets`). Windows of the past are cut at the start of the
+trace, so they never require missing samples; a window "to the end" requires only its start.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeAlias, TypeVar, assert_never, final
+from typing import Generic, NamedTuple, TypeAlias, TypeVar, final
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves, nodes, numbers
+from stlc.compile.ir.traverse import leaves, nodes, numbers, operands
 
 V = TypeVar("V")
 
@@ -30,65 +30,38 @@ class Analysis(ABC, Generic[V]):
         """Value of `true` and `false`."""
 
     @abstractmethod
-    def all_of(self, parts: Sequence[V]) -> V:
-        """Value of one or more formulas at the same instant."""
-
-    @abstractmethod
-    def ahead(self, body: V, window: ir.Window) -> V:
-        """Value of a future window."""
-
-    @abstractmethod
-    def back(self, body: V, window: ir.Window) -> V:
-        """Value of a past window."""
-
-    @abstractmethod
-    def shift(self, body: V, node: ir.Shift) -> V:
-        """Value of a shifted formula."""
+    def over(self, parts: Sequence[V], offsets: Sequence[ir.Offsets]) -> V:
+        """Value of an operator that reads each operand at its offsets; the last ones are its window."""
 
     @abstractmethod
     def at_start(self, body: V) -> V:
         """Value of a formula at the first sample."""
 
-    def until(self, left: V, right: V, window: ir.Window) -> V:
-        """Value of `until`: the right side is read in the window, the left one from now on."""
-        return self.all_of((self.ahead(right, window), self.ahead(left, ir.Window(0, window.hi))))
-
-    def since(self, left: V, right: V, window: ir.Window) -> V:
-        """Value of `since`, the mirror of `until`."""
-        return self.all_of((self.back(right, window), self.back(left, ir.Window(0, window.hi))))
+    def shift(self, body: V, node: ir.Shift) -> V:
+        """Value of a shifted formula."""
+        return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
         """Value of a `freeze` with its bound numbers."""
-        return self.all_of((body, *bound))
+        parts = (body, *bound)
+        return self.over(parts, (ir.NOW,) * len(parts))
 
 
 def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
     """Return the value of a formula under an analysis."""
-
-    def of(part: ir.Formula) -> V:
-        return fold(part, analysis)
-
     match formula:
         case ir.Truth():
             return analysis.constant()
         case ir.Predicate(num):
             return analysis.predicate(num)
-        case ir.BoolOp(_, items):
-            return analysis.all_of([of(item) for item in items])
-        case ir.Temporal(_, window, body) | ir.PastTemporal(_, window, body):
-            windowed = analysis.ahead if isinstance(formula, ir.Temporal) else analysis.back
-            return windowed(of(body), window)
-        case ir.Until(_, window, left, right) | ir.Since(_, window, left, right):
-            met = analysis.until if isinstance(formula, ir.Until) else analysis.since
-            return met(of(left), of(right), window)
         case ir.Shift(_, body):
-            return analysis.shift(of(body), formula)
+            return analysis.shift(fold(body, analysis), formula)
         case ir.Freeze(bindings, body):
-            return analysis.freeze([analysis.predicate(num) for _, num in bindings], of(body))
+            return analysis.freeze([analysis.predicate(num) for _, num in bindings], fold(body, analysis))
         case ir.AtStart(body):
-            return analysis.at_start(of(body))
+            return analysis.at_start(fold(body, analysis))
         case _:
-            assert_never(formula)
+            return analysis.over([fold(part, analysis) for part in operands(formula)], formula.offsets)
 
 
 # ------------------------------------------------------------------- lookback and lookahead
@@ -148,18 +121,13 @@ class _Required(Analysis[_Needs]):
     def constant(self) -> _Needs:
         return 0, 0, 0
 
-    def all_of(self, parts: Sequence[_Needs]) -> _Needs:
-        past, future, clocked = (max(values) for values in zip(*parts, strict=True))
+    def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
+        """Furthest samples; of a window without bound only its near end is required."""
+        past = future = clocked = 0
+        for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):
+            low, high = (last or 0) if first is None else first, (first or 0) if last is None else last
+            past, future, clocked = max(past, back - low), max(future, ahead + high), max(clocked, later)
         return past, future, clocked
-
-    def ahead(self, body: _Needs, window: ir.Window) -> _Needs:
-        return max(body[0] - window.lo, 0), body[1] + _last(window), body[2]
-
-    def back(self, body: _Needs, window: ir.Window) -> _Needs:
-        return body[0] + _last(window), max(body[1] - window.lo, 0), body[2]
-
-    def shift(self, body: _Needs, node: ir.Shift) -> _Needs:
-        return max(body[0] - node.steps, 0), max(body[1] + node.steps, 0), body[2]
 
     def at_start(self, body: _Needs) -> _Needs:
         return 0, 0, max(body[1], body[2])
@@ -175,17 +143,9 @@ class _History(Analysis[int]):
     def constant(self) -> int:
         return 0
 
-    def all_of(self, parts: Sequence[int]) -> int:
-        return max(parts)
-
-    def ahead(self, body: int, window: ir.Window) -> int:
-        return max(body - window.lo, 0)
-
-    def back(self, body: int, window: ir.Window) -> int:
-        return body + (_EVERYTHING if window.hi is None else window.hi)
-
-    def shift(self, body: int, node: ir.Shift) -> int:
-        return max(body - node.steps, 0)
+    def over(self, parts: Sequence[int], offsets: Sequence[ir.Offsets]) -> int:
+        firsts = [-_EVERYTHING if first is None else first for first, _ in offsets]
+        return max(0, *(part - first for part, first in zip(parts, firsts, strict=True)))
 
     def at_start(self, body: int) -> int:  # noqa: ARG002
         return _EVERYTHING
@@ -194,10 +154,6 @@ class _History(Analysis[int]):
 _EVERYTHING = 1 << 40
 """More samples than any trace has."""
 _REQUIRED, _HISTORY = _Required(), _History()
-
-
-def _last(window: ir.Window) -> int:
-    return window.lo if window.hi is None else window.hi
 
 
 # ---------------------------------------------------------------------------------- signals
@@ -226,8 +182,9 @@ def looks_on(num: ir.Num) -> bool:
 
 def uses_end(formula: ir.Formula) -> bool:
     """True if a future window extends to the end of the trace, or a `sweep` is clamped there."""
-    ahead = (node.window for node in nodes(formula) if isinstance(node, (ir.Temporal, ir.Until)))
-    return any(window.hi is None for window in ahead) or any(map(looks_on, numbers(formula)))
+    windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
+    endless = any(node.window.hi is None and not node.back for node in windowed)
+    return endless or any(map(looks_on, numbers(formula)))
 
 
 # ------------------------------------------------------------------------------ steady tails
@@ -259,29 +216,19 @@ class _Tail(Analysis[int | None]):
     def constant(self) -> int | None:
         return 0
 
-    def all_of(self, parts: Sequence[int | None]) -> int | None:
+    def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
+        """Instant from which the operands are constant wherever they are read, or the window stays empty.
+
+        A window from the start of the trace covers all known samples then.
+        """
         known = [part for part in parts if part is not None]
-        return max(known) if len(known) == len(parts) else None
-
-    def ahead(self, body: int | None, window: ir.Window) -> int | None:
-        """Tail of a future window; one to the end is unknown where it starts beyond the end."""
-        if body is None:
+        if len(known) < len(parts):
             return None
-        return max(body - window.lo, 0 if window.hi is not None else self.length - window.lo, 0)
-
-    def back(self, body: int | None, window: ir.Window) -> int | None:
-        """Tail of a past window; one from the start covers all known samples."""
-        return None if body is None else body + (window.hi if window.hi is not None else window.lo + 1)
-
-    def until(self, left: int | None, right: int | None, window: ir.Window) -> int | None:
-        whole = self.all_of((left, right))
-        return None if whole is None else max(whole, 0 if window.hi is not None else self.length - window.lo)
-
-    def since(self, left: int | None, right: int | None, window: ir.Window) -> int | None:
-        return self.back(self.all_of((left, right)), window)
-
-    def shift(self, body: int | None, node: ir.Shift) -> int | None:
-        return None if body is None else max(body - node.steps, -node.steps, 0)
+        (first, last), whole = offsets[-1], max(known)
+        if first is None:
+            return whole + 1 - (last or 0)
+        least = min(each.first or 0 for each in offsets)
+        return max(whole - least, 0 if last is not None else self.length - first, 0)
 
     def freeze(self, bound: Sequence[int | None], body: int | None) -> int | None:  # noqa: ARG002
         return None

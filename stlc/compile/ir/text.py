@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import re
-from typing import assert_never
+from collections.abc import Sequence
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.ir.traverse import operands
 from stlc.grammar.show.printer import show_name
 
-_INFIX = {
-    "add": ("+", 1),
-    "sub": ("-", 1),
-    "mul": ("*", 2),
-    "div": ("/", 2),
-    "mod": ("%", 2),
-    "pow": ("^", 4),
-}
+_LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "%": 2, "^": 4}
+"""Sign of an operator between two numbers -> its precedence."""
 _FROZEN = re.compile(r"#\d+@.*", re.S)
 _COMPONENT = re.compile(r"(?<!^)\[\d+\]\Z")
 _UNARY = 3
 _TOP = 5
 _FLIPPED = {">": "<", ">=": "<=", "<": ">", "<=": ">="}
-
-
-def show_window(window: ir.Window, end: str = "end") -> str:
-    """Return a window in samples, `[0..25]`, `[5..end]`; past ones run back to `end` "start"."""
-    return f"[{window.lo}..{end if window.hi is None else window.hi}]"
 
 
 def show_formula(formula: ir.Formula) -> str:
@@ -35,16 +26,6 @@ def show_formula(formula: ir.Formula) -> str:
             return "true" if value else "false"
         case ir.Predicate():
             return _atom(formula)
-        case ir.BoolOp(op, items):
-            shown_items = _without_lacks(items)
-            return f" {op} ".join(map(_operand, shown_items))
-        case ir.Temporal(op, window, body) | ir.PastTemporal(op, window, body):
-            end = "end" if isinstance(formula, ir.Temporal) else "start"
-            return f"{op}{show_window(window, end)} {_operand(body)}"
-        case ir.Until(op, window, left, right):
-            return f"{_operand(left)} {op}{show_window(window)} {_operand(right)}"
-        case ir.Since(op, window, left, right):
-            return f"{_operand(left)} {op}{show_window(window, 'start')} {_operand(right)}"
         case ir.Shift(steps, body):
             name = {1: "next", -1: "prev"}.get(steps, f"shift[{steps}]")
             return f"{name}({show_formula(body)})"
@@ -54,19 +35,33 @@ def show_formula(formula: ir.Formula) -> str:
         case ir.AtStart(body):
             return f"at the start ({show_formula(body)})"
         case _:
-            assert_never(formula)
+            return _operator(formula)
+
+
+def _operator(formula: ir.BoolOp | ir.Temporal | ir.PastTemporal | ir.Until | ir.Since) -> str:
+    """Return an operator with its window in samples: before its operand, or between several."""
+    parts = [_operand(part) for part in _parts(formula)]
+    if not isinstance(formula, ir.Windowed):
+        return f" {formula.op} ".join(parts)
+    window, end = formula.window, "start" if formula.back else "end"
+    *before, last = parts
+    return " ".join([*before, f"{formula.op}[{window.lo}..{end if window.hi is None else window.hi}]", last])
 
 
 def _operand(formula: ir.Formula) -> str:
     """Return an operand, in parentheses if it has several operands itself."""
     text = show_formula(formula)
-    several = isinstance(formula, (ir.Until, ir.Since))
-    several |= isinstance(formula, ir.BoolOp) and len(_without_lacks(formula.items)) > 1
-    return f"({text})" if several else text
+    return f"({text})" if len(_parts(formula)) > 1 else text
 
 
-def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
-    """Drop predicates that only quantify the failure of an adjacent time test (`timers.timer_test`)."""
+def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
+    """Return the operands; of `and` and `or` without those that quantify by how much a time test fails.
+
+    `timers.timer_test` makes these.
+    """
+    items = operands(formula)
+    if not isinstance(formula, ir.BoolOp):
+        return items
     tests = {item.num for item in items if isinstance(item, ir.Predicate) and item.guard}
     return [
         item
@@ -111,35 +106,28 @@ def show_number(num: ir.Num, level: int = 0) -> str:
 
 
 def _leaf(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    match leaf:
-        case ir.Signal(ir.ELAPSED):
-            return "elapsed"
-        case ir.ShiftedSignal(name) if leaf == ir.at_first(ir.Signal(name)):
-            return f"first({shown(name)})"
-        case ir.ShiftedSignal(name, 1):
-            return f"next({shown(name)})"
-        case ir.ShiftedSignal(name, -1):
-            return f"prev({shown(name)})"
-        case ir.ShiftedSignal(name, steps):
-            return f"shift({shown(name)}, {steps})"
-        case _:
-            return shown(leaf.name)
+    name = shown(leaf.name)
+    if not isinstance(leaf, ir.ShiftedSignal):
+        return "elapsed" if leaf == ir.Signal(ir.ELAPSED) else name
+    if leaf == ir.at_first(ir.Signal(leaf.name)):
+        return f"first({name})"
+    stepping = {1: "next", -1: "prev"}.get(leaf.steps)
+    return f"{stepping}({name})" if stepping else f"shift({name}, {leaf.steps})"
 
 
 def _number(num: ir.Num) -> tuple[str, int]:
+    """Return the text of a number, and the precedence of its outermost operator."""
     match num:
         case ir.Const(value):
             return f"{value:g}", _TOP if value >= 0 else _UNARY
-        case ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar():
-            return _leaf(num), _TOP
         case ir.Op("neg", (arg,)):
             return f"-{show_number(arg, _UNARY)}", _UNARY
         case ir.Op("sub", (left, ir.Const(value))) if value < 0:
             return f"{show_number(left, 1)} + {-value:g}", 1
         case ir.Op("square", (arg,)):
             return f"{show_number(arg, _TOP)}^2", 4
-        case ir.Op(name, (left, right)) if name in _INFIX:
-            sign, own = _INFIX[name]
+        case ir.Op(name, (left, right)) if sign := FUNCTIONS[name].symbol:
+            own = _LEVELS[sign]
             return f"{show_number(left, own)} {sign} {show_number(right, own + 1)}", own
         case ir.Op(name, args) | ir.Extern(name, args):
             return f"{name}({', '.join(map(show_number, args))})", _TOP
@@ -147,5 +135,5 @@ def _number(num: ir.Num) -> tuple[str, int]:
             return f"ind({show_formula(cond)})", _TOP
         case ir.Where(cond, yes, no):
             return f"if {show_formula(cond)} then {show_number(yes)} else {show_number(no)}", 0
-        case _:
-            assert_never(num)
+        case leaf:
+            return _leaf(leaf), _TOP

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
+from functools import cache
 from typing import Any, Literal, TypeAlias, TypeGuard, TypeVar, get_args, overload
 
 from stlc.compile.ir import nodes as ir
@@ -32,16 +33,11 @@ _SORTS: Mapping[str, _Sort] = {
 """Declared type of a field -> sort of its value."""
 
 
-_SHAPES: dict[type, tuple[tuple[str, _Sort], ...]] = {}
-
-
-def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
+@cache
+def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
     """Fields of a node class that hold children, in order."""
-    found = _SHAPES.get(type(node))
-    if found is None:
-        declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(node))
-        found = _SHAPES[type(node)] = tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
-    return found
+    declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
+    return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
 
 # ----------------------------------------------------------------------------- one step down
@@ -50,7 +46,8 @@ def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
 def children(node: Node) -> tuple[Any, ...]:
     """Return the formulas and numbers directly below a node, in field order."""
     found: tuple[Any, ...] = ()
-    for name, sort in _shape(node):
+    kind: Any = type(node)
+    for name, sort in _shape(kind):
         value = getattr(node, name)
         if sort in ("numbers", "formulas"):
             found = found + value if found else value
@@ -75,7 +72,8 @@ def map_children(
         numbers: child number -> its replacement; None keeps them.
     """
     changed: dict[str, Any] = {}
-    for name, sort in _shape(node):
+    kind: Any = type(node)
+    for name, sort in _shape(kind):
         change: Callable[[Any], Any] | None = formulas if sort.startswith("formula") else numbers
         if change is None:
             continue
@@ -94,21 +92,25 @@ def map_children(
     return replace(node, **changed) if changed else node
 
 
+@cache
+def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
+    """Fields of a formula class that hold a formula, or several; of `Recalled` only `now`."""
+    found = ((name, sort == "formulas") for name, sort in _shape(kind) if sort.startswith("formula"))
+    return (("now", False),) if kind is typed.Recalled else tuple(found)
+
+
 @overload
 def operands(formula: ir.Formula) -> tuple[ir.Formula, ...]: ...
 @overload
 def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]: ...
 def operands(formula: Any) -> tuple[Any, ...]:
     """Return the formulas directly below a formula; of `Recalled` only `now`."""
-    if isinstance(formula, typed.Recalled):
-        return (formula.now,)
-    found: list[Any] = []
-    for name, sort in _shape(formula):
-        if sort == "formula":
-            found.append(getattr(formula, name))
-        elif sort == "formulas":
-            found.extend(getattr(formula, name))
-    return tuple(found)
+    found: tuple[Any, ...] = ()
+    kind: Any = type(formula)
+    for name, several in _formulas_of(kind):
+        value = getattr(formula, name)
+        found += value if several else (value,)
+    return found
 
 
 # ---------------------------------------------------------------------------- all the way down

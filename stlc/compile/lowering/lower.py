@@ -9,16 +9,15 @@ Negation normal form comes first, so that bounds are rounded for the final opera
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import final
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.normal_form import DUAL, Sign, flip, literal, normal
+from stlc.compile.ir.nodes import DUAL, OPERATORS
+from stlc.compile.ir.normal_form import literal, normal
 from stlc.compile.ir.traverse import from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
 from stlc.units import Unit, same_dims
@@ -69,10 +68,6 @@ def _divided(value: float, unit: Unit) -> float:
     return short if math.isclose(short, found, rel_tol=1e-15) else found
 
 
-_CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
-"""Universal operators, whose bounds off the grid are rounded outwards."""
-
-
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
     """Lower `formula` to negation normal form and steps.
 
@@ -81,6 +76,15 @@ def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Form
     the formula must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
+
+
+def _meaning(node: typed.Edge | typed.Recalled) -> typed.Formula:
+    """Return the definition of an edge or a timer: `rise(p)` is `p and prev(not p)`, false at first."""
+    if isinstance(node, typed.Recalled):
+        return node.along
+    span, inverse = node.span, typed.Not(node.span, node.body)
+    now, before = (node.body, inverse) if node.op == "rise" else (inverse, node.body)
+    return typed.Logic(span, "and", (now, typed.Shift(span, -1, before, outside=False)))
 
 
 @final
@@ -100,33 +104,27 @@ class _Lowering:
                 return self._negated(body)
             case typed.Logic(span, "and" | "or" as op, items):
                 return ir.BoolOp(op, tuple(map(self.formula, items)), span)
-            case typed.Temporal() | typed.Until():
-                return self._timed(node, node.op)
             case typed.Shift(span, steps, body, outside):
                 return ir.Shift(steps, self.formula(body), outside, span)
-            case typed.Edge():
-                return self._edge(node, holds=True)
             case typed.Freeze(span, bindings, body):
                 return ir.Freeze(bindings, self.formula(body), span)
-            case typed.Recalled(_, _, along):
-                return self.formula(along)
+            case typed.Temporal() | typed.Until():
+                return self._timed(node, node.op)
+            case typed.Edge() | typed.Recalled():
+                return self.formula(normal(_meaning(node)))
             case _:
                 raise AssertionError("not in negation normal form")
 
     def _negated(self, node: typed.Formula) -> ir.Formula:
         """Lower the negation of an operator before which `normal` keeps `not`."""
         match node:
-            case typed.Until(_, op):
-                return self._timed(
-                    replace(node, left=normal(node.left, -1), right=normal(node.right, -1)), DUAL[op]
-                )
+            case typed.Until(_, op, _, left, right):
+                return self._timed(replace(node, left=normal(left, -1), right=normal(right, -1)), DUAL[op])
             case typed.Shift(span, steps, body, outside):
                 filled = None if outside is None else not outside
                 return ir.Shift(steps, self.formula(normal(body, -1)), filled, span, weak=True)
-            case typed.Edge():
-                return self._edge(node, holds=False)
-            case typed.Recalled(_, _, along):
-                return self.formula(normal(along, -1))
+            case typed.Edge() | typed.Recalled():
+                return self.formula(normal(_meaning(node), -1))
             case _:
                 raise AssertionError("not in negation normal form")
 
@@ -135,23 +133,6 @@ class _Lowering:
         if on_clock(node):
             return ir.AtStart(self._timed(from_now(node), op), node.span)
         parts = [self.formula(part) for part in operands(node)]
-        window = to_window(node.interval, self.grid, self.sink, outward=op in _CAUTIOUS)
-        return _MAKE[op](op, window, *parts, node.span)
-
-    def _edge(self, node: typed.Edge, *, holds: bool) -> ir.Formula:
-        """Lower `rise` (now and not before) or `fall` (before and not now); false at the first sample."""
-        now: Sign = 1 if (node.op == "rise") is holds else -1
-        before = ir.Shift(-1, self.formula(normal(node.body, flip(now))), not holds, node.span)
-        parts = (self.formula(normal(node.body, now)), before)
-        return ir.BoolOp("and" if holds else "or", parts, node.span)
-
-
-_MAKE: Mapping[str, Callable[..., ir.Formula]] = MappingProxyType(
-    {
-        **dict.fromkeys(("always", "eventually"), ir.Temporal),
-        **dict.fromkeys(("historically", "once"), ir.PastTemporal),
-        **dict.fromkeys(("until", "release"), ir.Until),
-        **dict.fromkeys(("since", "trigger"), ir.Since),
-    }
-)
-"""Operator -> node class."""
+        window = to_window(node.interval, self.grid, self.sink, outward=op == OPERATORS[op].names[0])
+        lowered: ir.Formula = OPERATORS[op](op, window, *parts, node.span)
+        return lowered

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, assert_never
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach_of, tail
+from stlc.compile.ir.traverse import operands as parts_of
 
 Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """Treatment of instants beyond the last sample.
@@ -26,10 +28,9 @@ bounds.
 
 Pick: TypeAlias = Literal["min", "max"]
 
-PICKS: Mapping[str, Pick] = {
-    **dict.fromkeys(("and", "always", "historically", "release", "trigger"), "min"),
-    **dict.fromkeys(("or", "eventually", "once", "until", "since"), "max"),
-}
+PICKS: Mapping[str, Pick] = MappingProxyType(
+    {name: "min" if name == kind.names[0] else "max" for name, kind in ir.OPERATORS.items()}
+)
 """Operator -> its extremum (of `until`, `since` and their duals, that over the window)."""
 
 _FAR = 256
@@ -167,29 +168,6 @@ class TraceDomain:
         """Final length; unbounded windows are clipped here."""
         return self.samples if self.stop is None else self.stop
 
-    def last(self, window: ir.Window, latest_start: Instant, parts: Sequence[ir.Formula]) -> Instant:
-        """Return the last instant of `parts` that a future window needs.
-
-        Among instants beyond the trace at which all parts are constant, one suffices.
-
-        Args:
-            window: of the operator.
-            latest_start: last instant at which the operator is needed.
-            parts: its operands.
-        """
-        if window.hi is None:
-            return self.length - 1
-        last = latest_start + window.hi
-        if not self.open:
-            return at_most(last, self.samples - 1)
-        if latest(last) < self.samples + _FAR or self.counted:
-            return last
-        tails = [tail(part, self.samples, self.length) for part in parts]
-        known = [found for found in tails if found is not None]
-        if len(known) < len(tails):
-            return last
-        return min(latest(last), max(*known, latest(latest_start) + window.lo))
-
 
 # ------------------------------------------------------------------------------ operands
 
@@ -201,44 +179,44 @@ def operands(
     match node:
         case ir.Truth() | ir.Predicate() | ir.Freeze():
             return ()
-        case ir.BoolOp(_, items):
-            return tuple((item, run) for item in items)
-        case ir.Temporal(_, window, body):
-            return ((body, IndexRange(run.start + window.lo, domain.last(window, run.last, (body,)))),)
-        case ir.PastTemporal(_, window, body):
-            return ((body, IndexRange(_first(window, run), run.last - window.lo)),)
-        case ir.Until() | ir.Since():
-            return _both(node, run, domain)
-        case ir.Shift(steps, body):
-            last = run.last + steps
-            last = last if domain.open else at_most(last, domain.samples - 1)
-            return ((body, IndexRange(at_least(run.start + steps, 0), last)),)
         case ir.AtStart(body):
             return ((body, IndexRange(0, 0)),)
+        case ir.BoolOp(_, items):
+            return tuple((item, run) for item in items)
         case _:
-            assert_never(node)
+            parts, around = parts_of(node), node.offsets
+            runs = [
+                IndexRange(_first(read, run), _last(read, run, around[-1], parts, domain)) for read in around
+            ]
+            runs = runs if runs[-1].count > 0 else [_NEVER] * len(runs)
+            return tuple(zip(parts, runs, strict=True))
 
 
 _NEVER = IndexRange(0, -1)
 
 
-def _both(
-    node: ir.Until | ir.Since, run: IndexRange, domain: TraceDomain
-) -> tuple[tuple[ir.Formula, IndexRange], tuple[ir.Formula, IndexRange]]:
-    """Operands of `until` and `since`: the right one over the window, the left one from now to its end."""
-    window, left, right = node.window, node.left, node.right
-    if isinstance(node, ir.Until):
-        last = domain.last(window, run.last, (left, right))
-        held, met = IndexRange(run.start, last), IndexRange(run.start + window.lo, last)
-    else:
-        first = _first(window, run)
-        held, met = IndexRange(first, run.last), IndexRange(first, run.last - window.lo)
-    return ((left, held), (right, met)) if met.count > 0 else ((left, _NEVER), (right, _NEVER))
+def _first(read: ir.Offsets, run: IndexRange) -> Instant:
+    """Return the first instant at which a formula needed at `run` reads an operand."""
+    return 0 if read.first is None else at_least(run.start + read.first, 0)
 
 
-def _first(window: ir.Window, run: IndexRange) -> Instant:
-    """First instant that a past window reads."""
-    return 0 if window.hi is None else at_least(run.start - window.hi, 0)
+def _last(
+    read: ir.Offsets, run: IndexRange, window: ir.Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
+) -> Instant:
+    """Return the last such instant; of those beyond the trace at which all operands are constant, one."""
+    if read.last is None:
+        return domain.length - 1
+    last = run.last + read.last
+    if not domain.open:
+        return at_most(last, domain.samples - 1)
+    far = read.last > 0 and latest(last) >= domain.samples + _FAR
+    if not far or domain.counted or read.first == read.last:
+        return last
+    tails = [tail(part, domain.samples, domain.length) for part in parts]
+    known = [found for found in tails if found is not None]
+    if len(known) < len(tails):
+        return last
+    return min(latest(last), max(*known, latest(run.last) + (window.first or 0)))
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
