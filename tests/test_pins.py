@@ -6,13 +6,14 @@ import importlib.util
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
+
+from stlc.controller.policies.policy import Policy
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "data" / "pins"
@@ -114,16 +115,13 @@ def test_documents(pins: ModuleType, place: Any, regenerate: bool) -> None:
     hold(pins, "documents", [place.stlc(each) for each in words()], regenerate)
 
 
-@dataclass
-class Held:
+class Held(Policy):
     """A policy that holds the middle of every control, but the first where a state's first number is even."""
 
-    task: Any
-
-    def plan(self, x0: torch.Tensor) -> torch.Tensor:
+    def candidates(self, x0: torch.Tensor) -> torch.Tensor:
         low, high = self.task.system.control_low.to(x0), self.task.system.control_high.to(x0)
         share = 0.5 + 0.25 * (x0[:, :1].floor() % 2)
-        return (low + (high - low) * share)[:, None].expand(-1, self.task.horizon, -1).clone()
+        return (low + (high - low) * share)[:, None, None].expand(-1, 1, self.task.horizon, -1).clone()
 
 
 def test_decisions_of_guards(pins: ModuleType, place: Any, regenerate: bool) -> None:

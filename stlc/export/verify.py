@@ -19,7 +19,7 @@ from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import unmoved
 
 if TYPE_CHECKING:
-    from stlc.controller.policies.policy import BestOfKPolicy
+    from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.runtime.graphs import Graphs, JudgedPlans
 
@@ -50,9 +50,7 @@ class Agreement:
     ties: int
 
 
-def agreement(
-    policy: BestOfKPolicy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7
-) -> Agreement:
+def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
     """Compare both in random states.
 
     Args:
@@ -114,7 +112,7 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
     return decide
 
 
-def backup_agreement(policy: BestOfKPolicy, path: Path, *, states: int, seed: int = 11) -> Agreement:
+def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11) -> Agreement:
     """Compare the backup policy and the program in a file in random states, whether they need it or not.
 
     Raises:
@@ -143,7 +141,7 @@ def _answer(judged: JudgedPlans) -> Answer:
     return plan, rho, safe, each
 
 
-def kept_agreement(policy: BestOfKPolicy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
+def kept_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
     """Compare both one step later, with the previous plans.
 
     Raises:

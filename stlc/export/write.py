@@ -106,8 +106,8 @@ def _torch(run: Run, folder: Path) -> Checked:
     torch.export.save(recorded(run.task, run.network), path)
     torch.export.save(recorded_guard(run.task, run.network), backup)
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
-    fresh = agreement(run.network_policy, by_torch(path), states=STATES)
-    guarded = backup_agreement(run.network_policy, backup, states=STATES // 16)
+    fresh = agreement(run.policy, by_torch(path), states=STATES)
+    guarded = backup_agreement(run.policy, backup, states=STATES // 16)
     off = max(fresh.rho, guarded.rho)
     return Agreement(STATES, max(fresh.plan, guarded.plan), off, fresh.ties + guarded.ties), None
 
@@ -116,8 +116,8 @@ def _onnx(run: Run, folder: Path) -> Checked:
     """Write the graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
-    fresh = agreement(run.network_policy, by_onnx(graphs), states=STATES)
-    kept = kept_agreement(run.network_policy, graphs, states=STATES)
+    fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
+    kept = kept_agreement(run.policy, graphs, states=STATES)
     off = max(fresh.rho, kept.rho, same_verdicts(run.task, graphs, states=STATES // 4))
     found = Agreement(STATES, max(fresh.plan, kept.plan), off, fresh.ties + kept.ties)
     return found, timed(run.task, folder)
@@ -139,7 +139,7 @@ def _c(run: Run, folder: Path) -> Checked:
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")
     decide = by_c(folder, run.task, folder / BUILT)
-    return agreement(run.network_policy, decide, states=STATES), None
+    return agreement(run.policy, decide, states=STATES), None
 
 
 _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}

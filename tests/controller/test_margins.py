@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.margins import MarginRequest, calibrated_margins, parse_margins
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.load import parse_system
@@ -48,15 +49,15 @@ def task_of(scenario: str) -> Task:
     return Task.of(parse(Source("a.stl", SPEC)), System(under(decl, scenario)))  # type: ignore[arg-type]
 
 
-class Onward:
+class Onward(Policy):
     """Moves on at 1 m/s."""
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return torch.ones((len(x0), 6, 1), dtype=x0.dtype)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.ones((len(x0), 1, 6, 1), dtype=x0.dtype)
 
 
 def margins(scenario: str, steps: int = 1) -> dict[str, float]:
-    return dict(calibrated_margins(task_of(scenario), Onward(), steps))
+    return dict(calibrated_margins(task := task_of(scenario), Onward(task), steps))
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,8 @@ def test_noise_is_lost_where_a_plan_begins() -> None:
     """Who believes to be lower than it is loses that; 99 % of even noise of 0.2 m is 0.196 m."""
     assert margins("blurred") == {"q_low": pytest.approx(0.196, abs=0.003)}
     assert margins("blurred", 3) == margins("blurred")
-    whole = calibrated_margins(task_of("blurred"), Onward(), 1, 1.0)
+    task = task_of("blurred")
+    whole = calibrated_margins(task, Onward(task), 1, 1.0)
     assert whole["q_low"] == pytest.approx(0.2, abs=0.005)
 
 
@@ -93,20 +95,21 @@ def test_noise_on_actuators_loses_its_quantile() -> None:
 
 
 def test_without_a_safe_plan_nothing_is_measured() -> None:
-    class Away:
-        def plan(self, x0: Tensor) -> Tensor:
-            return torch.full((len(x0), 6, 1), 9.0, dtype=x0.dtype)
+    class Away(Policy):
+        def candidates(self, x0: Tensor) -> Tensor:
+            return torch.full((len(x0), 1, 6, 1), 9.0, dtype=x0.dtype)
 
-    assert calibrated_margins(task_of("windy"), Away()) == {}
+    task = task_of("windy")
+    assert calibrated_margins(task, Away(task)) == {}
 
 
 def test_where_nothing_is_wrong_nothing_is_lost_but_digits(car_task: Task) -> None:
-    class Anyhow:
-        def plan(self, x0: Tensor) -> Tensor:
+    class Anyhow(Policy):
+        def candidates(self, x0: Tensor) -> Tensor:
             drawn = torch.rand((len(x0), car_task.horizon, 1), generator=torch.Generator().manual_seed(0))
-            return 12.0 * drawn.to(x0) - 9.0
+            return (12.0 * drawn.to(x0) - 9.0)[:, None]
 
-    assert calibrated_margins(car_task, Anyhow()) == {}
+    assert calibrated_margins(car_task, Anyhow(car_task)) == {}
 
 
 def test_margins_are_asked_for_by_number_by_name_or_measured() -> None:
@@ -114,7 +117,7 @@ def test_margins_are_asked_for_by_number_by_name_or_measured() -> None:
     assert parse_margins(["0.2", "p_low=0.5", "0.3"]) == MarginRequest(0.3, {"p_low": 0.5})
     assert parse_margins(["auto", "q_low = 1"]) == MarginRequest(0.0, {"q_low": 1.0}, 0.99)
     assert parse_margins(["auto:95"]).share == 0.95
-    windy, policy = task_of("windy"), Onward()
+    policy = Onward(windy := task_of("windy"))
     assert parse_margins(["0.2", "q_low=0.5"]).of(windy, policy, "full") == {"p_low": 0.2, "q_low": 0.5}
     assert parse_margins(["auto", "q_low=0.5"]).of(windy, policy, "full", 3) == pytest.approx(
         {"p_low": 0.05, "q_low": 0.5}

@@ -14,7 +14,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
@@ -83,14 +83,11 @@ def steered(task: Task, x: Tensor) -> Tensor:
     return (speed[:, None] * step)[..., None]
 
 
-class Steered:
+class Steered(Policy):
     """A policy that knows the mission."""
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
-
-    def plan(self, x: Tensor) -> Tensor:
-        return steered(self.task, x)
+    def candidates(self, x: Tensor) -> Tensor:
+        return steered(self.task, x)[:, None]
 
     def judged(self, x: Tensor) -> PlanVerdicts:
         return self.task.judge(x, self.plan(x))

@@ -6,20 +6,21 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.stages.sampled_shooting import SampledPrefixes
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import PrefixGrid
 from tests.controller.guard.test_prefix_shooting import F64, Constant, grid
 
 
-class Reached:
+class Reached(Policy):
     """A policy whose plan tells the state that it was asked in, and the step of the plan."""
 
     def __init__(self, task: Task) -> None:
-        self.task = task
+        super().__init__(task)
         self.speed = task.names.index("v")
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return (0.1 * x0[:, self.speed, None] + 0.2 * torch.arange(self.task.horizon))[..., None]
+    def candidates(self, x0: Tensor) -> Tensor:
+        return (0.1 * x0[:, self.speed, None] + 0.2 * torch.arange(self.task.horizon))[:, None, :, None]
 
 
 def test_they_are_finished_from_where_they_end(car_task: Task) -> None:

@@ -14,7 +14,7 @@ from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.margins import tightened, with_margins
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.declaration.load import parse_system
@@ -47,21 +47,18 @@ def task_of(scenario: str = "") -> Task:
     return Task.of(parse(Source("a.stl", SPEC)), System(under(decl, scenario) if scenario else decl))  # type: ignore[arg-type]
 
 
-class Onward:
+class Onward(Policy):
     """Speeds up for half of the plan, and brakes for the other half."""
 
-    def __init__(self, horizon: int) -> None:
-        self.horizon = horizon
-
-    def plan(self, x0: Tensor) -> Tensor:
-        plan = torch.full((len(x0), self.horizon, 1), 0.4, dtype=x0.dtype)
-        plan[:, self.horizon // 2 :] = -0.4
+    def candidates(self, x0: Tensor) -> Tensor:
+        plan = torch.full((len(x0), 1, self.task.horizon, 1), 0.4, dtype=x0.dtype)
+        plan[:, :, self.task.horizon // 2 :] = -0.4
         return plan
 
 
 def driven(mode: Mode, margin: float, scenario: str = "") -> DeploymentRecording:
     task = task_of(scenario)
-    guard = Guard(task, Onward(task.horizon), mode, limits=Limits(margin={"clear": margin}, seconds=None))
+    guard = Guard(task, Onward(task), mode, limits=Limits(margin={"clear": margin}, seconds=None))
     recorder = Recorder(8)
     drive(guard, world_type(task.system.decl), Setting((0,), 8, 24, 4), recorder)
     found = recorder.recording()
@@ -96,7 +93,7 @@ def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
 @pytest.mark.parametrize("mode", ["paper", "full"])
 def test_a_guard_keeps_away_and_tells_the_plain_verdict(mode: Mode) -> None:
     task, x = task_of(), torch.tensor([[1.0, 0.0]], dtype=torch.float64)
-    policy = Onward(task.horizon)
+    policy = Onward(task)
     plain = Guard(task, policy, mode, limits=Limits(seconds=None)).decide(x)
     assert int(plain.source[0]) == 0
     away = Guard(task, policy, mode, limits=Limits(seconds=None, margin={"clear": 0.3})).decide(x)
@@ -140,10 +137,10 @@ def test_what_nobody_has_planned_is_no_danger() -> None:
     task, planned = Task.of(parse(Source("a.stl", spec)), System(decl)), []  # type: ignore[arg-type]
 
     class Faster(Onward):
-        def plan(self, x0: Tensor) -> Tensor:
-            return torch.full((len(x0), self.horizon, 1), 0.4, dtype=x0.dtype)
+        def candidates(self, x0: Tensor) -> Tensor:
+            return torch.full((len(x0), 1, self.task.horizon, 1), 0.4, dtype=x0.dtype)
 
-    guard = Guard(task, Faster(task.horizon), "full", limits=Limits(seconds=None))
+    guard = Guard(task, Faster(task), "full", limits=Limits(seconds=None))
     recorder = Recorder(8)
     watch = lambda moment: planned.append(moment.planned)  # noqa: E731
     drive(guard, world_type(decl), Setting((0,), 8, 4, 4), recorder, watch)
@@ -156,7 +153,7 @@ def test_what_nobody_has_planned_is_no_danger() -> None:
 def test_the_full_guard_looks_at_all_that_is_left_of_a_plan() -> None:
     """Who will be unsafe after the next planning alone, by what is planned now, plans at once."""
     task = task_of("disturb-50")
-    guard, recorder = Guard(task, Onward(task.horizon), "full", limits=Limits(seconds=None)), Recorder(8)
+    guard, recorder = Guard(task, Onward(task), "full", limits=Limits(seconds=None)), Recorder(8)
     planned: list[int] = []
     drive(
         guard,
@@ -173,21 +170,21 @@ def test_the_full_guard_looks_at_all_that_is_left_of_a_plan() -> None:
 
 def test_so_many_steps_count_for_each_agent() -> None:
     task = task_of()
-    guard, x = Guard(task, Onward(task.horizon), "full"), torch.tensor([[0.0, 0.0], [1.2, 0.3]])
-    begun = Guard(task, Onward(task.horizon), "none").decide(x.double())
+    guard, x = Guard(task, Onward(task), "full"), torch.tensor([[0.0, 0.0], [1.2, 0.3]])
+    begun = Guard(task, Onward(task), "none").decide(x.double())
     assert guard.endangered(x, begun, 6).tolist() == [False, True]
     assert guard.endangered(x, begun, torch.tensor([6, 2])).tolist() == [False, False]
 
 
 def test_who_runs_into_danger_plans_before_the_others() -> None:
     task = task_of()
-    guard = Guard(task, Onward(task.horizon), "full")
+    guard = Guard(task, Onward(task), "full")
     x = torch.tensor([[0.0, 0.0], [1.6, 0.0]], dtype=torch.float64)
-    begun = Guard(task, Onward(task.horizon), "none").decide(x)
+    begun = Guard(task, Onward(task), "none").decide(x)
     assert guard.endangered(x, begun, 4).tolist() == [False, True]
     assert guard.endangered(x, begun, 1).tolist() == [False, False]
     for mode in ("none", "paper"):  # the paper's guard looks at plans when they are made
-        assert not Guard(task, Onward(task.horizon), mode).endangered(x, begun, 4).any()
+        assert not Guard(task, Onward(task), mode).endangered(x, begun, 4).any()
 
 
 def test_robustness_until_a_sample_is_that_of_the_prefix() -> None:

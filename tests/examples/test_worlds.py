@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from stlc.controller.deployment.simulator import Setting
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.evaluation.metrics import METRICS
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
@@ -38,17 +38,14 @@ WORLDS = {
 FREE = [name for name in WORLDS if name != "traffic"]  # agents that do not meet each other
 
 
-@dataclass(frozen=True)
-class Wild:
+class Wild(Policy):
     """Plans of random controls that depend on the state alone."""
 
-    task: Task
-
-    def plan(self, x0: Tensor) -> Tensor:
+    def candidates(self, x0: Tensor) -> Tensor:
         low, high = self.task.system.control_low, self.task.system.control_high
         phase = 7.0 * x0.to(torch.float64).sum(1)[:, None, None] + torch.arange(self.task.horizon)[:, None]
         share = 0.5 + 0.5 * torch.sin(phase + torch.arange(len(low)))
-        return (low + share * (high - low)).to(x0.dtype)
+        return (low + share * (high - low)).to(x0.dtype)[:, None]
 
 
 @pytest.fixture(scope="module", params=WORLDS)
@@ -113,7 +110,7 @@ def test_an_episode_ends_with_a_trace_that_check_reads(
     everybody = "stlc.controller.evaluation.executed.search_safe"
     monkeypatch.setattr(everybody, lambda _, x0: torch.ones(len(x0), dtype=torch.bool))
     setting = Setting((0, 1), 2, task.horizon + 4, task.system.decl.test.replan)
-    found = deploy(task, Wild(task), setting, "none")  # type: ignore[arg-type]
+    found = deploy(task, Wild(task), setting, "none")
     assert {"plan_accuracy", "executed", "executed_safe", "savable"} <= set(found.metrics)
     assert set(found.metrics) - set(METRICS) >= set(found.recording.progress[0])
     folder = open_folder(task, TrainConfig(steps=1), Launch(root=tmp_path / "runs", name="wild"))

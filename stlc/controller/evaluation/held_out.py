@@ -13,7 +13,6 @@ import torch
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import ENOUGH, solve
-from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.exploration import EFFORTS, Exploration
@@ -106,7 +105,7 @@ def score(
         states = visited(task, policy, n, seed, enough)
     else:
         states = task.sample(n, seed=seed, dtype=torch.float64)
-    states, plans, rho, each = _judged(task, policy, states, enough)
+    states, plans, rho, each = _judged(policy, states, enough)
     n, good = len(states), satisfied(rho)
     shares = satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
@@ -143,9 +142,7 @@ def score(
     )
 
 
-def _judged(
-    task: Task, policy: Policy, states: Tensor, enough: Stop
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _judged(policy: Policy, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Evaluated states (k, dim), the plans followed from there, their robustness, and that per requirement.
 
     All states, or the first ones, at least one batch, evaluated before `enough` returns True.
@@ -156,7 +153,7 @@ def _judged(
     for part in torch.split(states, JUDGED):
         if rho and enough():
             break
-        followed, judged = plan_judged(task, policy, part)
+        followed, judged = policy.plan_judged(part)
         plans.append(followed)
         rho.append(judged.rho)
         each.append(judged.requirements)

@@ -13,7 +13,6 @@ from stlc.controller.guard.candidates import Candidates, Limits, Mode, finite
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
-from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import rank
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -97,9 +96,7 @@ class Guard:
     ) -> None:
         self.task, self.mode = task, mode
         self.strict = with_margins(task, {} if mode == "none" or limits is None else limits.margin)
-        self.policy: Policy = policy
-        if isinstance(policy, BestOfKPolicy):
-            self.policy = policy.for_task(self.strict)  # it selects among its plans with the margin
+        self.policy = policy.for_task(self.strict)  # it selects among its plans with the margin
         self.backup: StagedSearch | RelaxedSearch | None = None
         if mode == "full" and self.strict is not task and limits is not None:
             self.backup = RelaxedSearch(task, self.strict, self.policy, grid=grid, limits=limits)
@@ -122,7 +119,7 @@ class Guard:
             The decision. Mode "none" passes a non-finite plan on, with robustness -inf.
         """
         x = x.to(torch.float64)
-        fresh, judged = plan_judged(self.strict, self.policy, x)
+        fresh, judged = self.policy.plan_judged(x)
         found = self._kept(x, begun, fresh, judged)
         failing = torch.nonzero(~found.satisfies).squeeze(1)
         if self.backup is not None and len(failing):
@@ -177,7 +174,7 @@ class Guard:
         """
         agents, count, _ = options.shape
         options = options.to(torch.float64)
-        _, judged = plan_judged(self.strict, self.policy, options.flatten(0, 1))
+        _, judged = self.policy.plan_judged(options.flatten(0, 1))
         score = self._score(judged).view(agents, count)
         if begun is not None:
             rest = self._score(self.strict.judge(options[:, 0], begun.plan))

@@ -1,42 +1,208 @@
 """Training methods and planners, one per file, named as in `--method` and `train: {method: …}`.
 
-A file holds an object `METHOD` with the attributes of `Method`; `stlc.registry.METHODS` finds it.
-Schema, command line and tables read the names from there, without torch. Code shared by several methods lies
-in files whose names begin with `_`.
+A file holds an object `METHOD` of a subclass of `Method`; `stlc.registry.METHODS` finds it. Schema, command
+line and tables read the names from there, without torch. Code shared by several methods lies in files whose
+names begin with `_`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.config import ResolvedConfig, base_config
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.native import never
 
 if TYPE_CHECKING:
-    import torch
+    from collections.abc import Mapping
 
-    from stlc.controller.parallel.ddp import Ranks
+    from torch import Tensor
+
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
-    from stlc.controller.training.learner import Trainer
+    from stlc.controller.problem.task import PlanVerdicts, Task
+    from stlc.controller.training.config import TrainConfig
+    from stlc.diagnostics import StlcError
+    from stlc.native import Stop
     from stlc.rundir import RunDir
 
 
-class Method(Protocol):
-    """A training method or planner."""
+class Method(ABC):
+    """A training method or planner.
+
+    Attributes:
+        options: the type of its resolved options; a method with numbers of its own derives one whose
+            further fields are int or float, with defaults.
+    """
+
+    options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve all options of a run from those of the user and the system file.
-
-        `stlc.controller.training.config.base_config` gives those that do not depend on the method.
-        """
+        """Resolve all options of a run from those of the user and the system file."""
+        return base_config(task, config, kind=self.options)
 
     def learner(
-        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
-    ) -> Trainer | None:
+        self,
+        task: Task,  # noqa: ARG002
+        config: ResolvedConfig,  # noqa: ARG002
+        *,
+        steps: int,  # noqa: ARG002
+        device: torch.device,  # noqa: ARG002
+        ranks: Ranks,  # noqa: ARG002
+    ) -> Learner | None:
         """The initial state of a training; None for a planner, which has nothing to learn."""
+        return None
 
+    @abstractmethod
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> Policy:
         """Load the policy of a run.
 
         Raises:
             RunError: R101, the run is damaged or has no checkpoint yet; R102, it is of another task.
         """
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """Shares and counts on fresh states, over all ranks.
+
+    Attributes:
+        accuracy: share whose plan satisfies the specification.
+        requirements: share per requirement, in the order of the task's rules.
+        feasible: share for which a satisfying plan is known after the search (None: no search was made).
+        failing: number of states searched.
+        repaired: number of them solved.
+        explored: plans found by exploration, including those from states on their way.
+    """
+
+    accuracy: float
+    requirements: tuple[float, ...]
+    feasible: float | None = None
+    failing: int = 0
+    repaired: int = 0
+    explored: int = 0
+
+    @classmethod
+    def of(cls, judged: PlanVerdicts) -> Validation:
+        """Shares of satisfying plans among those judged."""
+        shares = satisfied(judged.requirements).double().mean(0).tolist()
+        return cls(float(satisfied(judged.rho).double().mean()), tuple(shares))
+
+    def mean(self, ranks: Ranks) -> Validation:
+        """The validation over all ranks: means of shares, sums of counts."""
+        counts = (self.failing, self.repaired, self.explored)
+        own = (self.feasible or 0.0, *counts, self.accuracy, *self.requirements)
+        feasible, failing, repaired, explored, accuracy, *shares = ranks.mean(own)
+        return Validation(
+            accuracy,
+            tuple(shares),
+            None if self.feasible is None else feasible,
+            round(failing * ranks.size),
+            round(repaired * ranks.size),
+            round(explored * ranks.size),
+        )
+
+
+class Learner(ABC):
+    """State of a training, which the training loop advances, validates and saves step by step.
+
+    A subclass gives the steps, the policy and what a checkpoint holds. The attributes and methods of search
+    and exploration describe work beside the steps, of which there is none by default.
+
+    Attributes:
+        task: problem of the training.
+        config: its resolved options.
+        steps: planned total number of steps; the loop changes it.
+        device: of torch.
+        ranks: processes that train together.
+        step: number of completed steps.
+        next_validation: step of the next validation.
+        generator: of all random numbers of this rank.
+        margin: the objective's gamma.
+        loss: of the last step; NaN before the first.
+        searches: whether failing states are repaired concurrently with the steps.
+        searching: whether such a search runs now.
+        solved: whether a search has found a satisfying plan.
+        exhausted: whether exploration with the largest effort has found nothing.
+    """
+
+    searches: bool = False
+    searching: bool = False
+    solved: bool = False
+    exhausted: bool = False
+
+    def __init__(
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        self.task, self.config, self.steps, self.device, self.ranks = task, config, steps, device, ranks
+        self.step = 0
+        self.next_validation = config.every
+        self.generator = torch.Generator().manual_seed(ranks.seed(config.seed))
+        self.margin = task.system.decl.objective.gamma
+        self.loss = math.nan
+
+    @abstractmethod
+    def advance(self) -> float:
+        """Make one step and return its loss; NaN and no step if loss or gradient is not finite."""
+
+    @property
+    @abstractmethod
+    def policy(self) -> Policy:
+        """The resulting policy, on the CPU."""
+
+    @property
+    def rate(self) -> float:
+        """Learning rate of the next step."""
+        return self.config.lr
+
+    def validate(self) -> Validation:
+        """Judge the policy on fresh states."""
+        x0 = self.task.sample(self.config.pool, generator=self.generator)
+        self.next_validation = self.step + self.config.every
+        return Validation.of(self.policy.plan_judged(x0)[1]).mean(self.ranks)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State for an exact resumption, bit for bit; on the first of several ranks, of all ranks.
+
+        All ranks have to call this at the same time.
+        """
+        return {"generator": self.generator.get_state()}
+
+    def facts(self) -> dict[str, float | int]:
+        """Scalars stored with `tensors`."""
+        last = {"loss": self.loss} if math.isfinite(self.loss) else {}
+        facts = {"step": self.step, "steps": self.steps, "margin": self.margin}
+        return last | facts | {"next_look": self.next_validation}
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Restore the state of `tensors` and `facts`."""
+        self.step, self.steps = int(facts["step"]), int(facts["steps"])
+        self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
+        self.loss = float(facts.get("loss", math.nan))
+        self.generator.set_state(tensors["generator"].cpu())
+
+    def diagnose(self) -> tuple[StlcError, bool]:
+        """Cause of a non-finite step on any rank, and whether the weights before it give finite plans."""
+        message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
+        return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
+
+    def torch_reasons(self) -> Mapping[str, str]:
+        """Part of the training -> reason why torch is used, or "" where it runs as C."""
+        return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
+
+    def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
+        """Search for plans by exploration where that is due; False where `stop` came first."""
+        return True
+
+    def wait(self, stop: Stop = never) -> bool:  # noqa: ARG002
+        """Wait for the end of the concurrent search; False where `stop` came first."""
+        return True
+
+    def close(self) -> None:  # noqa: B027
+        """End the work beside the steps."""

@@ -1,54 +1,82 @@
-"""Policies from states to plans: one network proposes several plans, the monitor selects one.
+"""Policies from states to plans: a set of candidate plans per state, of which exact verdicts select one.
 
 A continuous function cannot jump from left to right of an obstacle; a set of several can, and judging a few
-plans exactly costs well under a millisecond.
+plans exactly costs well under a millisecond. Planners and actors of one action a step propose a single plan.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from copy import copy
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.problem.task import PlanVerdicts, rank
+from stlc.controller.problem.task import rank
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from stlc.controller.problem.task import Task
+    from stlc.controller.problem.task import PlanVerdicts, Task
     from stlc.dynamics.model.mirror import Mirror
 
 
-class Policy(Protocol):
-    """Interface of planners and trained networks."""
+class Policy(ABC):
+    """Interface of planners and trained policies: candidate plans, and the selection among them.
 
+    Of the plans that satisfy the specification the one with the least performance cost is selected, otherwise
+    the one with the largest exact robustness.
+
+    Attributes:
+        task: the problem whose verdicts select the plan; `for_task` changes it.
+        network: the network that proposes the plans; None where there is none, then exports are refused.
+    """
+
+    network: PlanNetwork | None = None
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+
+    @abstractmethod
+    def candidates(self, x0: Tensor) -> Tensor:
+        """All candidate plans in physical units: (B, n) -> (B, plans, T, m)."""
+
+    def for_task(self, task: Task) -> Self:
+        """The same policy for another task of the same system, for example one with robustness margins."""
+        other = copy(self)
+        other.task = task
+        return other
+
+    @torch.no_grad()
     def plan(self, x0: Tensor) -> Tensor:
-        """Plans in physical units: (B, n) -> (B, T, m)."""
+        """The selected plan, physical units: (B, n) -> (B, T, m) in the dtype of `x0`."""
+        plans = self.candidates(x0).to(x0.dtype)
+        return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
+    def __call__(self, x0: Tensor) -> Tensor:
+        """The selected plan, as `plan` returns it."""
+        return self.plan(x0)
 
-@runtime_checkable
-class SelfJudging(Protocol):
-    """A policy that judges its own plans for a task."""
-
-    task: Task
-
+    @torch.no_grad()
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
+        """The selected plan, as `plan` returns it, and its verdicts over (B,)."""
+        return self._best(x0, self.candidates(x0).to(x0.dtype))
+
+    def _best(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, PlanVerdicts]:
+        """The best of the plans (B, plans, T, m) from each state, and its verdicts."""
+        batch, count = plans.shape[:2]
+        if count == 1:
+            return plans[:, 0], self.task.judge(x0, plans[:, 0])
+        judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
+        rows = torch.arange(batch, device=x0.device)
+        best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
+        return plans[rows, best], judged.of(rows * count + best)
 
 
-def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-    """Plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
-    if isinstance(policy, SelfJudging) and policy.task is task:
-        plans, judged = policy.plan_judged(x0)
-        return plans.to(x0.dtype), judged
-    plans = policy.plan(x0).to(x0.dtype)
-    return plans, task.judge(x0, plans)
-
-
-class ModelRollout:
+class ModelRollout(Policy):
     """Policy from a one-step actor: the plan is its closed-loop action sequence on the model.
 
     Args:
@@ -57,18 +85,16 @@ class ModelRollout:
     """
 
     def __init__(self, actor: Callable[[Tensor], Tensor], task: Task) -> None:
-        self.actor, self.task = actor, task
+        super().__init__(task)
+        self.actor = actor
 
-    @torch.no_grad()
-    def plan(self, x0: Tensor) -> Tensor:
-        """Plans in physical units: (B, n) -> (B, T, m)."""
+    def candidates(self, x0: Tensor) -> Tensor:
+        """One plan per state: (B, n) -> (B, 1, T, m)."""
         x, actions = x0, []
         for _ in range(self.task.horizon):
             actions.append(self.actor(x))
             x = self.task.system.step(x, actions[-1])
-        return torch.stack(actions, 1)
-
-    __call__ = plan
+        return torch.stack(actions, 1)[:, None]
 
 
 class PlanNetwork(nn.Module):
@@ -131,50 +157,16 @@ class PlanNetwork(nn.Module):
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 
 
-class BestOfKPolicy:
-    """Trained policy: the network proposes plans, the monitor selects the best.
+class BestOfKPolicy(Policy):
+    """Trained policy: the network proposes plans, the monitor selects the best."""
 
-    Of the plans that satisfy the specification the one with the least performance cost is selected, otherwise
-    the one with the largest exact robustness.
-    """
+    network: PlanNetwork
 
     def __init__(self, task: Task, network: PlanNetwork) -> None:
-        self.task = task
+        super().__init__(task)
         self.network = network
 
-    def for_task(self, task: Task) -> BestOfKPolicy:
-        """The same network, selecting plans for another task of the same system."""
-        return self if task is self.task else BestOfKPolicy(task, self.network)
-
-    @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
-        """All plans of the network in the dtype of `x0`: (B, n) -> (B, plans, T, m)."""
+        """All plans of the network: (B, n) -> (B, plans, T, m)."""
         plans: Tensor = self.network(x0)
-        return plans.to(x0.dtype)
-
-    def plan(self, x0: Tensor) -> Tensor:
-        """The selected plan, physical units: (B, n) -> (B, T, m)."""
-        return self.plan_judged(x0)[0]
-
-    __call__ = plan
-
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
-        plans = self.candidates(x0)
-        batch, count, steps, controls = plans.shape
-        judged = self.task.judge(x0.repeat_interleave(count, 0), plans.reshape(-1, steps, controls))
-        rows = torch.arange(batch, device=x0.device)
-        best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
-        index = rows * count + best
-        return plans[rows, best], select(judged, index)
-
-
-def select(judged: PlanVerdicts, index: Tensor) -> PlanVerdicts:
-    """The verdicts at `index`, (k,) positions along the batch."""
-    return PlanVerdicts(
-        rho=judged.rho[index],
-        safe=judged.safe[index],
-        requirements=judged.requirements[index],
-        plans=judged.plans[index],
-        columns={name: column[:, index] for name, column in judged.columns.items()},
-    )
+        return plans

@@ -63,6 +63,13 @@ class PlanVerdicts:
     plans: Tensor
     columns: Mapping[str, Tensor]
 
+    def of(self, index: Tensor) -> PlanVerdicts:
+        """The verdicts at `index`, (k,) positions along the batch."""
+        columns = {name: column[:, index] for name, column in self.columns.items()}
+        return PlanVerdicts(
+            self.rho[index], self.safe[index], self.requirements[index], self.plans[index], columns
+        )
+
 
 def satisfied(rho: Tensor) -> Tensor:
     """Return whether rho >= -1e-6, with tolerance for float32 rounding.

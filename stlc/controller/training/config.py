@@ -132,14 +132,14 @@ _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
     """Return the options unchanged. Raises ValueError where one has the wrong type or is too large."""
     words = {"method": METHODS.names, "clock": get_args(Clock)}
-    for field in fields(ResolvedConfig):
+    for field in fields(config):
         value = getattr(config, field.name)
         if field.name in words:
             if value not in words[field.name]:
                 known = ", ".join(words[field.name])
                 raise ValueError(f"`{field.name}` is {value!r:.40}, none of {known}")
             continue
-        kinds = (int, float) if field.type == "float" else (int,)
+        kinds = (int, float) if field.type in ("float", float) else (int,)
         most = _MOST.get(field.name, 1e12)
         each = value if field.name == "hidden" else (value,)
         least = 1 if field.name in _POSITIVE else 0
@@ -164,13 +164,20 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
 
 
 def base_config(
-    task: Task, config: TrainConfig, *, batch: int = 1, plans: int = 1, searches: bool = False
+    task: Task,
+    config: TrainConfig,
+    *,
+    kind: type[ResolvedConfig] = ResolvedConfig,
+    batch: int = 1,
+    plans: int = 1,
+    searches: bool = False,
 ) -> ResolvedConfig:
     """Resolve the options that do not depend on the method.
 
     Args:
         task: problem to train for.
         config: the user's options.
+        kind: type of the options; fields that a method adds keep their defaults.
         batch: default number of fresh states per step.
         plans: default number of plans of the network.
         searches: whether a search runs concurrently: torch leaves a core to it.
@@ -178,7 +185,7 @@ def base_config(
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)
     plans = config.plans or plans
-    return ResolvedConfig(
+    return kind(
         method="",
         seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,

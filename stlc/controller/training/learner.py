@@ -9,14 +9,15 @@ Each gradient step mixes fresh states with such hard ones. Of the network's plan
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import rank, satisfied
@@ -56,41 +57,13 @@ RISE = 30
 """Steps of the rise to a held peak learning rate; independent of the total number."""
 
 
-@dataclass(frozen=True, slots=True)
-class Validation:
-    """Shares and counts on fresh states, over all ranks.
-
-    Attributes:
-        accuracy: share whose plan satisfies the specification.
-        requirements: share per requirement, in the order of the task's rules.
-        feasible: share for which a satisfying plan is known after the search (None: no search was made).
-        failing: number of states searched.
-        repaired: number of them solved.
-        explored: plans found by exploration, including those from states on their way.
-    """
-
-    accuracy: float
-    requirements: tuple[float, ...]
-    feasible: float | None
-    failing: int
-    repaired: int
-    explored: int = 0
-
-
-class Trainer:
-    """State of a training. The same seed and steps give the same weights on the same machine."""
+class Trainer(Learner):
+    """Training of a plan network. The same seed and steps give the same weights on the same machine."""
 
     def __init__(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
     ) -> None:
-        self.task = task
-        self.config = config
-        self.steps = steps
-        self.device = device
-        self.ranks = ranks
-        self.step = 0
-        self.next_validation = config.every
-        self.generator = torch.Generator().manual_seed(ranks.seed(config.seed))
+        super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         self.method: NetworkMethod = METHODS.get(config.method)
         self.network = self._network()
         self.supply = self._supply()
@@ -105,7 +78,7 @@ class Trainer:
         self.buffer = ReplayBuffer.empty(
             len(task.names), task.horizon, len(task.system.control_names), device
         )
-        self.margin = task.system.decl.objective.gamma
+        self.searches = self.method.searches
         if self.searches:
             self.margin = ranks.agree(self._feasible_margin())
         self.objective = self.method.objective(self)
@@ -113,7 +86,6 @@ class Trainer:
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy = 0.0
-        self.loss = math.nan
         self.learnt = torch.empty(0, len(task.names), device=device)
 
     def advance(self) -> float:
@@ -154,17 +126,12 @@ class Trainer:
         return BestOfKPolicy(self.task, self.average if on_processor else deepcopy(self.average).cpu())
 
     @property
-    def searches(self) -> bool:
-        """True if the method repairs failing states concurrently with the steps."""
-        return self.method.searches
-
-    @property
-    def searching(self) -> bool:
+    def searching(self) -> bool:  # type: ignore[override]
         """True while a repair search runs."""
         return self.repairing is not None and not self.repairing.done()
 
     @property
-    def solved(self) -> bool:
+    def solved(self) -> bool:  # type: ignore[override]
         """True once a search has found a satisfying plan."""
         return self.buffer.count > 0
 
@@ -210,7 +177,7 @@ class Trainer:
         return True
 
     @property
-    def exhausted(self) -> bool:
+    def exhausted(self) -> bool:  # type: ignore[override]
         """True once exploration with the largest effort has found nothing."""
         return self.effort >= len(EFFORTS)
 
@@ -223,11 +190,11 @@ class Trainer:
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
         good = satisfied(judged.rho)
-        shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
-        accuracy = float(good.double().mean())
+        fresh = Validation.of(judged)
+        accuracy = fresh.accuracy
         self.next_validation = self.step + self.config.every
         if not self.searches:
-            return self._of_all(Validation(accuracy, shares, None, 0, 0))
+            return fresh.mean(self.ranks)
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
         bad = (~good).nonzero()[:, 0][: self._effort[0]]
@@ -235,7 +202,8 @@ class Trainer:
         self.accuracy = accuracy
         self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
         explored, self.explored = self.explored, 0
-        return self._of_all(Validation(accuracy, shares, feasible, failing, repaired, explored))
+        found = replace(fresh, feasible=feasible, failing=failing, repaired=repaired, explored=explored)
+        return found.mean(self.ranks)
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
         """Start a search that runs until the next round."""
@@ -252,21 +220,6 @@ class Trainer:
         """Cancel the running search."""
         if self.repairing is not None:
             self.repairing.cancel()
-
-    def _of_all(self, look: Validation) -> Validation:
-        """Validation over all ranks."""
-        counts = (look.failing, look.repaired, look.explored)
-        own = (look.feasible or 0.0, *counts, look.accuracy, *look.requirements)
-        feasible, failing, repaired, explored, accuracy, *shares = self.ranks.mean(own)
-        size = self.ranks.size
-        return Validation(
-            accuracy,
-            tuple(shares),
-            None if look.feasible is None else feasible,
-            round(failing * size),
-            round(repaired * size),
-            round(explored * size),
-        )
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
         """Store the plans found by the previous search round in replay buffer and supply.
@@ -397,13 +350,8 @@ class Trainer:
 
     def facts(self) -> dict[str, float | int]:
         """Scalars stored with `tensors`."""
-        last = {"loss": self.loss} if math.isfinite(self.loss) else {}
-        return last | {
-            "step": self.step,
-            "steps": self.steps,
-            "margin": self.margin,
+        return super().facts() | {
             "solved": self.buffer.count,
-            "next_look": self.next_validation,
             "accuracy": self.accuracy,
             "barren": int(self.barren),
             "effort": self.effort,
@@ -412,9 +360,8 @@ class Trainer:
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
         """Restore the state of `tensors` and `facts`."""
         tensors, facts = self._restored(tensors, facts)
-        self.step, self.steps = int(facts["step"]), int(facts["steps"])
-        self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
-        self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
+        super().restore(tensors, facts)
+        self.accuracy = float(facts["accuracy"])
         self.effort = max(int(facts.get("effort", 0)), 0)
         self.barren = bool(facts.get("barren", 0)) and not self.exhausted
         self.objective = self.method.objective(self)
@@ -434,7 +381,6 @@ class Trainer:
         self.supply.restore(_below(tensors, "supply"))
         if isinstance(self.training, FixedSet):
             self.training.restore(_below(tensors, "training"))
-        self.generator.set_state(tensors["generator"].cpu())
         if known := _below(tensors, "repairing"):
             self.repairing = Search.of(SearchResult(**known))
         elif begun := _below(tensors, "searching"):
@@ -465,7 +411,7 @@ def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 # ------------------------------------------------------------------ methods with a plan network
 
 
-class NetworkMethod(ABC):
+class NetworkMethod(Method):
     """Training and loading of a network that proposes `config.plans` plans.
 
     Attributes:

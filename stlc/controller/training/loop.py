@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from contextlib import AbstractContextManager
 
-    from stlc.controller.methods import Method
+    from stlc.controller.methods import Learner, Method, Validation
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.learner import Trainer, Validation
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
@@ -253,7 +252,7 @@ class _Session:
     """A training session: from the learner's present state to the end, or to an interruption."""
 
     def __init__(
-        self, writer: RunWriter, learner: Trainer, watch: Watch, time: TimeBudget, schedule: StepSchedule
+        self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
     ) -> None:
         """`schedule` is completed; with a budget it is replanned as the pace demands."""
         self.writer = writer

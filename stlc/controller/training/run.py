@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from stlc.compile.frontend.modules import file_of
 from stlc.controller.evaluation.held_out import save_states
-from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import save_checkpoint
 from stlc.controller.training.config import ResolvedConfig, checked_config
@@ -81,21 +80,16 @@ class Run:
         return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
 
     @property
-    def network_policy(self) -> BestOfKPolicy:
-        """The policy as a network policy. Raises RunError (R101) where the run's method trains none."""
-        if not isinstance(self.policy, BestOfKPolicy):
-            message = f"the policy of `{self.dir.shown}` is no network"
-            raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
-        return self.policy
-
-    @property
     def network(self) -> PlanNetwork:
         """The network of the policy. Raises RunError (R101) where the run's method trains none."""
-        return self.network_policy.network
+        if self.policy.network is None:
+            message = f"the policy of `{self.dir.shown}` is no network"
+            raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
+        return self.policy.network
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """Plans of the policy from states (B, n), and their verdicts."""
-        return plan_judged(self.task, self.policy, x0)
+        return self.policy.plan_judged(x0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,9 +217,10 @@ def load_config(folder: RunDir) -> ResolvedConfig:
     """Read the resolved options of a run. Raises RunError R101 where they are damaged."""
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
-        known = {field.name for field in fields(ResolvedConfig)}
-        engine = {key: value for key, value in values.items() if key in known}
-        return checked_config(ResolvedConfig(**{**engine, "hidden": tuple(engine["hidden"])}))
+        method = values["method"]
+        kind: type[ResolvedConfig] = METHODS.get(method).options if method in METHODS else ResolvedConfig
+        engine = {field.name: values[field.name] for field in fields(kind) if field.name in values}
+        return checked_config(kind(**{**engine, "hidden": tuple(engine["hidden"])}))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RunError(
             Diagnostic("R101", f"`{folder.shown}/{CONFIG}` is missing or damaged: {error}")

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.native import never
 
@@ -241,7 +240,7 @@ def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never)
     for _ in range(legs):
         if enough():
             break
-        _, judged = plan_judged(task, policy, x)
+        _, judged = policy.plan_judged(x)
         x = torch.stack([judged.columns[name][stride] for name in task.names], 1)
         x = x[task.alive(x)]
         seen.append(x)

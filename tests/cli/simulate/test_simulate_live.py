@@ -16,6 +16,7 @@ from stlc.controller.deployment.live import LiveMonitor
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
 from stlc.controller.guard.candidates import Mode
 from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.declaration.load import parse_system
@@ -42,14 +43,11 @@ backup: {bins: 3, T0: [1], batch: 64}
 """
 
 
-class Away:
+class Away(Policy):
     """Drives off."""
 
-    def __init__(self, horizon: int) -> None:
-        self.horizon = horizon
-
-    def plan(self, x0: Tensor) -> Tensor:
-        return torch.ones((len(x0), self.horizon, 1), dtype=x0.dtype)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.ones((len(x0), 1, self.task.horizon, 1), dtype=x0.dtype)
 
 
 def shown(
@@ -83,7 +81,7 @@ def shown(
 
     view.start()
     made = world_type(task.system.decl)
-    drive(Guard(task, Away(task.horizon), guard), made, setting, Recorder(6), watch)
+    drive(Guard(task, Away(task), guard), made, setting, Recorder(6), watch)
     view.stop()
     assert oversight.counts.sum() == seeds * 6 * steps
     return stream.getvalue()

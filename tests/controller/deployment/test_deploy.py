@@ -5,19 +5,21 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 
 F64 = torch.float64
 
 
-class Rule:
+class Rule(Policy):
     """A policy from a function of the states."""
 
     def __init__(self, task: Task, action: float) -> None:
-        self.horizon, self.action = task.horizon, action
+        super().__init__(task)
+        self.action = action
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return torch.full((len(x0), self.horizon, 1), self.action)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.full((len(x0), 1, self.task.horizon, 1), self.action)
 
 
 def test_without_a_guard_the_policy_acts_whatever_it_plans(car_task: Task) -> None:
@@ -65,14 +67,11 @@ def test_a_plan_that_is_no_number_is_never_executed_under_guard(car_task: Task) 
     assert torch.isneginf(Guard(car_task, broken, "none").decide(x).rho).all()
 
 
-class Slowing:
+class Slowing(Policy):
     """A policy that brakes the harder the faster it is."""
 
-    def __init__(self, task: Task) -> None:
-        self.horizon = task.horizon
-
-    def plan(self, x0: Tensor) -> Tensor:
-        return -x0[:, 1, None, None].expand(-1, self.horizon, 1)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return -x0[:, 1, None, None, None].expand(-1, 1, self.task.horizon, 1)
 
 
 def test_a_plan_of_which_several_steps_were_taken_is_carried_on_by_the_policy(car_task: Task) -> None:
@@ -157,15 +156,15 @@ def test_a_begun_plan_goes_on_while_it_holds_and_is_no_worse(car_task: Task) -> 
     state = {"x": -1.3, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}
     x = torch.tensor([[state[name] for name in car_task.names]], dtype=F64)
 
-    class Later:
+    class Later(Policy):
         """Waits for half a second, then moves up to the line."""
 
-        def plan(self, x0: Tensor) -> Tensor:
+        def candidates(self, x0: Tensor) -> Tensor:
             steps = torch.zeros(len(x0), car_task.horizon, 1, dtype=x0.dtype)
             steps[:, 5:8], steps[:, 9:12] = 10.0 / 3, -10.0 / 3
-            return steps
+            return steps[:, None]
 
-    guard = Guard(car_task, Later(), "none")
+    guard = Guard(car_task, Later(car_task), "none")
     decision, begun = guard.decide(x), None
     assert float(decision.rho[0]) >= 0
     fresh = x

@@ -14,6 +14,7 @@ from stlc.controller.deployment.disturbance import Disturbance, errors_of
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
@@ -54,15 +55,16 @@ scenario:
 SPEC = "signal x [m]\nsignal p: real[2] [m]\nconst speed = 1 m/s\nrequire a: always[0, T] x > -speed * 1 s\n"
 
 
-class Still:
+class Still(Policy):
     """Remembers what it saw, and does nothing."""
 
     def __init__(self, task: Task) -> None:
-        self.horizon, self.saw = task.horizon, []  # type: ignore[var-annotated]
+        super().__init__(task)
+        self.saw: list[Tensor] = []
 
-    def plan(self, x0: Tensor) -> Tensor:
+    def candidates(self, x0: Tensor) -> Tensor:
         self.saw.append(x0)
-        return torch.zeros((len(x0), self.horizon, 1), dtype=x0.dtype)
+        return torch.zeros((len(x0), 1, self.task.horizon, 1), dtype=x0.dtype)
 
 
 def task_of(scenario: str) -> Task:
@@ -153,8 +155,8 @@ def test_a_scenario_may_name_a_world_of_its_own() -> None:
 class Steady(Still):
     """Commands the same always."""
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return super().plan(x0) + 0.5
+    def candidates(self, x0: Tensor) -> Tensor:
+        return super().candidates(x0) + 0.5
 
 
 def steady(scenario: str, agents: int = 40) -> tuple[DeploymentRecording, Steady]:

@@ -25,7 +25,7 @@ from stlc.controller.evaluation.metrics import METRICS, measure
 from stlc.controller.evaluation.stats import MeanInterval, student
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Guard, GuardDecision
-from stlc.controller.policies.policy import BestOfKPolicy
+from stlc.controller.policies.policy import BestOfKPolicy, Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, SystemFileError
@@ -36,15 +36,12 @@ from stlc.trace import load_trace
 SETTING = Setting(seeds=(0, 1), agents=6, steps=40)
 
 
-class Careful:
+class Careful(Policy):
     """The rule-based driver as a policy: its first action, then coasting to a halt."""
 
-    def __init__(self, task: Task) -> None:
-        self.horizon = task.horizon
-
-    def plan(self, x0: Tensor) -> Tensor:
-        plan = torch.full((len(x0), self.horizon, 1), -2.0, dtype=x0.dtype)
-        plan[:, 0] = careful(x0.double())
+    def candidates(self, x0: Tensor) -> Tensor:
+        plan = torch.full((len(x0), 1, self.task.horizon, 1), -2.0, dtype=x0.dtype)
+        plan[:, 0, 0] = careful(x0.double())
         return plan
 
 
@@ -203,16 +200,16 @@ def test_a_world_that_fails_leaves_what_happened_until_then(
 
 
 def test_a_policy_that_gives_no_number_is_told(car_task: Task) -> None:
-    class Broken:
-        def plan(self, x0: Tensor) -> Tensor:
-            return torch.full((len(x0), car_task.horizon, 1), torch.nan)
+    class Broken(Policy):
+        def candidates(self, x0: Tensor) -> Tensor:
+            return torch.full((len(x0), 1, car_task.horizon, 1), torch.nan)
 
     with pytest.raises(InterruptedDeploymentError) as caught:
-        deploy(car_task, Broken(), Setting((0,), 2, 5), "none")
+        deploy(car_task, Broken(car_task), Setting((0,), 2, 5), "none")
     assert isinstance(caught.value.__cause__, RunError)
     assert caught.value.__cause__.diagnostics[0].code == "R402"
     assert caught.value.recording is None
-    guarded = deploy(car_task, Broken(), Setting((0,), 2, 5), "paper")
+    guarded = deploy(car_task, Broken(car_task), Setting((0,), 2, 5), "paper")
     assert guarded.decisions["policy"] == 0.0
 
 

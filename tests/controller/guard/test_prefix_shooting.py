@@ -21,16 +21,17 @@ from stlc.runtime.prefixes import PrefixGrid
 F64 = torch.float64
 
 
-class Constant:
+class Constant(Policy):
     """A policy that always plans the same action."""
 
     def __init__(self, task: Task, action: float) -> None:
-        self.task, self.action = task, action
+        super().__init__(task)
+        self.action = action
         self.rows: list[int] = []
 
-    def plan(self, x0: Tensor) -> Tensor:
+    def candidates(self, x0: Tensor) -> Tensor:
         self.rows.append(len(x0))
-        return torch.full((len(x0), self.task.horizon, 1), self.action, dtype=x0.dtype)
+        return torch.full((len(x0), 1, self.task.horizon, 1), self.action, dtype=x0.dtype)
 
 
 def paper_search(task: Task, policy: Policy, grid: PrefixGrid, seconds: float | None = None) -> StagedSearch:

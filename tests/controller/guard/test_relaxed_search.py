@@ -11,6 +11,7 @@ from stlc.controller.guard.candidates import REPAIRED, Limits
 from stlc.controller.guard.guard import Guard, GuardDecision
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
@@ -43,15 +44,15 @@ def cart() -> Task:
     return Task.of(parse(Source("a.stl", SPEC)), System(decl))  # type: ignore[arg-type]
 
 
-class Onward:
+class Onward(Policy):
     """Speeds up."""
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return torch.ones((len(x0), 6, 1), dtype=x0.dtype)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.ones((len(x0), 1, 6, 1), dtype=x0.dtype)
 
 
 def decided(task: Task, x: Tensor) -> GuardDecision:
-    return Guard(task, Onward(), "full", limits=LIMITS).decide(x)
+    return Guard(task, Onward(task), "full", limits=LIMITS).decide(x)
 
 
 def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
@@ -66,7 +67,9 @@ def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
 def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
     task = cart()
     x = task.sample(60, seed=1, dtype=torch.float64)
-    plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    plain = StagedSearch(task, Onward(task), "full", limits=Limits(seconds=None)).search(
+        x, Onward(task).plan(x)
+    )
     found = decided(task, x)
     strict = with_margins(task, LIMITS.margin)
     assert 10 < int(plain.is_safe.sum()) < 60
@@ -81,9 +84,11 @@ def test_it_spares_more_than_a_guard_that_asks_for_nothing() -> None:
     task = cart()
     x = task.sample(60, seed=2, dtype=torch.float64)
     strict = with_margins(task, LIMITS.margin)
-    guard = RelaxedSearch(task, strict, Onward(), limits=LIMITS)
-    found = guard.search(x, Onward().plan(x))
-    plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    guard = RelaxedSearch(task, strict, Onward(task), limits=LIMITS)
+    found = guard.search(x, Onward(task).plan(x))
+    plain = StagedSearch(task, Onward(task), "full", limits=Limits(seconds=None)).search(
+        x, Onward(task).plan(x)
+    )
     short = plain.is_safe & ~found.is_safe
     assert int(short.sum()) > 5
     spare, other = (task.judge(x, each.plans).safe[short] for each in (found, plain))

@@ -14,7 +14,9 @@ import torch
 import stlc.controller.methods as package
 from stlc import Run, System
 from stlc.cli.framework.app import main
-from stlc.controller.policies.policy import ModelRollout, plan_judged
+from stlc.controller.guard.candidates import Limits
+from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.diagnostics import RunError, SystemFileError, UsageError
@@ -25,17 +27,11 @@ SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
 
 COASTING = '''"""Coasting: the least force at every step, a planner that learns nothing."""
 
+from stlc.controller.methods import Method
 from stlc.controller.policies.policy import ModelRollout
-from stlc.controller.training.config import base_config
 
 
-class Coasting:
-    def resolve(self, task, config):
-        return base_config(task, config)
-
-    def learner(self, task, config, **_):
-        return None
-
+class Coasting(Method):
     def load(self, task, run, config, device):
         low = task.system.control_low
         return ModelRollout(lambda x: low.to(x).expand(len(x), -1), task)
@@ -43,19 +39,89 @@ class Coasting:
 
 METHOD = Coasting()
 '''
+CLIMBING = '''"""Climbing: one action a step, the state times a gain that is learnt by random steps."""
+
+from dataclasses import dataclass
+
+import torch
+from stlc.controller.methods import Learner, Method
+from stlc.controller.policies.policy import ModelRollout
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.config import ResolvedConfig
+from stlc.controller.training.run import spec_hash, trained_on
+
+
+@dataclass(frozen=True, slots=True)
+class Options(ResolvedConfig):
+    noise: float = 0.5
+
+
+def feedback(task, gain):
+    low, high = task.system.control_low, task.system.control_high
+    return ModelRollout(lambda x: (x @ gain.to(x)).clamp(low.to(x), high.to(x)), task)
+
+
+class Climber(Learner):
+    def __init__(self, task, config, **rest):
+        super().__init__(task, config, **rest)
+        self.gain = torch.zeros(len(task.names), len(task.system.control_names))
+
+    @property
+    def policy(self):
+        return feedback(self.task, self.gain)
+
+    def advance(self):
+        x0 = self.task.sample(32, generator=self.generator)
+        other = self.gain + self.config.noise * torch.randn(self.gain.shape, generator=self.generator)
+        mine, new = (-feedback(self.task, gain).plan_judged(x0)[1].rho.mean() for gain in (self.gain, other))
+        self.gain = other if new < mine else self.gain
+        self.step, self.loss = self.step + 1, float(min(mine, new))
+        return self.loss
+
+    def tensors(self):
+        return super().tensors() | {"gain": self.gain}
+
+    def restore(self, tensors, facts):
+        super().restore(tensors, facts)
+        self.gain = tensors["gain"]
+
+
+class Climbing(Method):
+    options = Options
+
+    def learner(self, task, config, **rest):
+        return Climber(task, config, **rest)
+
+    def load(self, task, run, config, device):
+        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        return feedback(task, saved.tensors["gain"])
+
+
+METHOD = Climbing()
+'''
+
+
+def added(name: str, text: str, folder: Path) -> Iterator[None]:
+    """A method more, in a file of its own."""
+    (folder / "methods").mkdir()
+    (folder / "methods" / f"{name}.py").write_text(text, encoding="utf-8")
+    package.__path__.append(str(folder / "methods"))
+    yield
+    package.__path__.pop()
+    METHODS._entries.pop(name, None)
+    sys.modules.pop(f"stlc.controller.methods.{name}", None)
 
 
 @pytest.fixture
 def coasting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A method more, in a file of its own."""
-    (tmp_path / "methods").mkdir()
-    (tmp_path / "methods" / "coasting.py").write_text(COASTING, encoding="utf-8")
-    package.__path__.append(str(tmp_path / "methods"))
     monkeypatch.chdir(tmp_path)
-    yield
-    package.__path__.pop()
-    METHODS._entries.pop("coasting", None)
-    sys.modules.pop("stlc.controller.methods.coasting", None)
+    yield from added("coasting", COASTING, tmp_path)
+
+
+@pytest.fixture
+def climbing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    yield from added("climbing", CLIMBING, tmp_path)
 
 
 def test_the_default_comes_first_and_parts_of_methods_are_none() -> None:
@@ -96,10 +162,33 @@ def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
+@pytest.mark.usefixtures("climbing")
+def test_a_method_of_one_action_a_step_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
+    """It has its own option, is trained, resumed bit for bit, deployed under guards, and opened again."""
+
+    def trained(*words: str) -> Run:
+        assert main(["train", *words, "--no-pictures", "--json"]) == 0
+        return Run.open(json.loads(capsys.readouterr().out)["result"]["run"])
+
+    options = [SPEC, "--system", CAR, "--method", "climbing", "--held-out", "40", "--drives", "4"]
+    whole, part = trained(*options, "--steps", "60"), trained(*options, "--steps", "30")
+    rows = [json.loads(line) for line in (whole.dir.path / "train.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [50]
+    assert json.loads((whole.dir.path / "config.resolved.yaml").read_text())["noise"] == 0.5
+    resumed = trained("--resume", str(part.dir.path), "--steps", "60")
+    x = whole.task.sample(5, seed=0, dtype=torch.float64)
+    assert torch.equal(whole.policy(x), resumed.policy(x))
+    assert not torch.equal(whole.policy(x), torch.zeros_like(whole.policy(x)))
+    guarded = Guard(whole.task, whole.policy, "full", limits=Limits(margin={"stop": 0.1})).decide(x)
+    assert torch.isfinite(guarded.action).all()
+    with pytest.raises(RunError, match="no network"):
+        _ = whole.network
+
+
 def test_an_actor_plans_along_the_model(car_task: Task) -> None:
     policy = ModelRollout(lambda x: 0.1 * x[:, :1], car_task)
     x = car_task.sample(4, seed=1, dtype=torch.float64)
-    plans, _ = plan_judged(car_task, policy, x)
+    plans = policy.plan(x)
     path = car_task.rollout(x, plans)
     torch.testing.assert_close(plans, 0.1 * path[:, :-1, :1])
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.controller.problem.task import KEPT, Task
 from stlc.dynamics.model.system import System
@@ -103,15 +104,15 @@ def test_a_plan_goes_on_while_it_gets_further_in(task: Task, path: list[float], 
     assert task.promises.deepened(columns(task, path)).tolist() == [goes_on]
 
 
-class Leaver:
+class Leaver(Policy):
     """Plans to go left, always."""
 
-    def plan(self, x0: Tensor) -> Tensor:
-        return torch.full((len(x0), 8, 1), -1.0, dtype=x0.dtype)
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.full((len(x0), 1, 8, 1), -1.0, dtype=x0.dtype)
 
 
 def test_a_guard_carries_on_with_a_plan_that_keeps_a_promise(task: Task) -> None:
-    guard = Guard(task, Leaver(), "none")
+    guard = Guard(task, Leaver(task), "none")
     x = torch.zeros(1, len(task.names), dtype=torch.float64)
     x[0, task.names.index("x")], x[0, task.names.index("there")] = 2.05, 1.0
     for name in task.names:

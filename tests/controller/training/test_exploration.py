@@ -9,10 +9,11 @@ import torch
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.methods import Validation
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.exploration import Exploration, pieces
-from stlc.controller.training.learner import Trainer, Validation
+from stlc.controller.training.learner import Trainer
 from stlc.controller.training.local_search import Searcher
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
