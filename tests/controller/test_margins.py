@@ -132,13 +132,13 @@ def test_margins_are_asked_for_by_number_by_name_or_measured() -> None:
 )
 def test_what_is_no_margin(text: str) -> None:
     with pytest.raises(UsageError, match=r"is no (margin|safety requirement)"):
-        parse_margins([text]).of(task_of("mild"), Onward(), "full")
+        parse_margins([text]).of(task := task_of("mild"), Onward(task), "full")
 
 
 def test_a_margin_of_what_is_no_safety_requirement() -> None:
     with pytest.raises(UsageError) as caught:
-        parse_margins(["p_lo=1"]).of(task_of("mild"), Onward(), "full")
+        parse_margins(["p_lo=1"]).of(task := task_of("mild"), Onward(task), "full")
     (found,) = caught.value.diagnostics
     assert found.help == ("did you mean `p_low`?", "safety requirements: p_low, q_low")
     with pytest.raises(UsageError, match="`q_up` is no safety requirement"):
-        parse_margins(["q_up=1"]).of(task_of("mild"), Onward(), "full")
+        parse_margins(["q_up=1"]).of(task := task_of("mild"), Onward(task), "full")
