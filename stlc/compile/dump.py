@@ -137,8 +137,8 @@ def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
     """Distinct intervals: operator, seconds, samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
-        if isinstance(node, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since)):
-            line = _interval(node.op, node.window, grid, back=isinstance(node, (ir.PastTemporal, ir.Since)))
+        if isinstance(node, ir.Windowed):
+            line = _interval(node.op, node.window, grid, back=node.back)
             if line not in seen:
                 seen.add(line)
                 yield line

@@ -108,7 +108,7 @@ def _farthest(node: ir.Formula) -> int:
 
 
 def _long(formula: ir.Formula, length: int) -> ir.Formula:
-    if isinstance(formula, (ir.Temporal, ir.Until)):
+    if isinstance(formula, ir.Windowed) and not formula.back:
         formula = replace(formula, window=_longer(formula.window, length))
     return map_children(formula, formulas=lambda part: _long(part, length))
 

@@ -215,7 +215,7 @@ def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[dict[str, Any]]
     from stlc.compile.ir.traverse import nodes
 
     for node in nodes(rule.formula):
-        if not isinstance(node, ir.Temporal | ir.PastTemporal | ir.Until | ir.Since):
+        if not isinstance(node, ir.Windowed):
             continue
         steps = (node.window.lo, node.window.hi)
         yield {

@@ -98,9 +98,8 @@ def read_by(stream: DerivedColumn) -> frozenset[str]:
 
 def endless(formula: ir.Formula) -> bool:
     """True if the formula has an unbounded future window."""
-    return any(
-        isinstance(node, (ir.Temporal, ir.Until)) and node.window.hi is None for node in nodes(formula)
-    )
+    windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
+    return any(node.window.hi is None and not node.back for node in windowed)
 
 
 def column(name: str) -> ir.Predicate:
@@ -195,7 +194,7 @@ def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
 
 def unbounded_past(node: ir.Formula) -> bool:
     """True if a node is a past operator with an unbounded window."""
-    return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
+    return isinstance(node, ir.Windowed) and node.back and node.window.hi is None
 
 
 def looks_on(formula: ir.Formula) -> int:

@@ -157,9 +157,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(looks_at_ends, numbers(body))):
         return math.inf, math.inf
-    back = any(
-        isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None for node in nodes(body)
-    )
+    back = any(isinstance(node, ir.Windowed) and node.back and node.window.hi is None for node in nodes(body))
     return math.inf if back else past, math.inf if uses_end(body) else future
 
 

@@ -229,7 +229,7 @@ class _Planner(Scheduler):
                 self._check(num, run)
             case ir.BoolOp(op, items):
                 return self._join(node, PICKS[op], _operands(op, items), run)
-            case ir.Temporal(_, window) | ir.Until(_, window):
+            case ir.Windowed(window=window, back=False):
                 most = latest(run.last) + max(window.lo, window.hi or 0)
                 if most >= self.domain.samples:
                     raise Untranslatable("a window that leaves the plan")

@@ -293,7 +293,7 @@ class _Windowed(StepForm):
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
-        self.back = isinstance(self.node, (ir.PastTemporal, ir.Since))
+        self.back = self.node.back
         self.pick = _MACRO[PICKS[self.node.op]]
         self.window: ir.Window = self.node.window
         self.before = self.out["k - 1" if self.back else "k + 1"]
