@@ -200,7 +200,7 @@ def image_of_state(mirror: Mirror, task: Task) -> list[str]:
 
 def image_of_action(task: Task) -> list[str]:
     """Statements that fill `image` from the controls `u`; angles stay within a turn of their range."""
-    controls = task.system.controls
+    controls = task.system.decl.controls
     moved = {each.name: each.value for each in task.system.decl.policy.mirror}
     numbers = [moved.get(each.name, ir.Signal(each.name)) for each in controls]
     lines = _assigned("image", numbers, {each.name: f"u[{i}]" for i, each in enumerate(controls)})
@@ -214,7 +214,7 @@ def image_of_action(task: Task) -> list[str]:
 def squashed(task: Task) -> list[str]:
     """Statements that fill `u` from the network's output for one step, `raw`."""
     lines, at = [], 0
-    for i, each in enumerate(task.system.controls):
+    for i, each in enumerate(task.system.decl.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
         match each.squash:
             case "tanh":
@@ -330,7 +330,7 @@ def header(task: Task, network: PlanNetwork) -> str:
 
 def main_of(task: Task) -> str:
     """An example program: states from standard input, decisions to standard output."""
-    return _template("main.c.txt").substitute({"SYSTEM": c_comment(task.system.name)})
+    return _template("main.c.txt").substitute({"SYSTEM": c_comment(task.system.decl.name)})
 
 
 def makefile() -> str:
@@ -350,9 +350,9 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     """Sizes, constants and straight-line code."""
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
-    controls = task.system.controls
+    controls = task.system.decl.controls
     return {
-        "NAME": c_comment(task.system.name),
+        "NAME": c_comment(task.system.decl.name),
         "SPEC": c_comment(task.compiled.name),
         "STATES": len(task.names),
         **_added(task),

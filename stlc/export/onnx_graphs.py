@@ -160,9 +160,9 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
     """
     folded, swapped = _folded(task, network, state)
     raw = _layers(network, _observed(task, folded))
-    raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.controls))
+    raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.decl.controls))
     columns = iter(raw.transposed(3, 0, 1, 2).rows())
-    controls = {each.name: _squashed(each, columns) for each in task.system.controls}
+    controls = {each.name: _squashed(each, columns) for each in task.system.decl.controls}
     if swapped is not None:
         mask = swapped.reshaped(1, BATCH, 1, 1)
         images = _images(task, controls)
@@ -232,7 +232,7 @@ def _images(task: Task, controls: Mapping[str, Value]) -> dict[str, Value]:
     names = set(task.names)
     images = [each for each in task.system.decl.policy.mirror if each.name not in names]
     moved = {**controls, **assigned({each.name: each.value for each in images}, controls)}
-    for each in task.system.controls:
+    for each in task.system.decl.controls:
         if each.squash == "angle":
             moved[each.name] = ONNX_OPS.mod(moved[each.name] - each.low, 2.0 * math.pi) + each.low
     return moved
@@ -460,7 +460,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """
     sheet = Sheet()
     state = sheet.input("state", (BATCH, len(task.names)))
-    begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.controls)))
+    begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
     fresh = proposed(task, network, columns_of(state, task.names))
     count = fresh.shape[1]
     table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
@@ -564,5 +564,5 @@ def falling(task: Task) -> dict[str, Value]:
 def _asked(task: Task) -> tuple[Mapping[str, Value], Value]:
     sheet = Sheet()
     state = sheet.input("state", (BATCH, len(task.names)))
-    plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.controls)))
+    plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.decl.controls)))
     return columns_of(state, task.names), plans

@@ -179,11 +179,11 @@ def _facts(run: Run) -> dict[str, object]:
         "stlc": __version__,
         "run": run.dir.name,
         "spec": {"name": task.compiled.name, "sha256": spec_hash(run.dir)},
-        "system": {"name": task.system.name, "sha256": system_hash(run.dir)},
+        "system": {"name": task.system.decl.name, "sha256": system_hash(run.dir)},
         "states": [asdict(each) for each in _states(task)],
         "controls": [
             asdict(ControllerQuantity(each.name, str(each.unit), each.low, each.high))
-            for each in task.system.controls
+            for each in task.system.decl.controls
         ],
         "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],

@@ -199,7 +199,7 @@ def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
     """The backup policy as an exported program for any number of states; they and the plans are float64."""
     module = Guarding(task, network).eval()
     x = task.sample(2, seed=0, dtype=torch.float64)
-    plan = torch.zeros(2, task.horizon, len(task.system.controls), dtype=torch.float64)
+    plan = torch.zeros(2, task.horizon, len(task.system.decl.controls), dtype=torch.float64)
     with torch.no_grad(), unmoved():
         module(x, plan)  # cached constants are created here, not while exporting
         batch = torch.export.Dim("batch", min=1)

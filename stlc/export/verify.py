@@ -215,7 +215,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
         raise RunError(
             Diagnostic("R105", "the exported C does not compile", note=tuple(done.said.splitlines()[:5]))
         )
-    rules, shape = len(task.rules), (task.horizon, len(task.system.controls))
+    rules, shape = len(task.rules), (task.horizon, len(task.system.decl.controls))
 
     def decide(x: Tensor) -> Answer:
         table = torch.tensor(answers([str(built), "policy"], x.tolist()), dtype=torch.float64)

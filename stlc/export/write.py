@@ -151,10 +151,10 @@ def _facts(run: Run) -> dict[str, object]:
     feedback = task.system.decl.feedback
     return {
         "spec": task.compiled.name,
-        "system": task.system.name,
+        "system": task.system.decl.name,
         "states": list(task.names),
         "controls": [
-            {"name": each.name, "low": each.low, "high": each.high} for each in task.system.controls
+            {"name": each.name, "low": each.low, "high": each.high} for each in task.system.decl.controls
         ],
         "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],

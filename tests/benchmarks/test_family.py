@@ -59,7 +59,9 @@ def test_at_the_value_of_the_benchmark_a_family_is_the_benchmark(
     assert [item for item in spec.items if isinstance(item, ast.Param)]
     x0 = own.sample(200, seed=1, dtype=torch.float64)
     generator = torch.Generator().manual_seed(2)
-    share = torch.rand(200, own.horizon, len(own.system.controls), generator=generator, dtype=torch.float64)
+    share = torch.rand(
+        200, own.horizon, len(own.system.decl.controls), generator=generator, dtype=torch.float64
+    )
     u = own.system.control_low + share * (own.system.control_high - own.system.control_low)
     here, there = same.judge(x0, u).requirements, own.judge(x0, u).requirements
     torch.testing.assert_close(here, there, rtol=0, atol=1e-12)

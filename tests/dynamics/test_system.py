@@ -42,7 +42,7 @@ policy:
 
 
 def test_squash_maps_onto_the_ranges(make: Make) -> None:
-    controls = make(MIXED).controls
+    controls = make(MIXED).decl.controls
     assert raw_width(controls) == 4
     raw = torch.tensor(
         [[0.0, 0.0, 1.0, 0.0], [9.0, -1.0, 0.0, 9.0], [-9.0, 0.0, -2.0, -9.0], [0.5, 1.0, 1.0, 0.0]]
@@ -54,7 +54,7 @@ def test_squash_maps_onto_the_ranges(make: Make) -> None:
 
 
 def test_squash_keeps_shapes_dtypes_and_gradients(make: Make, car: System) -> None:
-    for controls in (make(MIXED).controls, car.controls):
+    for controls in (make(MIXED).decl.controls, car.decl.controls):
         raw = torch.zeros(2, 3, 5, raw_width(controls), dtype=torch.float64, requires_grad=True)
         out = squash(raw, controls)
         assert out.shape == (2, 3, 5, len(controls))
@@ -147,9 +147,9 @@ def test_rollouts_do_not_write_into_their_inputs(car: System, switch: Tanh | Non
 
 def test_the_hash_follows_text_and_overrides(make: Make) -> None:
     one, same, other = make(MIXED), make(MIXED), make(MIXED + "# changed\n")
-    assert one.hash == same.hash != other.hash
-    assert len(one.hash) == 64
-    assert make(MIXED, train__seed="3").hash != one.hash
+    assert one.decl.hash == same.decl.hash != other.decl.hash
+    assert len(one.decl.hash) == 64
+    assert make(MIXED, train__seed="3").decl.hash != one.decl.hash
 
 
 def test_the_description_is_a_table(make: Make) -> None:

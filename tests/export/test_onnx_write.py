@@ -112,7 +112,7 @@ def test_a_plan_that_is_no_number_counts_as_violated() -> None:
     run, folder = exported("traffic", "car")
     graphs = Graphs(read_facts(folder))
     x = run.task.sample(3, seed=2, dtype=torch.float64)
-    plans = torch.zeros(3, run.task.horizon, len(run.task.system.controls), dtype=torch.float64)
+    plans = torch.zeros(3, run.task.horizon, len(run.task.system.decl.controls), dtype=torch.float64)
     plans[0, 2, 0], plans[1, 0, 0] = torch.nan, torch.inf
     wanted = run.task.judge(x, plans)
     found, _ = graphs.judged(x.numpy(), plans.numpy())

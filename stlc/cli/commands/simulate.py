@@ -328,7 +328,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
     world = run.task.system.decl.test.world
     facts = {
         "spec": run.task.compiled.name,
-        "system": run.task.system.name,
+        "system": run.task.system.decl.name,
         "run": run.dir.name,
         "world": world.path.name if world is not None else None,
         "scenario": _laid_over(run),
@@ -396,7 +396,7 @@ def _require_robots(run: Run) -> None:
     from stlc.view.bullet import require_window
 
     if not isinstance(world_type(run.task.system.decl), Staged):
-        message = f"`--window` shows robots, and `{run.task.system.name}` has none"
+        message = f"`--window` shows robots, and `{run.task.system.decl.name}` has none"
         raise UsageError(Diagnostic("U101", message))
     require_window()
 

@@ -112,7 +112,7 @@ def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
     warnings = system.probe(_DRAWN, seed=seed)
     low, high = system.control_low, system.control_high
     generator = torch.Generator().manual_seed(seed)
-    share = torch.rand((_DRAWN, steps, len(system.controls)), generator=generator)
+    share = torch.rand((_DRAWN, steps, len(system.decl.controls)), generator=generator)
     with torch.no_grad():
         system.require_finite(system.rollout(system.sample(_DRAWN, seed=seed), low + share * (high - low)))
     return tuple(warnings)

@@ -77,7 +77,7 @@ class Chance:
 
 def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
     """The controls of a task with their grid values."""
-    controls = zip(task.system.controls, grid.values, strict=True)
+    controls = zip(task.system.decl.controls, grid.values, strict=True)
     return tuple(Axis(each.name, each.low, each.high, tuple(sorted(values))) for each, values in controls)
 
 

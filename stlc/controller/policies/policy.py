@@ -118,7 +118,7 @@ class PlanNetwork(nn.Module):
         self.plans = plans
         self.mirror: Mirror | None = task.system.mirror if mirrored else None
         self._task = task
-        self._width = raw_width(task.system.controls)
+        self._width = raw_width(task.system.decl.controls)
         widths = [task.system.observed_count, *hidden]
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise(widths):
@@ -147,7 +147,7 @@ class PlanNetwork(nn.Module):
         observed = self._task.system.observe(x0).to(self.centre.dtype)
         raw = self.body((observed - self.centre) / self.spread)
         raw = raw.view(-1, self.plans, self._task.horizon, self._width)
-        plans = squash(raw, self._task.system.controls)
+        plans = squash(raw, self._task.system.decl.controls)
         if self.mirror is None or swapped is None:
             return plans
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)

@@ -63,7 +63,7 @@ class NativeJudge:
         self.kernel = kernel
         self.names = system.names
         self.rules = len(rules)
-        controls = system.controls
+        controls = system.decl.controls
         turns = torch.tensor([control.squash == "angle" for control in controls])
         low, high = system.control_low, system.control_high
         self._bounds = torch.stack((low, high, turns.to(low.dtype))).double().numpy()

@@ -116,7 +116,7 @@ def _motion(step: TrainingStep) -> StlcError | None:
     return SystemFileError(
         Diagnostic(
             "S302",
-            f"the dynamics of {step.task.system.name} give {what} in `{name}`, {then}",
+            f"the dynamics of {step.task.system.decl.name} give {what} in `{name}`, {then}",
             step.task.system.decl.places.get(name),
             label="declared here",
             help=("clamp the state, shorten the step, or keep divisors away from 0",),

@@ -132,7 +132,7 @@ class Exploration:
         self._low, self._high = (
             bound.double().numpy(force=True) for bound in (system.control_low, system.control_high)
         )
-        self._turns = np.array([control.squash == "angle" for control in system.controls])
+        self._turns = np.array([control.squash == "angle" for control in system.decl.controls])
         read = frozenset[str]().union(*(columns(piece) for piece in self.pieces))
         kinds = {timer.name: timer.kind for timer in system.timers}
         moving = system.exact_step.next.keys()

@@ -63,7 +63,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "started": now(),
             "spec": task.compiled.name,
             "spec_path": task.compiled.spec.source.name,
-            "system": task.system.name,
+            "system": task.system.decl.name,
             "system_path": str(decl.path),
             "overrides": dict(launch.overrides),
             "seed": resolve_config(task, config).seed,

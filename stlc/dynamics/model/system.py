@@ -32,7 +32,6 @@ from stlc.dynamics.model.rollout import Columns, Stepper
 from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
-from stlc.dynamics.schema.names import ControlDecl
 from stlc.files import find_system
 
 HARD = Hard()
@@ -97,16 +96,6 @@ class System:
 
     # ---------------------------------------------------------------- description
 
-    @property
-    def name(self) -> str:
-        """Name of the system."""
-        return self.decl.name
-
-    @property
-    def hash(self) -> str:
-        """SHA-256 of the file's text and its overrides."""
-        return self.decl.hash
-
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the state columns."""
@@ -122,31 +111,26 @@ class System:
         """Horizon of a plan in steps."""
         return self.decl.horizon
 
-    @property
-    def controls(self) -> tuple[ControlDecl, ...]:
-        """Declarations of the inputs."""
-        return self.decl.controls
-
     @cached_property
     def control_names(self) -> tuple[str, ...]:
         """Names of the inputs."""
-        return tuple(control.name for control in self.controls)
+        return tuple(control.name for control in self.decl.controls)
 
     @cached_property
     def control_low(self) -> Tensor:
         """Lower ends of the control ranges, (m,)."""
-        return torch.tensor([control.low for control in self.controls], dtype=torch.float32)
+        return torch.tensor([control.low for control in self.decl.controls], dtype=torch.float32)
 
     @cached_property
     def control_high(self) -> Tensor:
         """Upper ends of the control ranges, (m,)."""
-        return torch.tensor([control.high for control in self.controls], dtype=torch.float32)
+        return torch.tensor([control.high for control in self.decl.controls], dtype=torch.float32)
 
     @property
     def actuators(self) -> tuple[tuple[float, float], ...]:
         """Ranges of the actuators; with inner feedback the ranges of plans are wider."""
         if self.decl.feedback is None:
-            return tuple((control.low, control.high) for control in self.controls)
+            return tuple((control.low, control.high) for control in self.decl.controls)
         return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
 
     @property
@@ -221,11 +205,11 @@ class System:
         """Rollout as (T+1, B) columns by name; constant columns are expanded views."""
         if (
             x0.shape[1:] != (len(self.names),)
-            or u.shape[2:] != (len(self.controls),)
+            or u.shape[2:] != (len(self.decl.controls),)
             or x0.shape[0] != u.shape[0]
         ):
             raise ValueError(
-                f"{self.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.controls)}),"
+                f"{self.decl.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.decl.controls)}),"
                 f" not {tuple(x0.shape)} and {tuple(u.shape)}"
             )
         start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
@@ -317,7 +301,7 @@ class System:
     def mirror(self) -> Mirror | None:
         """The declared symmetry; None without one."""
         images = self.decl.policy.mirror
-        return Mirror(images, self.names, self.controls) if images else None
+        return Mirror(images, self.names, self.decl.controls) if images else None
 
     def performance(
         self,
@@ -344,7 +328,7 @@ class System:
         if controlled is None:
             return total
         if u is None:
-            raise ValueError(f"the objective of {self.name} needs the controls")
+            raise ValueError(f"the objective of {self.decl.name} needs the controls")
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0), strict=True))
         before = {name: column[:-1] for name, column in columns.items()}
         return total + self._mean(controlled, {**before, **inputs}, sat, rho, switch)
@@ -407,7 +391,7 @@ class System:
         raise SystemFileError(
             Diagnostic(
                 "S302",
-                f"the dynamics of {self.name} give NaN or infinity in {listed}",
+                f"the dynamics of {self.decl.name} give NaN or infinity in {listed}",
                 place,
                 label="declared here",
                 help=("clamp the state, shorten the step, or keep divisors away from 0",),
@@ -422,7 +406,7 @@ class System:
         x0 = self.sample(n, seed=seed, dtype=torch.float64)
         self.require_finite(x0)
         generator = torch.Generator().manual_seed(seed)
-        shape = (n, min(self.horizon, PROBED), len(self.controls))
+        shape = (n, min(self.horizon, PROBED), len(self.decl.controls))
         low, high = self.control_low.double(), self.control_high.double()
         u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
         self.require_finite(self.rollout(x0, u))

@@ -90,7 +90,7 @@ def test_no_more_is_changed_than_is_enough(car_task: Task) -> None:
 
 
 def test_a_direction_turns_round(rover_task: Task) -> None:
-    turns = [control.squash == "angle" for control in rover_task.system.controls]
+    turns = [control.squash == "angle" for control in rover_task.system.decl.controls]
     assert any(turns)
     rise = made(rover_task)
     beyond = (rise._high + 0.1 * rise._span) * np.ones((1, 1, rover_task.horizon, 1))

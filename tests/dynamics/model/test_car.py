@@ -246,7 +246,7 @@ def test_the_objective_is_the_benchmarks_and_stands_still_at_stop_signs(car: Sys
 
 def test_what_the_file_says_beside_the_dynamics(car: System) -> None:
     decl = car.decl
-    assert (car.name, car.dt, car.horizon, car.control_names) == ("car", 0.1, 25, ("u",))
+    assert (car.decl.name, car.dt, car.horizon, car.control_names) == ("car", 0.1, 25, ("u",))
     assert (float(car.control_low), float(car.control_high)) == (-10.0, 10.0)
     assert decl.objective.gamma == 0.5
     assert decl.objective.smoothing == 500

@@ -134,7 +134,7 @@ def test_the_world_can_be_switched_off(car: System) -> None:
 
 def test_a_system_is_found_by_name(monkeypatch: pytest.MonkeyPatch, car: System) -> None:
     monkeypatch.chdir(car.decl.path.parent.parent)
-    assert System.load("car.yaml").hash == car.hash
+    assert System.load("car.yaml").decl.hash == car.decl.hash
 
 
 @settings(max_examples=75)

@@ -75,7 +75,7 @@ class GradientAscent:
             bound.double().numpy(force=True) for bound in (system.control_low, system.control_high)
         )
         self._span = self._high - self._low
-        self._turns = np.array([control.squash == "angle" for control in system.controls])
+        self._turns = np.array([control.squash == "angle" for control in system.decl.controls])
         self._factors = np.array([rule.weight / rule.scale for rule in task.rules])
         safe = {rule.name for rule in task.compiled.safety}
         self._safe = [at for at, rule in enumerate(task.rules) if rule.name in safe]
