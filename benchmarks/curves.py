@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stlc.files import write_atomic
+from stlc.view import available
 from stlc.view.style import BLUE, INK, MUTED, ORANGE, Picture, new_figure, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from benchmarks.feasible import KnownFeasible
     from benchmarks.store import Result
 
+PICTURE = "img/results.svg"
+"""The picture, relative to the page."""
 COLORS = {"guided": BLUE, "gradient": ORANGE}
 COLUMNS = 3
 
@@ -23,8 +29,8 @@ class Curve:
 
     Attributes:
         method: of training.
-        seconds: of the points.
-        accuracies: of the points, on fresh states.
+        seconds: training time at each point.
+        accuracies: at each point, on fresh states.
         end: seconds and final accuracy on held-out states.
     """
 
@@ -32,6 +38,13 @@ class Curve:
     seconds: tuple[float, ...]
     accuracies: tuple[float, ...]
     end: tuple[float, float]
+
+    @classmethod
+    def of(cls, result: Result) -> Curve:
+        """The learning curve in the result of a training."""
+        points = [(float(point["seconds"]), float(point["accuracy"])) for point in result["curve"]]
+        times, accuracies = zip(*points, strict=True) if points else ((), ())
+        return cls(result["key"]["method"], times, accuracies, (result["seconds"], result["accuracy"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +62,23 @@ class Panel:
     feasible: float | None
 
 
-def curve_of(result: Result) -> Curve:
-    """The learning curve in the result of a training."""
-    points = result["curve"]
-    return Curve(
-        result["key"]["method"],
-        tuple(float(point["seconds"]) for point in points),
-        tuple(float(point["accuracy"]) for point in points),
-        (float(result["seconds"]), float(result["accuracy"])),
-    )
+def draw_results(results: Sequence[Result], known: Mapping[str, KnownFeasible | None], path: Path) -> bool:
+    """Draw the longest training of each method and seed, a panel per benchmark of `known`, as an SVG file.
+
+    Returns False if matplotlib is missing or nothing was measured.
+    """
+    longest: dict[str, dict[tuple[str, int], Result]] = {}
+    for each in sorted(results, key=lambda each: float(each["seconds"])):
+        key = each["key"]
+        longest.setdefault(key["benchmark"], {})[key["method"], key["seed"]] = each
+    panels = [
+        Panel(name, tuple(map(Curve.of, longest[name].values())), None if share is None else share.share)
+        for name, share in known.items()
+    ]
+    picture = draw_benchmarks(panels) if available() else None
+    if picture is not None:
+        write_atomic(path, picture.svg())
+    return picture is not None
 
 
 def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:

@@ -65,7 +65,10 @@ def key_of(result: Result) -> Key:
 
 
 def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, KnownFeasible]:
-    """The stored known feasible shares of the benchmarks of `results`, without a search."""
+    """The stored known feasible share of each benchmark, without a search.
+
+    It belongs to the held-out states of the first of the `results` of the benchmark; others are ignored.
+    """
     groups: dict[str, list[Result]] = {}
     for result in results:
         groups.setdefault(result["key"]["benchmark"], []).append(result)

@@ -1,4 +1,4 @@
-"""Formulas whose robustness is timed, each also written by hand in plain torch.
+"""Formulas and the time of their robustness; each formula is also written by hand in plain torch.
 
 Arrays are `(time, batch)`; windows are clipped at the end of the trace.
 """
@@ -8,11 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
+from benchmarks.timing import interleaved, ratio
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 
 Plain: TypeAlias = Callable[[Tensor, Tensor, int], Tensor]
@@ -132,3 +136,87 @@ CASES = (
     ),
 )
 """All timed formulas."""
+
+
+# ------------------------------------------------------------------------------- timing
+
+_MOST_PLAIN = 1 << 21
+"""Number of elements from which on plain torch is omitted: it takes minutes, or exhausts the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """One formula at one size.
+
+    Attributes:
+        formula: name.
+        samples: of a trace.
+        traces: their number.
+        width: of its windows, in steps.
+        gradient: with the backward pass.
+        seconds: processor time.
+        passes: time as a multiple of one pass over memory.
+        plain: time of plain torch as a multiple of ours; None if omitted.
+    """
+
+    formula: str
+    samples: int
+    traces: int
+    width: int
+    gradient: bool
+    seconds: float
+    passes: float
+    plain: float | None
+
+    @property
+    def time(self) -> str:
+        """The seconds with a unit."""
+        return f"{self.seconds * 1e3:.2f} ms" if self.seconds >= 1e-3 else f"{self.seconds * 1e6:.0f} us"
+
+
+def width_of(samples: int) -> int:
+    """Steps of a window: a tenth of the trace, and at least 5."""
+    return max(samples // 10, 5)
+
+
+def timing_of(case: Case, shape: tuple[int, int], *, gradient: bool, seconds: float) -> Timing:
+    """Time a formula on arrays of shape (samples, traces), for about `seconds`."""
+    x, y, data, weights = _arrays(shape)
+    width = width_of(shape[0])
+    formula = case.formula(width)
+    todo: list[Callable[[], Tensor]] = [
+        lambda: data.clone(),
+        lambda: robustness_signal(formula, {"x": x, "y": y}, ops=TORCH, end="truncate"),
+    ]
+    if x.numel() <= _MOST_PLAIN:
+        todo.append(lambda: case.plain(x, y, width))
+    leaves = (x, y, data)
+    wrapped = [_backward(each, weights, leaves) if gradient else _forward(each) for each in todo]
+    floor, ours, *plain = interleaved(wrapped, seconds)
+    slower = ratio(plain[0], ours) if plain else None
+    return Timing(case.name, *shape, width, gradient, median(ours), ratio(ours, floor), slower)
+
+
+def _arrays(shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    x, y, data, weights = (torch.randn(shape, generator=generator) for _ in range(4))
+    return x.requires_grad_(), y.requires_grad_(), data.requires_grad_(), weights
+
+
+def _forward(function: Callable[[], Tensor]) -> Callable[[], None]:
+    def run() -> None:
+        with torch.no_grad():
+            function()
+
+    return run
+
+
+def _backward(
+    function: Callable[[], Tensor], weights: Tensor, leaves: tuple[Tensor, ...]
+) -> Callable[[], None]:
+    def run() -> None:
+        for leaf in leaves:
+            leaf.grad = None
+        function().backward(weights)  # type: ignore[no-untyped-call]
+
+    return run

@@ -6,9 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
+from string import Formatter
 from textwrap import wrap
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
+import typer
+
+from benchmarks.options import Output
 from benchmarks.store import Result, made_here
 from stlc.cli.framework.output import emit, emit_json, say
 from stlc.cli.framework.output import table as columns_of_text
@@ -16,6 +20,9 @@ from stlc.files import write_atomic
 
 Cell = TypeVar("Cell")
 Row = TypeVar("Row")
+Columns: TypeAlias = Mapping[str, "str | Callable[[Row], str]"]
+"""Header -> text of a row: a function, or a template such as `{accuracy:.3f}` over the row's attributes, in
+which None is empty."""
 
 WIDTH = 120
 
@@ -29,6 +36,24 @@ float64.
 """
 
 
+class _Template(Formatter):
+    """Formats the attributes of one object; None is empty."""
+
+    def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+        return getattr(args[0], str(key))
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            return super().get_field(field_name, args, kwargs)
+        except AttributeError:
+            if self.get_value(field_name.split(".")[0], args, kwargs) is not None:
+                raise
+            return None, field_name
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        return "" if value is None else format(value, format_spec)
+
+
 @dataclass(frozen=True)
 class Table(Generic[Cell, Row]):
     """A table: each cell is measured in turn and gives a row.
@@ -38,14 +63,14 @@ class Table(Generic[Cell, Row]):
         cells: to measure.
         measure: cell -> row, a dataclass; its fields and properties are the JSON values.
         columns: header -> text of a row, for a terminal and for Markdown.
-        told: message printed when a row is measured.
+        message: printed when a row is measured.
     """
 
     name: str
     cells: Iterable[Cell]
     measure: Callable[[Cell], Row]
-    columns: Mapping[str, Callable[[Row], str]]
-    told: Callable[[Row], str] | None = None
+    columns: Columns[Row]
+    message: str | Callable[[Row], str] | None = None
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -53,14 +78,14 @@ class Table(Generic[Cell, Row]):
         rows = []
         for cell in self.cells:
             rows.append(self.measure(cell))
-            if self.told is not None:
-                say(self.told(rows[-1]))
+            if self.message is not None:
+                say(text_of(rows[-1], self.message))
         return rows
 
     def texts(self, rows: Iterable[Row] | None = None) -> list[tuple[str, ...]]:
         """The cells of (some) rows as text."""
         chosen = self.rows if rows is None else rows
-        return [tuple(shown(row) for shown in self.columns.values()) for row in chosen]
+        return [tuple(text_of(row, shown) for shown in self.columns.values()) for row in chosen]
 
     def terminal(self) -> str:
         """Aligned columns."""
@@ -75,13 +100,51 @@ class Table(Generic[Cell, Row]):
         return [values(row) for row in self.rows]
 
 
-def values(row: Any) -> dict[str, Any]:
-    """Fields and public properties of a dataclass, recursively."""
+def listed(name: str, rows: Iterable[Row], columns: Columns[Row]) -> Table[Row, Row]:
+    """A table of known rows."""
+    return Table(name, rows, lambda row: row, columns)
+
+
+def text_of(row: Row, shown: str | Callable[[Row], str]) -> str:
+    """The text of a row by a function or a template of `Columns`."""
+    return _Template().vformat(shown, (row,), {}) if isinstance(shown, str) else shown(row)
+
+
+def values(row: Any) -> Any:
+    """Fields and public properties of a dataclass, recursively; other values unchanged."""
     if not hasattr(row, "__dataclass_fields__"):
-        return row  # type: ignore[no-any-return]
+        return row
     names = [each.name for each in fields(row)]
     names += [name for name, each in vars(type(row)).items() if isinstance(each, property)]
     return {name: values(getattr(row, name)) for name in names}
+
+
+def publish(
+    what: str,
+    output: Output,
+    section: Callable[[], Iterable[str]],
+    tables: Mapping[str, Table[Any, Any]],
+    **facts: Any,
+) -> None:
+    """Write the section of a table's page, then print its tables.
+
+    Args:
+        what: name of the table, of the section and in the document.
+        output: the page, if any, and whether the document of `--json` is printed.
+        section: lines of the section.
+        tables: key in the document -> table.
+        facts: further entries of the document; `failed` lists the measurements that failed.
+
+    Raises:
+        typer.Exit: 1, a measurement failed.
+    """
+    if output.page is not None:
+        write_section(output.page, what, section())
+        facts["page"] = str(output.page)
+    code = int(bool(facts.get("failed")))
+    show(what, tables, as_json=output.as_json, code=code, **facts)
+    if code:
+        raise typer.Exit(1)
 
 
 def show(

@@ -7,11 +7,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from stlc.controller.training.loop import keep_freed_memory
+
+Item = TypeVar("Item")
+Measured = TypeVar("Measured")
 
 _SLICE = 0.01
 """Minimum duration of one measurement in seconds."""
@@ -56,6 +60,11 @@ def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> li
         for function, repeats, found in zip(functions, often, samples, strict=True):
             found.append(_timed(function, repeats) / repeats)
     return samples
+
+
+def after_warm_up(measure: Callable[[Item], Measured], items: Sequence[Item]) -> list[Measured]:
+    """Measurements of all items; the first few are measured twice, as their first time warms the caches."""
+    return [measure(item) for item in (*items[:WARM], *items)][min(WARM, len(items)) :]
 
 
 def ratio(some: Sequence[float], others: Sequence[float]) -> float:

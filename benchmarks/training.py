@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
@@ -12,7 +13,7 @@ from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
-from stlc.controller.parallel.jobs import Job, JobResult
+from stlc.controller.parallel.jobs import Job
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.budget import Clock
 from stlc.controller.training.checkpoint import load_checkpoint
@@ -164,7 +165,32 @@ class Place:
 
     def valid(self) -> list[Result]:
         """The results whose specification, system and method are unchanged."""
-        return [each for each in self.store.all().values() if each["key"] == Cell.of(each).key.values]
+        return [each for each in self.store.all().values() if not outdated(each)]
+
+    def all(self) -> list[Result]:
+        """All results, the valid ones first."""
+        return sorted(self.store.all().values(), key=lambda each: bool(outdated(each)))
+
+
+INPUTS = {"spec_sha256": "specification", "system_sha256": "system", "method_version": "method"}
+"""Inputs of a training that can change while its result is stored, in words."""
+
+
+def outdated(result: Result) -> tuple[str, ...]:
+    """Inputs of a stored training that have changed since; empty if its result is valid."""
+    now, then = Cell.of(result).key.values, result["key"]
+    return tuple(INPUTS.get(name, name) for name in now if now[name] != then.get(name))
+
+
+def inputs_text(changed: Sequence[str]) -> str:
+    """Cell of a table on the inputs of its row: `current`, or those that have changed since."""
+    return f"outdated: {', '.join(changed)}" if changed else "current"
+
+
+OUTDATED_TEXT = """\
+Rows whose `inputs` are outdated were measured before a change of the specification, the system or the method,
+and are shown until they are measured again.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,10 +209,10 @@ class Filling:
     kept: int
     failed: tuple[dict[str, str], ...]
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        """The facts for the JSON document."""
-        return {"trained": self.trained, "kept": self.kept, "failed": list(self.failed)}
+    def facts(self, valid: int, failed: Sequence[dict[str, str]] = ()) -> dict[str, Any]:
+        """Entries of the JSON document: `valid` results in the store, trainings, and all failures."""
+        counts = {"results": valid, "trained": self.trained, "kept": self.kept}
+        return {**counts, "failed": [*self.failed, *failed]}
 
 
 def filled(cells: Sequence[Cell], place: Place) -> Filling:
@@ -219,7 +245,7 @@ def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
 
 
 def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | None, str]]:
-    """(cell, result, "kept" or ""), or (cell, None, reason of the failure), as they end."""
+    """Yield (cell, result, "kept" or "") or (cell, None, reason of the failure) when each cell is done."""
     wanted: dict[str, Cell] = {}
     for cell in cells:
         kept = place.store.find(cell.key)
@@ -234,19 +260,14 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
             yield cell, place.store.put(cell.key, collect(run)), ""
         else:
             jobs.append(_job(cell, place, run))
-    for back in _sent(jobs, place, lambda job: say(f"training {job.name}")):
+    workers = executor(place.jobs, place.cluster if jobs else None, cores=place.threads)
+    for back in workers.run(jobs, lambda job: say(f"training {job.name}")):
         cell = wanted[back.job.name]
         run = place.newest_run(cell.key)
         if back.code not in (0, 1) or run is None or run.status != "finished":
             yield cell, None, f"exit code {back.code}\n{back.why}".strip()
         else:
             yield cell, place.store.put(cell.key, collect(run, cores=back.cores)), ""
-
-
-def _sent(jobs: Sequence[Job], place: Place, begun: Callable[[Job], None]) -> Iterator[JobResult]:
-    """Run jobs on this machine or on the cluster."""
-    cluster = place.cluster if jobs else None
-    return executor(place.jobs, cluster, cores=place.threads).run(jobs, begun)
 
 
 def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
@@ -306,14 +327,46 @@ def _curve(run: RunDir) -> list[dict[str, float | None]]:
     return [{key: row.get(key) for key in ("seconds", "step", "accuracy", "feasible")} for row in kept]
 
 
-def grouped(
-    results: Sequence[Result], key: Callable[[Cell], tuple[Any, ...]]
-) -> dict[tuple[Any, ...], list[Result]]:
-    """Results grouped by a key, each group sorted by seed."""
+@dataclass(frozen=True, slots=True)
+class SeedGroup:
+    """Results of the same training with several seeds.
+
+    Attributes:
+        results: sorted by seed.
+        outdated: inputs that have changed since; the same for all results.
+    """
+
+    results: tuple[Result, ...]
+    outdated: tuple[str, ...] = ()
+
+    @property
+    def cell(self) -> Cell:
+        """The training with the first seed."""
+        return Cell.of(self.results[0])
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds."""
+        return tuple(int(each["key"]["seed"]) for each in self.results)
+
+    @property
+    def accuracies(self) -> tuple[float, ...]:
+        """Accuracy on the held-out states, one per seed."""
+        return tuple(float(each["accuracy"]) for each in self.results)
+
+    def mean(self, name: str) -> float:
+        """Mean over the seeds of a number in the results."""
+        return fmean(float(each[name]) for each in self.results)
+
+
+def grouped(results: Iterable[Result]) -> list[SeedGroup]:
+    """Results that differ in nothing but the seed, together; current and outdated results apart."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in sorted(results, key=lambda each: int(each["key"]["seed"])):
-        groups.setdefault(key(Cell.of(result)), []).append(result)
-    return groups
+        cell = Cell.of(result)
+        key = (cell.benchmark, cell.method, cell.length, cell.axis, cell.value, outdated(result))
+        groups.setdefault(key, []).append(result)
+    return [SeedGroup(tuple(own), key[-1]) for key, own in groups.items()]
 
 
 def benchmark_order(name: str) -> tuple[int, str]:

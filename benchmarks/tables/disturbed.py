@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from benchmarks.drives import (
+from benchmarks.deployments import (
     NOMINAL,
     SCENARIOS,
     USUAL,
+    DeploymentOptions,
     Deployments,
-    Drives,
+    Row,
     guard_of,
     mean_and_half,
     policy_lines,
+    publish_deployments,
     rows_of,
 )
 from benchmarks.options import Output
 from benchmarks.store import Result, ResultStore
-from benchmarks.table import Table, provenance
-from benchmarks.tables.worlds import conclude
+from benchmarks.table import Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
 from stlc.controller.guard.margins import AUTO
-
-if TYPE_CHECKING:
-    from benchmarks.drives import Row
 
 TEXT = """\
 Written by `python -m benchmarks disturbed` from `benchmarks/results/disturbed.json`. Each policy is driven
@@ -47,24 +46,23 @@ MOST = 0.95
 METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
 """Columns of each guard."""
 TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
-_DRIVES, _OUTPUT = Drives(), Output(Path("docs/worlds.md"))
+_OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
 
 def table(rows: Sequence[Row]) -> Table[Row, Row]:
     """A row for every policy and scenario, a column for every metric and guard."""
     guards = _guards(rows)
-    first = {
-        id(row)
-        for row, before in zip(rows, [None, *rows], strict=False)
-        if not before or before.spec != row.spec
+    first = [next(group) for _, group in groupby(rows, lambda row: row.spec)]
+    columns: Columns[Row] = {
+        "": lambda row: f"{row.spec}, {row.size}" if any(row is each for each in first) else "",
+        "scenario": "{scenario}",
+        **{
+            f"{what}, {_title(guard)}": _shown(metric, guard)
+            for what, metric in METRICS.items()
+            for guard in guards
+        },
     }
-    columns: dict[str, Callable[[Row], str]] = {
-        "": lambda row: f"{row.spec}, {row.size}" if id(row) in first else "",
-        "scenario": lambda row: row.scenario,
-    }
-    for what, metric in METRICS.items():
-        columns |= {f"{what}, {_title(guard)}": _shown(metric, guard) for guard in guards}
-    return Table("disturbed", rows, lambda row: row, columns)
+    return listed("disturbed", rows, columns)
 
 
 def _guards(rows: Sequence[Row]) -> list[str]:
@@ -87,24 +85,26 @@ def section(results: Sequence[Result]) -> list[str]:
     """The section of the page: all deployments, starts without exogenous events, policies and machines."""
     rows = rows_of(results)
     lost = [row.spec for row in rows if row.scenario == NOMINAL and _lost_to_the_world(row)]
-    columns: Mapping[str, Callable[[Row], str]] = {
-        "": lambda row: row.spec,
-        "scenario": lambda row: row.scenario,
+    columns: Columns[Row] = {
+        "": "{spec}",
+        "scenario": "{scenario}",
         "share of starts": _shown("quiet", "none"),
         **{f"safe, {_title(guard)}": _shown("quiet_safe_starts", guard) for guard in _guards(rows)},
     }
     some = [row for row in rows if row.spec in lost]
-    quiet = [WITHOUT_EVENTS, *Table("quiet", some, lambda row: row, columns).markdown(), ""] if some else []
+    uneventful = [WITHOUT_EVENTS, *listed("no events", some, columns).markdown(), ""] if some else []
     return [
-        *(TEXT, *table(rows).markdown(), "", *quiet),
+        *(TEXT, *table(rows).markdown(), "", *uneventful),
         *(*policy_lines(rows), *provenance(results, "deployments (seeds x agents x steps)")),
     ]
 
 
 def _lost_to_the_world(row: Row) -> bool:
     """True if unsafe drives are due to the world: the model is exact, and the full guard is active."""
-    every, quiet = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
-    return every is not None and quiet is not None and float(every["mean"]) < min(float(quiet["mean"]), MOST)
+    every, uneventful = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
+    if every is None or uneventful is None:
+        return False
+    return float(every["mean"]) < min(float(uneventful["mean"]), MOST)
 
 
 @command(
@@ -129,7 +129,7 @@ def disturbed(
             help="Of none,paper,full; +0.2 or +auto behind one asks for a margin.",
         ),
     ] = ",".join(USUAL),
-    drives: Drives = _DRIVES,
+    options: DeploymentOptions = _OPTIONS,
     output: Output = _OUTPUT,
 ) -> None:
     """Deploy policies under model mismatch, disturbances and noise, without a guard and with one.
@@ -138,7 +138,7 @@ def disturbed(
     """
     modes = [name for name in map(str.strip, guards.split(",")) if guard_of(name)]
     laid = tuple(name.strip() for name in scenarios.split(",")) if scenarios else SCENARIOS
-    deployments = Deployments(ResultStore("disturbed", drives.out), drives)
-    for folder in drives.runs(runs):
+    deployments = Deployments(ResultStore("disturbed", options.out), options)
+    for folder in options.runs(runs):
         deployments.add(folder, laid, modes)
-    conclude("disturbed", deployments, output.page or _OUTPUT.page, section, table, as_json=output.as_json)
+    publish_deployments("disturbed", deployments, output, section, table)

@@ -6,31 +6,29 @@ policy is trained once, on values drawn from the declared range.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import typer
-
 from benchmarks.options import OnlyOption, Output, Training, chosen
 from benchmarks.store import Key, Result, ResultStore, load
-from benchmarks.table import Table, provenance, show, write_section
-from benchmarks.training import Cell, Place, filled, grouped
+from benchmarks.table import Columns, Table, provenance, publish
+from benchmarks.training import OUTDATED_TEXT, Cell, Place, SeedGroup, filled, grouped, inputs_text
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.controller.evaluation.held_out import score, wilson
 from stlc.controller.training.run import Run
 
 BUDGETS = (60.0,)
-TEXT = """\
+TEXT = f"""\
 Specifications in `specs/families/`, each that of a benchmark with one constant made a `param`. A policy is
 trained once, on values drawn evenly from the range in the title, and judged at single values; those outside
 of the range are in italics. `known feasible` is the share of the same states for which a satisfying plan is
 known, the policy's own or one that a search has found, and `share of feasible` the accuracy as a share of
 that.
-"""
+{OUTDATED_TEXT}"""
 _TRAINING = Training(seeds="0", held_out=2000)
 _OUTPUT = Output(Path("docs/results.md"))
 
@@ -63,17 +61,11 @@ class Family:
 
 FAMILIES = (
     Family(
-        "ship_radius",
-        "radius",
-        "m",
-        "ship-safe, the radius of the obstacles",
+        *("ship_radius", "radius", "m", "ship-safe, the radius of the obstacles"),
         (0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
     ),
     Family(
-        "stop_time",
-        "stop_time",
-        "s",
-        "traffic, how long to stand at a stop sign",
+        *("stop_time", "stop_time", "s", "traffic, how long to stand at a stop sign"),
         (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0),
     ),
 )
@@ -92,6 +84,7 @@ class Row:
         accuracy: mean over seeds.
         interval: its 95 % Wilson interval, over the states of all seeds.
         feasible: share of the states with a known satisfying plan, mean over seeds.
+        outdated: inputs that have changed since the trainings.
     """
 
     family: str
@@ -102,6 +95,7 @@ class Row:
     accuracy: float
     interval: tuple[float, float]
     feasible: float
+    outdated: tuple[str, ...] = ()
 
     @property
     def share(self) -> float | None:
@@ -109,17 +103,14 @@ class Row:
         return self.accuracy / self.feasible if self.feasible else None
 
 
-COLUMNS: dict[str, Callable[[Row], str]] = {
-    "value": lambda row: (
-        f"{row.value:g} {_named(row.family).unit}"
-        if row.inside
-        else f"*{row.value:g} {_named(row.family).unit}*"
-    ),
-    "budget": lambda row: row.length,
+COLUMNS: Columns[Row] = {
+    "value": lambda row: f"{row.value:g} {_named(row.family).unit}".join(("", "") if row.inside else "**"),
+    "budget": "{length}",
     "seeds": lambda row: ", ".join(map(str, row.seeds)),
-    "accuracy": lambda row: f"{row.accuracy:.4f} [{row.interval[0]:.4f}, {row.interval[1]:.4f}]",
-    "known feasible": lambda row: f"{row.feasible:.4f}",
-    "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f}",
+    "accuracy": "{accuracy:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
+    "known feasible": "{feasible:.4f}",
+    "share of feasible": "{share:.3f}",
+    "inputs": lambda row: inputs_text(row.outdated),
 }
 
 
@@ -161,27 +152,26 @@ def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[
 def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
     """The rows, ordered by family, length and value."""
     cells = [
-        (family, length, value, found)
-        for (benchmark, length), own in grouped(
-            trainings, lambda cell: (cell.benchmark, cell.length.text)
-        ).items()
-        for family in [_named(benchmark)]
+        (family, value, group, found)
+        for group in sorted(grouped(trainings), key=lambda group: group.cell.length.text)
+        for family in [_named(group.cell.benchmark)]
         for value in family.values
-        if (found := [(each, verdict) for each in own if (verdict := verdicts.find(key_of(each, value)))])
+        if (found := [each for own in group.results if (each := verdicts.find(key_of(own, value)))])
     ]
-    cells.sort(key=lambda cell: (FAMILIES.index(cell[0]), cell[1], cell[2]))
+    cells.sort(key=lambda cell: FAMILIES.index(cell[0]))
     return Table("family", cells, lambda cell: _row(*cell), COLUMNS)
 
 
-def _row(family: Family, length: str, value: float, found: Sequence[tuple[Result, Result]]) -> Row:
+def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Result]) -> Row:
     low, high = family.sampled()
-    accuracy = fmean(float(verdict["accuracy"]) for _, verdict in found)
+    accuracy = fmean(float(each["accuracy"]) for each in verdicts)
     return Row(
-        *(family.name, value, low <= value <= high, length),
-        tuple(int(training["key"]["seed"]) for training, _ in found),
+        *(family.name, value, low <= value <= high, group.cell.length.text),
+        tuple(int(each["key"]["training"]["seed"]) for each in verdicts),
         accuracy,
-        wilson(accuracy, sum(int(verdict["held_out"]) for _, verdict in found)),
-        fmean(float(verdict["feasible"]) for _, verdict in found),
+        wilson(accuracy, sum(int(each["held_out"]) for each in verdicts)),
+        fmean(float(each["feasible"]) for each in verdicts),
+        group.outdated,
     )
 
 
@@ -218,13 +208,8 @@ def family(only: OnlyOption = None, training: Training = _TRAINING, output: Outp
     ]
     place, verdicts = training.place("family"), ResultStore("family_verdicts", training.out)
     filling = filled(cells, place)
-    failed = [*filling.failed, *judge_all(filling.results, place, verdicts)]
-    results, page = place.valid(), output.page or _OUTPUT.page
-    assert page is not None
-    write_section(page, "family", section(results, table(results, verdicts)))
-    code = 1 if failed else 0
-    facts = {"page": str(page), "results": len(results), **filling.facts, "failed": failed}
+    failed = judge_all(filling.results, place, verdicts)
     made = table(filling.results, verdicts)
-    shown = replace(made, columns={"family": lambda row: row.family, **COLUMNS})
-    show("family", {"rows": shown}, as_json=output.as_json, code=code, **facts)
-    raise typer.Exit(code)
+    shown = {"rows": replace(made, columns={"family": "{family}", **COLUMNS})}
+    facts = filling.facts(len(place.valid()), failed)
+    publish("family", output, lambda: section(place.all(), table(place.all(), verdicts)), shown, **facts)

@@ -6,7 +6,7 @@ states with an intervention, which are rare for a good policy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Annotated
@@ -16,14 +16,14 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.drives import GUARDS, recorded
+from benchmarks.deployments import GUARDS, sampled_states
 from benchmarks.options import Output, RunsArgument, opened
-from benchmarks.table import Table, measured_here, show, write_section
-from benchmarks.timing import WARM, Times, one_thread
+from benchmarks.table import Columns, Table, measured_here, publish
+from benchmarks.timing import Times, after_warm_up, one_thread
 from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
-from stlc.controller.deployment.simulator import DeploymentRecording, Setting
+from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
@@ -36,7 +36,6 @@ policy's plan. `policy`: its plan, rollout and verdict. With a guard (also `none
 previous plan as well, the choice where the world leaves one (of five stations), and what is tried instead.
 """
 POLICY = "policy"
-AGENTS = 5
 _OUTPUT = Output()
 
 
@@ -46,7 +45,7 @@ class Row:
 
     Attributes:
         benchmark: name of the specification.
-        run: of the policy.
+        run: name of the policy's run.
         guard: name; `policy` for the policy's plan, rollout and verdict alone.
         every: times in evenly chosen visited states.
         acting: times of decisions with an intervention of the guard; None without any.
@@ -59,21 +58,10 @@ class Row:
     acting: Times | None
 
 
-def _shown(which: str, name: str) -> Callable[[Row], str]:
-    def shown(row: Row) -> str:
-        times: Times | None = getattr(row, which)
-        return "" if times is None else f"{getattr(times, name):.2f}"
-
-    return shown
-
-
-COLUMNS: dict[str, Callable[[Row], str]] = {
-    "benchmark": lambda row: row.benchmark,
-    "guard": lambda row: row.guard,
-    "median": _shown("every", "median"),
-    "99 %": _shown("every", "p99"),
-    "where it acts: median": _shown("acting", "median"),
-    "where it acts: 99 %": _shown("acting", "p99"),
+COLUMNS: Columns[Row] = {
+    **{"benchmark": "{benchmark}", "guard": "{guard}"},
+    **{"median": "{every.median:.2f}", "99 %": "{every.p99:.2f}"},
+    **{"where it acts: median": "{acting.median:.2f}", "where it acts: 99 %": "{acting.p99:.2f}"},
     "decisions": lambda row: " / ".join(str(each.samples if each else 0) for each in (row.every, row.acting)),
 }
 
@@ -93,67 +81,47 @@ def latency(
     Milliseconds on one thread, in states of deployments. The full guard has its default limit of 100 ms per
     decision.
     """
-    rows = (
-        row for folder in opened(runs) for row in rows_of(Run.open(folder.path), samples, parse_seeds(seeds))
-    )
-    told = lambda row: f"{row.benchmark}, {row.guard}: {COLUMNS['median'](row)} ms"  # noqa: E731
-    table = Table("latency", rows, lambda row: row, COLUMNS, told)
+    opened_runs = (Run.open(folder.path) for folder in opened(runs))
+    rows = (row for run in opened_runs for row in rows_of(run, samples, parse_seeds(seeds)))
+    message = "{benchmark}, {guard}: {every.median:.2f} ms"
+    table = Table("latency", rows, lambda row: row, COLUMNS, message)
     with one_thread():
-        table.rows  # noqa: B018 - measured here
-    if output.page is not None:
-        write_section(output.page, "latency", [TEXT, *table.markdown(), "", measured_here()])
-    show("latency", {"rows": table}, as_json=output.as_json)
+        lines = lambda: [TEXT, *table.markdown(), "", measured_here()]  # noqa: E731
+        publish("latency", output, lines, {"rows": table})
 
 
 def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
     """The rows: the policy alone, then every guard."""
-    task, test = run.task, run.task.system.decl.test
-    guards = {mode: Guard(task, run.policy, mode, limits=Limits()) for mode in GUARDS}
-    setting = Setting(seeds, min(AGENTS, test.agents), test.steps, test.replan)
-    recording = recorded(guards["paper"], setting)
-    even, acted = picked(recording, samples)
-    yield Row(task.compiled.name, run.dir.name, POLICY, Times.of(_alone(run, recording, even)), None)
+    guards = {mode: Guard(run.task, run.policy, mode, limits=Limits()) for mode in GUARDS}
+    recording, even, acted = sampled_states(guards["paper"], seeds, samples)
+
+    def plan(index: NDArray[np.int64]) -> float:
+        x = torch.from_numpy(recording.states[tuple(index)])[None]
+        begin = perf_counter()
+        run.plan_judged(x)
+        return perf_counter() - begin
+
+    names = run.task.compiled.name, run.dir.name
+    yield Row(*names, POLICY, Times.of(after_warm_up(plan, [*even])), None)
     for mode, guard in guards.items():
         every, there = _timed(guard, recording, even), _timed(guard, recording, acted)
         acting = [seconds for seconds, source in (*every, *there) if source]
-        times = Times.of([seconds for seconds, _ in every])
-        yield Row(task.compiled.name, run.dir.name, mode, times, Times.of(acting))
-
-
-def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (row, step) of states: evenly chosen ones, (k, 2), and ones with an intervention, (l, 2)."""
-    half = max(samples // 2, 1)
-    every = np.argwhere(np.ones_like(recording.source, dtype=bool))
-    return _spread(every, half), _spread(np.argwhere(recording.source > 0), half)
-
-
-def _spread(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)]
-    return found
-
-
-def _alone(run: Run, recording: DeploymentRecording, places: NDArray[np.int64]) -> list[float]:
-    """Seconds of a plan of the policy, its rollout and its verdict."""
-    found = []
-    for row, step in (*places[:WARM], *places):
-        x = torch.from_numpy(recording.states[row, step])[None]
-        begin = perf_counter()
-        run.plan_judged(x)
-        found.append(perf_counter() - begin)
-    return found[min(WARM, len(places)) :]
+        yield Row(*names, mode, Times.of([seconds for seconds, _ in every]), Times.of(acting))
 
 
 def _timed(
-    guard: Guard, recording: DeploymentRecording, places: NDArray[np.int64]
+    guard: Guard, recording: DeploymentRecording, indices: NDArray[np.int64]
 ) -> list[tuple[float, int]]:
-    """Seconds and source of each decision. The first few are repeated, as they warm the caches."""
-    found = []
-    for row, step in (*places[:WARM], *places):
+    """Seconds and source of each decision in the states at (row, step)."""
+
+    def decide(index: NDArray[np.int64]) -> tuple[float, int]:
+        row, step = index
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
-        begun = guard.decide(before).later()
+        previous = guard.decide(before).later()
         begin = perf_counter()
         if recording.options is not None:
-            guard.prefer(torch.from_numpy(recording.options[row, step])[None], begun)
-        decision = guard.decide(now, begun)
-        found.append((perf_counter() - begin, int(decision.source)))
-    return found[min(WARM, len(places)) :]
+            guard.prefer(torch.from_numpy(recording.options[row, step])[None], previous)
+        decision = guard.decide(now, previous)
+        return perf_counter() - begin, int(decision.source)
+
+    return after_warm_up(decide, [*indices])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -10,25 +10,22 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.curves import Panel, curve_of, draw_benchmarks
+from benchmarks.curves import PICTURE, draw_results
 from benchmarks.feasible import KnownFeasible, known_feasible, search_on
 from benchmarks.options import OnlyOption, Output, Training, chosen
 from benchmarks.store import BENCHMARKS, Result, ResultStore
-from benchmarks.table import Table, provenance, show, write_section
-from benchmarks.training import Cell, benchmark_order, filled, grouped
+from benchmarks.table import Columns, Table, listed, provenance, publish
+from benchmarks.training import OUTDATED_TEXT, Cell, SeedGroup, benchmark_order, filled, grouped, inputs_text
 from stlc.cli.framework.program import command
 from stlc.controller.evaluation.held_out import wilson
-from stlc.files import write_atomic
 from stlc.registry import METHODS
-from stlc.view import available
 
 BUDGETS = (60.0, 300.0)
-PICTURE = "img/results.svg"
-COLUMNS = """\
+TEXT = f"""\
 `accuracy` is the mean over seeds with its 95 % Wilson interval, `share of feasible` that mean as a share of
 the known feasible states (in brackets that of the worst seed). `known feasible` is the share of the same
-states for which some satisfying plan is known, a lower bound of what is feasible:
-"""
+states for which some satisfying plan is known, a lower bound of the feasible share.
+{OUTDATED_TEXT}"""
 _TRAINING, _OUTPUT = Training(), Output(Path("docs/results.md"))
 
 
@@ -40,13 +37,14 @@ class Row:
         benchmark: name.
         method: of training.
         length: such as `60 s`.
-        seeds: in order.
+        seeds: of the trainings, in order.
         accuracies: one per seed, on the same held-out states.
         interval: 95 % Wilson interval of the mean, over the states of all seeds.
         known_feasible: share of those states with a known satisfying plan; None before a search.
         requirements: share per requirement, mean over seeds.
         seconds: of training, mean over seeds.
         steps: mean over seeds.
+        outdated: inputs that have changed since the trainings.
     """
 
     benchmark: str
@@ -59,6 +57,7 @@ class Row:
     requirements: Mapping[str, float]
     seconds: float
     steps: float
+    outdated: tuple[str, ...] = ()
 
     @property
     def accuracy(self) -> float:
@@ -76,99 +75,77 @@ class Row:
         return min(self.accuracies) / self.known_feasible if self.known_feasible else None
 
 
-def row_of(own: Sequence[Result], known: Mapping[str, KnownFeasible]) -> Row:
+def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
     """The row of the results of a benchmark, method and length."""
-    cell, accuracies = Cell.of(own[0]), tuple(float(each["accuracy"]) for each in own)
+    cell, results = group.cell, group.results
     found = known.get(cell.benchmark)
     return Row(
-        *(cell.benchmark, cell.method, cell.length.text),
-        seeds=tuple(int(each["key"]["seed"]) for each in own),
-        accuracies=accuracies,
-        interval=wilson(fmean(accuracies), sum(int(each["key"]["held_out"]) for each in own)),
+        *(cell.benchmark, cell.method, cell.length.text, group.seeds, group.accuracies),
+        interval=wilson(group.mean("accuracy"), sum(int(each["key"]["held_out"]) for each in results)),
         known_feasible=None if found is None else found.share,
         requirements={
-            name: fmean(each["requirements"][name] for each in own) for name in own[0]["requirements"]
+            name: fmean(each["requirements"][name] for each in results) for name in results[0]["requirements"]
         },
-        seconds=fmean(float(each["seconds"]) for each in own),
-        steps=fmean(float(each["steps"]) for each in own),
+        seconds=group.mean("seconds"),
+        steps=group.mean("steps"),
+        outdated=group.outdated,
     )
 
 
-FIRST: dict[str, Callable[[Row], str]] = {
-    "benchmark": lambda row: row.benchmark,
-    "method": lambda row: row.method,
-    "budget": lambda row: row.length,
-}
-SHOWN: dict[str, Callable[[Row], str]] = {
+FIRST: Columns[Row] = {"benchmark": "{benchmark}", "method": "{method}", "budget": "{length}"}
+SHOWN: Columns[Row] = {
     **FIRST,
     "seeds": lambda row: ", ".join(map(str, row.seeds)),
-    "accuracy": lambda row: f"{row.accuracy:.4f} [{row.interval[0]:.4f}, {row.interval[1]:.4f}]",
+    "accuracy": "{accuracy:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
     "worst seed": lambda row: f"{min(row.accuracies):.4f}",
-    "known feasible": lambda row: "" if row.known_feasible is None else f"{row.known_feasible:.4f}",
+    "known feasible": "{known_feasible:.4f}",
     "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f} ({row.worst_share:.3f})",
-    "steps": lambda row: f"{row.steps:,.0f}",
+    "steps": "{steps:,.0f}",
+    "inputs": lambda row: inputs_text(row.outdated),
 }
-REQUIREMENTS: dict[str, Callable[[Row], str]] = {
+REQUIREMENTS: Columns[Row] = {
     **FIRST,
     "requirements": lambda row: ", ".join(f"{name} {share:.4f}" for name, share in row.requirements.items()),
 }
-FEASIBLE: dict[str, Callable[[KnownFeasible], str]] = {
-    "benchmark": lambda known: known.benchmark,
-    "known feasible": lambda known: f"{known.share:.4f} [{known.interval[0]:.4f}, {known.interval[1]:.4f}]",
-    "no plan known": lambda known: f"{known.open:,}",
-    "by search alone": lambda known: f"{known.by_search:,}",
-    "plans tried a state": lambda known: f"{known.tries:,}",
+FEASIBLE: Columns[KnownFeasible] = {
+    "benchmark": "{benchmark}",
+    "known feasible": "{share:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
+    "no plan known": "{open:,}",
+    "by search alone": "{by_search:,}",
+    "plans tried a state": "{tries:,}",
 }
 
 
 def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dict[str, Table[Any, Any]]:
     """The table of benchmarks, methods and lengths, and that of the known feasible shares."""
-    groups = grouped(results, lambda cell: (cell.benchmark, cell.method, cell.length.text))
-    ordered = sorted(
-        groups.values(),
-        key=lambda own: (
-            *benchmark_order(own[0]["key"]["benchmark"]),
-            METHODS.names.index(own[0]["key"]["method"]),
-            fmean(float(each["seconds"]) for each in own),
+    groups = sorted(
+        grouped(results),
+        key=lambda group: (
+            *benchmark_order(group.cell.benchmark),
+            METHODS.names.index(group.cell.method),
+            group.mean("seconds"),
         ),
     )
-    names = dict.fromkeys(own[0]["key"]["benchmark"] for own in ordered)
-    feasible = [known[name] for name in names if name in known]
+    names = dict.fromkeys(group.cell.benchmark for group in groups)
     return {
-        "rows": Table("paper", ordered, lambda own: row_of(own, known), SHOWN),
-        "known_feasible": Table("known feasible", feasible, lambda each: each, FEASIBLE),
+        "rows": Table("paper", groups, lambda group: row_of(group, known), SHOWN),
+        "known_feasible": listed("known", [known[name] for name in names if name in known], FEASIBLE),
     }
 
 
-def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], *, picture: bool) -> list[str]:
-    """The section of the page."""
+def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], page: Path) -> list[str]:
+    """The section of the page, whose picture is written into the page's folder."""
     made = tables(results, known)
-    requirements = Table("requirements", made["rows"].rows, lambda row: row, REQUIREMENTS)
+    rows = made["rows"].rows
+    names = dict.fromkeys(row.benchmark for row in rows)
+    drawn = draw_results(results, {name: known.get(name) for name in names}, page.parent / PICTURE)
     return [
         *("## The six benchmarks", ""),
-        *((f"![Plan accuracy over training time]({PICTURE})", "") if picture else ()),
-        *(*made["rows"].markdown(), "", COLUMNS, *made["known_feasible"].markdown(), ""),
+        *((f"![Plan accuracy over training time]({PICTURE})", "") if drawn else ()),
+        *(*made["rows"].markdown(), "", TEXT, *made["known_feasible"].markdown(), ""),
         *("### Requirements", "", "Share of the held-out states per requirement, mean over seeds.", ""),
-        *(*requirements.markdown(), "", *provenance(results, "trainings")),
+        *(*listed("requirements", rows, REQUIREMENTS).markdown(), "", *provenance(results, "trainings")),
     ]
-
-
-def draw(results: Sequence[Result], known: Mapping[str, KnownFeasible], folder: Path) -> bool:
-    """Draw accuracy over time of the longest trainings into the page's folder; False without matplotlib."""
-    longest: dict[str, dict[tuple[str, int], Result]] = {}
-    for each in sorted(results, key=lambda each: float(each["seconds"])):
-        key = each["key"]
-        longest.setdefault(key["benchmark"], {})[key["method"], key["seed"]] = each
-    panels = [
-        Panel(
-            name, tuple(map(curve_of, longest[name].values())), known[name].share if name in known else None
-        )
-        for name in dict.fromkeys(row.benchmark for row in tables(results, known)["rows"].rows)
-    ]
-    picture = draw_benchmarks(panels) if available() else None
-    if picture is not None:
-        write_atomic(folder / PICTURE, picture.svg())
-    return picture is not None
 
 
 @command(
@@ -203,18 +180,14 @@ def paper(
         for method in which
     ]
     place, found = training.place("paper"), ResultStore("feasible", training.out)
-    filling = filled(cells, place)
+    filling, page = filled(cells, place), output.page
+    assert page is not None
     results = place.valid()
     for name in names:
         own = [each for each in results if each["key"]["benchmark"] == name]
         own = [each for each in own if each["key"]["held_out"] == training.held_out]
         if own:
             search_on(own, found, passes=passes, run=place.best_run(own))
-    known = known_feasible(found, results)
-    page = output.page or _OUTPUT.page
-    assert page is not None
-    write_section(page, "paper", section(results, known, picture=draw(results, known, page.parent)))
-    code = 1 if filling.failed else 0
-    facts = {"page": str(page), "results": len(results), **filling.facts}
-    show("paper", tables(filling.results, known), as_json=output.as_json, code=code, **facts)
-    raise typer.Exit(code)
+    known = known_feasible(found, place.all())
+    shown = tables(filling.results, known)
+    publish("paper", output, lambda: section(place.all(), known, page), shown, **filling.facts(len(results)))

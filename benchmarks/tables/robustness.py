@@ -6,68 +6,25 @@ float32 on one thread; robustness is computed at every sample, with windows clip
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from statistics import median
-from typing import Annotated
+from collections.abc import Iterable
+from itertools import product
+from typing import Annotated, Any
 
-import torch
 import typer
-from torch import Tensor
 
-from benchmarks.formulas import CASES, Case
-from benchmarks.table import Table, show
-from benchmarks.timing import interleaved, one_thread, ratio
+from benchmarks.formulas import CASES, Timing, timing_of
+from benchmarks.table import Columns, Table, show
+from benchmarks.timing import one_thread
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
-from stlc.compile.backends.array.graph import robustness_signal
-from stlc.compile.backends.torch.ops import TORCH
 
 SAMPLES = (20, 100, 1000, 10_000)
 TRACES = (1, 1000)
 
-_MOST_PLAIN = 1 << 21
-"""Number of elements from which on plain torch is omitted: it takes minutes, or exhausts the memory."""
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """One formula at one size.
-
-    Attributes:
-        formula: name.
-        samples: of a trace.
-        traces: their number.
-        width: of its windows, in steps.
-        gradient: with the backward pass.
-        seconds: processor time.
-        passes: time as a multiple of one pass over memory.
-        plain: time of plain torch as a multiple of ours; None if omitted.
-    """
-
-    formula: str
-    samples: int
-    traces: int
-    width: int
-    gradient: bool
-    seconds: float
-    passes: float
-    plain: float | None
-
-    @property
-    def time(self) -> str:
-        """The seconds with a unit."""
-        return f"{self.seconds * 1e3:.2f} ms" if self.seconds >= 1e-3 else f"{self.seconds * 1e6:.0f} us"
-
-
-COLUMNS: dict[str, Callable[[Timing], str]] = {
-    "formula": lambda row: row.formula,
-    "samples": lambda row: str(row.samples),
-    "traces": lambda row: str(row.traces),
-    "w": lambda row: str(row.width),
+COLUMNS: Columns[Timing] = {
+    **{"formula": "{formula}", "samples": "{samples}", "traces": "{traces}", "w": "{width}"},
     "": lambda row: "with gradient" if row.gradient else "",
-    "time": lambda row: row.time,
-    "passes": lambda row: f"{row.passes:.1f}x",
+    **{"time": "{time}", "passes": "{passes:.1f}x"},
     "plain torch": lambda row: "" if row.plain is None else f"{row.plain:.1f}x",
 }
 
@@ -98,7 +55,7 @@ def robustness(
 
 def timings(
     samples: Iterable[int] = SAMPLES, traces: Iterable[int] = TRACES, seconds: float = 0.3
-) -> Table[tuple[Case, tuple[int, int], bool], Timing]:
+) -> Table[Any, Timing]:
     """All formulas at all sizes, without and with gradients.
 
     Args:
@@ -106,65 +63,10 @@ def timings(
         traces: numbers of traces.
         seconds: approximate measurement time per row.
     """
-    lengths = tuple(samples)
-    cells = [
-        (case, (length, batch), gradient)
-        for batch in traces
-        for length in lengths
-        for case in CASES
-        for gradient in (False, True)
-    ]
     return Table(
         "robustness",
-        cells,
-        lambda cell: _time(cell[0], cell[1], gradient=cell[2], seconds=seconds),
+        list(product(traces, samples, CASES, (False, True))),
+        lambda cell: timing_of(cell[2], (cell[1], cell[0]), gradient=cell[3], seconds=seconds),
         COLUMNS,
-        lambda row: f"{row.formula}, {row.samples} samples x {row.traces} traces",
+        "{formula}, {samples} samples x {traces} traces",
     )
-
-
-def width_of(samples: int) -> int:
-    """Steps of a window: a tenth of the trace, and at least 5."""
-    return max(samples // 10, 5)
-
-
-def _time(case: Case, shape: tuple[int, int], *, gradient: bool, seconds: float) -> Timing:
-    x, y, data, weights = _arrays(shape)
-    width = width_of(shape[0])
-    formula = case.formula(width)
-    todo: list[Callable[[], Tensor]] = [
-        lambda: data.clone(),
-        lambda: robustness_signal(formula, {"x": x, "y": y}, ops=TORCH, end="truncate"),
-    ]
-    if x.numel() <= _MOST_PLAIN:
-        todo.append(lambda: case.plain(x, y, width))
-    leaves = (x, y, data)
-    wrapped = [_backward(each, weights, leaves) if gradient else _forward(each) for each in todo]
-    floor, ours, *plain = interleaved(wrapped, seconds)
-    slower = ratio(plain[0], ours) if plain else None
-    return Timing(case.name, *shape, width, gradient, median(ours), ratio(ours, floor), slower)
-
-
-def _arrays(shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    x, y, data, weights = (torch.randn(shape, generator=generator) for _ in range(4))
-    return x.requires_grad_(), y.requires_grad_(), data.requires_grad_(), weights
-
-
-def _forward(function: Callable[[], Tensor]) -> Callable[[], None]:
-    def run() -> None:
-        with torch.no_grad():
-            function()
-
-    return run
-
-
-def _backward(
-    function: Callable[[], Tensor], weights: Tensor, leaves: tuple[Tensor, ...]
-) -> Callable[[], None]:
-    def run() -> None:
-        for leaf in leaves:
-            leaf.grad = None
-        function().backward(weights)  # type: ignore[no-untyped-call]
-
-    return run

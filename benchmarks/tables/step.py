@@ -7,38 +7,19 @@ their gradient, the optimiser.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from statistics import median
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import torch
 import typer
-from torch import Tensor
 
 from benchmarks.options import OnlyOption, Output, chosen
+from benchmarks.steps import Speed, StepTiming, speed, step_timing
 from benchmarks.store import BENCHMARKS, load
-from benchmarks.table import Table, measured_here, show, write_section
-from benchmarks.timing import interleaved, one_thread
+from benchmarks.table import Columns, Table, measured_here, publish
+from benchmarks.timing import one_thread
 from stlc.cli.framework.program import command
-from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.switch import StraightThrough
-from stlc.controller.problem.task import rank, satisfied
-from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.learner import Trainer
-from stlc.controller.training.objective import loss
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
 
 WARM = 120
 """Steps before the measurement, so that the search has found plans to learn from."""
-MOST_STEPS = 100_000
-ROLLOUTS, VERDICTS = 2_000, 16_384
-REPORTED = dict(zip(BENCHMARKS, (59.0, 79.0, 83.0, 81.0, 115.0, 181.0), strict=True))
-"""Milliseconds of processor time that one step of the authors' code takes with 2,000 states, on one thread:
-rollout, smooth robustness, backward and optimiser."""
 TEXT = """## A training step
 
 Written by `python -m benchmarks step`. Milliseconds of processor time on one thread, after {warm} steps;
@@ -54,85 +35,14 @@ robustness alone.
 """
 _OUTPUT = Output()
 
-
-@dataclass(frozen=True, slots=True)
-class StepTiming:
-    """Milliseconds of processor time of one training step and of its parts.
-
-    Attributes:
-        benchmark: name of the specification.
-        batch: states of a step.
-        plans: of the network for each of them.
-        forward: of the network.
-        verdict: rollout, robustness and cost of all plans, and the choice among them.
-        gradient: rollout and robustness of the chosen plans, with gradients.
-        backward: of the network.
-        optimiser: clipping, Adam, and the average of the weights.
-        whole: the step, with parts not listed above.
-        search: a search round, in its own thread, divided by the steps between two rounds.
-    """
-
-    benchmark: str
-    batch: int
-    plans: int
-    forward: float
-    verdict: float
-    gradient: float
-    backward: float
-    optimiser: float
-    whole: float
-    search: float
-
-
-@dataclass(frozen=True, slots=True)
-class Speed:
-    """Rollouts, verdicts and gradients of one task.
-
-    Attributes:
-        benchmark: name of the specification.
-        steps: of a rollout.
-        native: milliseconds of 2,000 rollouts with robustness and gradient in C; None without a kernel.
-        torch: the same in torch.
-        reported: of a step of the authors' code with the same number of states.
-        verdicts: rollouts with verdict a second, without gradient.
-    """
-
-    benchmark: str
-    steps: int
-    native: float | None
-    torch: float
-    reported: float | None
-    verdicts: float
-
-    @property
-    def share(self) -> float | None:
-        """Share of the authors' time."""
-        ours = self.torch if self.native is None else self.native
-        return None if self.reported is None else ours / self.reported
-
-
-def _one(value: float | None, digits: int = 1) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-STEPS: dict[str, Callable[[StepTiming], str]] = {
-    "benchmark": lambda row: row.benchmark,
-    "states": lambda row: str(row.batch),
-    "plans": lambda row: str(row.plans),
-    "network": lambda row: _one(row.forward),
-    "verdict": lambda row: _one(row.verdict),
-    "gradient": lambda row: _one(row.gradient),
-    "backward": lambda row: _one(row.backward),
-    "optimiser": lambda row: _one(row.optimiser),
-    "step": lambda row: _one(row.whole),
-    "search": lambda row: _one(row.search),
+STEPS: Columns[StepTiming] = {
+    **{"benchmark": "{benchmark}", "states": "{batch}", "plans": "{plans}", "network": "{forward:.1f}"},
+    **{"verdict": "{verdict:.1f}", "gradient": "{gradient:.1f}", "backward": "{backward:.1f}"},
+    **{"optimiser": "{optimiser:.1f}", "step": "{whole:.1f}", "search": "{search:.1f}"},
 }
-SPEEDS: dict[str, Callable[[Speed], str]] = {
-    "benchmark": lambda row: row.benchmark,
-    "steps": lambda row: str(row.steps),
-    "C": lambda row: _one(row.native),
-    "torch": lambda row: _one(row.torch),
-    "authors": lambda row: _one(row.reported, 0),
+SPEEDS: Columns[Speed] = {
+    **{"benchmark": "{benchmark}", "steps": "{steps}", "C": "{native:.1f}", "torch": "{torch:.1f}"},
+    **{"authors": "{reported:.0f}"},
     "share of the authors'": lambda row: "" if row.share is None else f"{100 * row.share:.1f} %",
     "verdicts a second": lambda row: f"{row.verdicts / 1e6:.1f} million",
 }
@@ -157,124 +67,10 @@ def step(
         names,
         lambda name: step_timing(name, load(name), seconds=seconds, warm=warm),
         STEPS,
-        lambda row: f"{row.benchmark}: {row.whole:.1f} ms a step",
+        "{benchmark}: {whole:.1f} ms a step",
     )
     speeds = Table("speed", names, lambda name: speed(name, load(name), seconds=seconds), SPEEDS)
+    text = TEXT.format(warm=warm)
+    lines = lambda: [text, *steps.markdown(), SPEED_TEXT, *speeds.markdown(), "", measured_here()]  # noqa: E731
     with one_thread():
-        show("step", {"steps": steps, "speeds": speeds}, as_json=output.as_json)
-    if output.page is not None:
-        lines = [
-            TEXT.format(warm=warm),
-            *steps.markdown(),
-            SPEED_TEXT,
-            *speeds.markdown(),
-            "",
-            measured_here(),
-        ]
-        write_section(output.page, "step", lines)
-
-
-def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTiming:
-    """Time the parts of a training step."""
-    engine = resolve_config(task, TrainConfig(seed=0, threads=1))
-    trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
-    for _ in range(warm):
-        if trainer.step >= trainer.next_validation:
-            trainer.validate()
-        trainer.advance()
-    if trainer.repairing is not None:
-        trainer.repairing.result()
-    x0 = trainer.training.take(engine.batch)
-    if engine.hard and len(trainer.buffer):
-        x0 = torch.cat((x0, trainer.buffer.draw(engine.hard, trainer.generator)[0]))
-    search = _searched(trainer)
-    parts = [*_parts(trainer, x0), trainer.advance]
-    times = [median(each) * 1e3 for each in interleaved(parts, seconds)]
-    forward, verdict, gradient, backward, optimiser, whole = times
-    return StepTiming(
-        *(name, len(x0), engine.plans, forward, verdict, gradient),
-        *(max(backward - forward, 0.0), optimiser, whole, search / engine.every),
-    )
-
-
-def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
-    """The parts as functions: forward; verdict; gradient; forward and backward; optimiser."""
-    task, network, count = trainer.task, trainer.network, trainer.config.plans
-    plans = network(x0).detach()
-    direction = torch.ones_like(plans)
-    chosen = plans[:, 0].clone().requires_grad_()
-    states = x0.repeat_interleave(count, 0)
-
-    def verdict() -> None:
-        with torch.no_grad():
-            judged = task.judge(states, plans.flatten(0, 1))
-            rank(judged.rho, task.cost(judged)).view(-1, count).argmax(1)
-
-    def gradient() -> None:
-        value = loss(task, trainer.objective, x0, chosen).total.mean()
-        torch.autograd.grad(value, chosen)
-
-    def both() -> None:
-        trainer.optimizer.zero_grad()
-        network(x0).backward(direction)
-
-    def optimise() -> None:
-        torch.nn.utils.clip_grad_norm_(network.parameters(), trainer.config.clip)
-        trainer.optimizer.step()
-        with torch.no_grad():
-            for averaged, current in zip(trainer.average.parameters(), network.parameters(), strict=True):
-                averaged.lerp_(current, 0.01)
-
-    return (lambda: network(x0)), verdict, gradient, both, optimise
-
-
-def _searched(trainer: Trainer) -> float:
-    """Milliseconds of a round of search for the states on which the network fails."""
-    with torch.no_grad():
-        x0 = trainer.supply.take(trainer.config.pool)
-        plans, judged = trainer.policy.plan_judged(x0)
-        bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
-    states, start, bank = x0[bad], plans[bad], trainer.buffer.bank
-    before = time.process_time()
-    trainer.searcher.repair(states, start, bank)
-    return (time.process_time() - before) * 1e3
-
-
-def speed(name: str, task: Task, *, seconds: float) -> Speed:
-    """Time rollouts with verdicts, and with gradients."""
-    x0 = task.sample(VERDICTS, seed=1)
-    generator = torch.Generator().manual_seed(2)
-    low, high = task.system.control_low, task.system.control_high
-    u = low + (high - low) * torch.rand(VERDICTS, task.horizon, len(low), generator=generator)
-    some, plan = x0[:ROLLOUTS], u[:ROLLOUTS].clone().requires_grad_()
-    slope = 5.0
-
-    def in_torch() -> None:
-        columns = task.system.rollout_columns(some, plan, StraightThrough(slope))
-        torch.autograd.grad(task.graph.columns(columns, ops=TORCH).sum(), plan)
-
-    def as_c() -> None:
-        assert task.gradient is not None
-        each, _ = task.gradient(some, plan, slope=slope)
-        torch.autograd.grad(task.graph.overall(each).sum(), plan)
-
-    double = x0.double().numpy(), u.double().numpy()
-
-    def verdict() -> None:
-        if task.native is None:
-            task.judge(x0, u, states=False)
-        else:
-            task.native.kernel.judge(*double)
-
-    todo: list[Callable[[], object]] = [in_torch, verdict]
-    if task.gradient is not None:
-        todo.append(as_c)
-    torch_time, judging, *native = (median(times) for times in interleaved(todo, seconds))
-    return Speed(
-        name,
-        task.horizon,
-        native[0] * 1e3 if native else None,
-        torch_time * 1e3,
-        REPORTED.get(name),
-        VERDICTS / judging,
-    )
+        publish("step", output, lines, {"steps": steps, "speeds": speeds})

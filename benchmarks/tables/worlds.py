@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from benchmarks.drives import GUARDS, NOMINAL, Deployments, Drives, mean_and_half, policy_lines, rows_of
+from benchmarks.deployments import (
+    GUARDS,
+    NOMINAL,
+    DeploymentOptions,
+    Deployments,
+    Row,
+    mean_and_half,
+    policy_lines,
+    publish_deployments,
+    rows_of,
+)
 from benchmarks.options import Output, chosen
 from benchmarks.store import Result, ResultStore
-from benchmarks.table import WIDTH, Table, provenance, show, write_section
+from benchmarks.table import WIDTH, Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
-
-if TYPE_CHECKING:
-    from benchmarks.drives import Row
+from stlc.controller.training.run import Run
 
 TEXT = """\
 Written by `python -m benchmarks worlds` from `benchmarks/results/worlds.json`: one policy for each
@@ -28,9 +36,9 @@ search finds a plan from their start that is safe through the horizon. `model-co
 which the world did as the model says through the window; some worlds never do. Means over deployment seeds
 with half of their 95 % intervals (Student's t).
 """
-_DRIVES, _OUTPUT = Drives(), Output(Path("docs/worlds.md"))
+_OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
-Line = tuple["Row", str]
+Line = tuple[Row, str]
 """A row and one of its guards."""
 
 
@@ -49,7 +57,7 @@ def _progress(line: Line) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {float(metric['mean']):.3g}" for name, metric in told)
 
 
-COLUMNS: Mapping[str, Callable[[Line], str]] = {
+COLUMNS: Columns[Line] = {
     "": _named,
     "guard": lambda line: line[1],
     "plan accuracy": _share("plan_accuracy"),
@@ -64,7 +72,7 @@ COLUMNS: Mapping[str, Callable[[Line], str]] = {
 def table(rows: Sequence[Row]) -> Table[Line, Line]:
     """A line for every guard; the first one names the deployment and its seeds x agents x steps."""
     lines = [(row, guard) for row in rows for guard in row.guards]
-    return Table("worlds", lines, lambda line: line, COLUMNS)
+    return listed("worlds", lines, COLUMNS)
 
 
 def section(results: Sequence[Result]) -> list[str]:
@@ -106,7 +114,7 @@ def worlds(
         int,
         typer.Option("--ceiling", metavar="N", min=0, help="Visited states to check for a feasible plan."),
     ] = 1000,
-    drives: Drives = _DRIVES,
+    options: DeploymentOptions = _OPTIONS,
     output: Output = _OUTPUT,
 ) -> None:
     """Deploy policies in their worlds, without a guard and with each, and write the table.
@@ -114,29 +122,9 @@ def worlds(
     Stored deployments with the same policy, system and setting are reused. Scenarios with a world of their
     own are simulated, too.
     """
-    from stlc.controller.training.run import Run
-
     modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")]
-    deployments = Deployments(ResultStore("worlds", drives.out), drives, ceiling)
-    for folder in drives.runs(runs):
+    deployments = Deployments(ResultStore("worlds", options.out), options, ceiling)
+    for folder in options.runs(runs):
         declared = Run.open(folder.path).task.system.decl.scenarios
         deployments.add(folder, (NOMINAL, *(each.name for each in declared if each.world)), modes)
-    conclude("worlds", deployments, output.page or _OUTPUT.page, section, table, as_json=output.as_json)
-
-
-def conclude(
-    what: str,
-    deployments: Deployments,
-    page: Path | None,
-    section: Callable[[Sequence[Result]], list[str]],
-    table: Callable[[Sequence[Row]], Table[Any, Any]],
-    *,
-    as_json: bool,
-) -> None:
-    """Write the page from all stored results, and show the requested ones."""
-    assert page is not None
-    write_section(page, what, section(list(deployments.store.all().values())))
-    rows = rows_of(deployments.results)
-    shown = Table(what, rows, lambda row: row, {}) if as_json else table(rows)
-    driven, kept = deployments.driven, deployments.kept
-    show(what, {"rows": shown}, as_json=as_json, page=str(page), driven=driven, kept=kept)
+    publish_deployments("worlds", deployments, output, section, table)

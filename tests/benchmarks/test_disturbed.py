@@ -9,12 +9,22 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.documents import misfits
 
-from benchmarks import drives
+from benchmarks import deployments
 from benchmarks.__main__ import main as measure
-from benchmarks.drives import NOMINAL, SCENARIOS, Deployments, Drives, Row, mean_and_half, rows_of
+from benchmarks.deployments import (
+    NOMINAL,
+    SCENARIOS,
+    DeploymentOptions,
+    Deployments,
+    Row,
+    mean_and_half,
+    rows_of,
+)
 from benchmarks.store import BENCHMARKS, ResultStore
 from benchmarks.tables.disturbed import METRICS, section
+from benchmarks.tables.schema import document_schema
 from benchmarks.tables.worlds import section as worlds_section
 from benchmarks.tables.worlds import wholly_viable
 from stlc.cli.framework.app import main
@@ -84,16 +94,17 @@ def test_what_was_driven_is_kept(
     assert f"| {' | '.join(columns)} |" in page
 
     with monkeypatch.context() as patch:
-        patch.setattr(drives, "drive", lambda *_: pytest.fail("driven twice"))
+        patch.setattr(deployments, "drive", lambda *_: pytest.fail("driven twice"))
         assert bench(run, tmp_path, *some, "--json") == 0
     document = json.loads(capsys.readouterr().out)
+    assert misfits(document, document_schema()) == []
     result = document["result"]
     assert (result["driven"], result["kept"]) == (0, 6)
     assert [row["scenario"] for row in result["rows"]] == ["as it is", "mismatch-20", "noise"]
     assert results(tmp_path) == first
 
     with monkeypatch.context() as patch:
-        patch.setattr(drives, "GUARD_VERSION", drives.GUARD_VERSION + 1)
+        patch.setattr(deployments, "GUARD_VERSION", deployments.GUARD_VERSION + 1)
         assert bench(run, tmp_path, "--scenarios", "noise", "--guards", "none") == 0
     assert capsys.readouterr().err.count("deploying") == 1  # by another guard
     assert bench(run, tmp_path, "--scenarios", "noise", "--guards", "none", "--steps", "6") == 0
@@ -132,8 +143,8 @@ def test_starts_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
         asked.append(len(x0))
         return x0[:, 0] > 0
 
-    monkeypatch.setattr(drives, "viable", search)
-    starts, x0 = Deployments(ResultStore("some"), Drives()), torch.tensor([[1.0], [-1.0]])
+    monkeypatch.setattr(deployments, "viable", search)
+    starts, x0 = Deployments(ResultStore("some"), DeploymentOptions()), torch.tensor([[1.0], [-1.0]])
     for _ in range(3):
         assert starts.viable(None, x0.clone()).tolist() == [True, False]  # type: ignore[arg-type]
     assert starts.viable(None, -x0).tolist() == [False, True]  # type: ignore[arg-type]
@@ -147,7 +158,7 @@ def test_worlds_are_driven_kept_and_laid_out(
     command = ["worlds", str(run.path), "--seeds", "0..2", "--guards", "none,full", "--json"]
     assert measure([*command, "--ceiling", "30", "--page", str(page), "--out", str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["schema"] == "benchmarks/1"
+    assert misfits(document, document_schema()) == []
     (row,) = document["result"]["rows"]
     shares = {name: each["metrics"]["feasible_followed"]["mean"] for name, each in row["guards"].items()}
     assert 0.0 < shares["none"] <= shares["full"] == 1.0

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
 from benchmarks.store import ResultStore, load, spec_path
 from benchmarks.table import Table
 from benchmarks.tables.family import COLUMNS, FAMILIES, Family, Row, section
+from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.config import HELD_OUT_SEED
@@ -93,7 +95,7 @@ def test_from_training_to_the_page_and_again(
         assert measure(words) == code
         said = capsys.readouterr()
         document: dict[str, Any] = json.loads(said.out)
-        assert document["schema"] == "benchmarks/1"
+        assert misfits(document, document_schema()) == []
         result: dict[str, Any] = document["result"]
         return result, said.err
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
-from benchmarks.drives import GUARDS
-from benchmarks.tables.latency import picked
+from benchmarks.deployments import GUARDS, picked
+from benchmarks.tables.schema import document_schema
 from benchmarks.timing import Times
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.simulator import DeploymentRecording
@@ -58,7 +59,7 @@ def test_guards_are_timed_and_the_page_is_written(
     command = ["latency", "--samples", "8", "--seeds", "3", "--page", str(page), "--json"]
     assert measure(command) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["schema"] == "benchmarks/1"
+    assert misfits(document, document_schema()) == []
     rows = document["result"]["rows"]
     assert [row["guard"] for row in rows] == ["policy", *GUARDS]
     assert rows[0]["acting"] is None

@@ -7,10 +7,12 @@ import sys
 
 import pytest
 import torch
+from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
-from benchmarks.formulas import CASES, Case
-from benchmarks.tables.robustness import Timing, timings, width_of
+from benchmarks.formulas import CASES, Case, Timing, width_of
+from benchmarks.tables.robustness import timings
+from benchmarks.tables.schema import document_schema
 from benchmarks.timing import interleaved, one_thread, ratio
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.torch.ops import TORCH
@@ -52,7 +54,7 @@ def test_timings_and_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert "with gradient" in out
     assert measure(["robustness", "--samples", "20", "--traces", "1", "--seconds", "0", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["schema"] == "benchmarks/1"
+    assert misfits(document, document_schema()) == []
     assert len(document["result"]["rows"]) == 2 * len(CASES)
 
 

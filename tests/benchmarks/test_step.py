@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
+from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
+from benchmarks.steps import speed, step_timing
 from benchmarks.store import load
-from benchmarks.tables.step import speed, step_timing
+from benchmarks.tables.schema import document_schema
 
 
 def test_the_parts_of_a_step_are_measured_and_written(
@@ -19,7 +21,9 @@ def test_the_parts_of_a_step_are_measured_and_written(
     page.write_text("# Page\n")
     command = ["step", "--only", "traffic", "--seconds", "0", "--warm", "2"]
     assert measure([*command, "--json", "--page", str(page)]) == 0
-    document = json.loads(capsys.readouterr().out)["result"]
+    printed = json.loads(capsys.readouterr().out)
+    assert misfits(printed, document_schema()) == []
+    document = printed["result"]
     (step,), (fast,) = document["steps"], document["speeds"]
     assert all(value > 0 for key, value in step.items() if key not in ("benchmark", "backward", "search"))
     assert fast["reported"] == 59.0

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.documents import misfits
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +20,19 @@ from benchmarks.feasible import TRIES, _union, known_feasible, search_on
 from benchmarks.options import Training
 from benchmarks.store import BENCHMARKS, ResultStore, load
 from benchmarks.tables import ablation, paper
-from benchmarks.training import Cell, Length, Place, _fill, filled, pack, remaining, unpack
+from benchmarks.tables.schema import document_schema
+from benchmarks.training import (
+    Cell,
+    Length,
+    Place,
+    _fill,
+    filled,
+    grouped,
+    outdated,
+    pack,
+    remaining,
+    unpack,
+)
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT_SEED
 from stlc.controller.training.launch import Launch, open_folder
@@ -123,9 +136,16 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert document["accuracy"] == pytest.approx(float(good.double().mean()))
     assert 0.0 <= document["training_accuracy"] <= 1.0
     assert place.valid() == [document]
+    assert [row.outdated for row in ablation.table([document], ["k"]).rows] == []  # no value of the paper
     monkeypatch.setattr("benchmarks.training.ENGINE_VERSION", -1)
     assert place.valid() == []
+    assert place.all() == [document]
+    assert outdated(document) == ("method",)
     assert place.store.find(cell.key) is None
+    (group,) = grouped(place.all())
+    row = paper.row_of(group, {})
+    assert row.outdated == ("method",)
+    assert paper.SHOWN["inputs"](row) == "outdated: method"  # type: ignore[operator]
 
 
 @pytest.mark.slow
@@ -154,7 +174,7 @@ def test_the_command_from_training_to_the_page(
     def answer(*more: str) -> dict[str, Any]:
         assert measure([*words, *more]) == 0
         document: dict[str, Any] = json.loads(capsys.readouterr().out)
-        assert document["schema"] == "benchmarks/1"
+        assert misfits(document, document_schema()) == []
         result: dict[str, Any] = document["result"]
         return result
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
 
-from benchmarks.options import ResultsOption, TrainedOption
+from benchmarks.options import Output, ResultsOption, TrainedOption
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
+from benchmarks.table import Table, listed, publish
 from benchmarks.training import Place, benchmark_order
 from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
@@ -40,6 +43,8 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 NOMINAL = "as it is"
+AGENTS = 5
+"""Maximum number of agents in the deployments whose states are sampled."""
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 USUAL = (*GUARDS, "full+auto")
@@ -47,7 +52,7 @@ USUAL = (*GUARDS, "full+auto")
 
 
 @dataclass(frozen=True, slots=True)
-class Drives:
+class DeploymentOptions:
     """Options of deployments."""
 
     seeds: SeedsOption = "0..9"
@@ -95,6 +100,31 @@ def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
     return recording
 
 
+def sampled_states(
+    guard: Guard, seeds: tuple[int, ...], samples: int
+) -> tuple[DeploymentRecording, NDArray[np.int64], NDArray[np.int64]]:
+    """A deployment of few agents, and indices (row, step) of some of its states.
+
+    Returns:
+        The recording; `samples / 2` evenly chosen states, (k, 2); at most as many of the states with an
+        intervention of the guard, (l, 2), which are rare for a good policy.
+    """
+    test = guard.task.system.decl.test
+    recording = recorded(guard, Setting(seeds, min(AGENTS, test.agents), test.steps, test.replan))
+    return recording, *picked(recording, samples)
+
+
+def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The indices of `sampled_states`."""
+    every = np.argwhere(np.ones_like(recording.source, dtype=bool))
+    acted = np.argwhere(recording.source > 0)
+    half = max(samples // 2, 1)
+    even, there = (
+        rows[np.linspace(0, len(rows) - 1, min(half, len(rows))).astype(int)] for rows in (every, acted)
+    )
+    return even, there
+
+
 def guard_of(name: str) -> tuple[Mode, MarginRequest]:
     """Parse a name such as `full`, `full+0.2` or `full+auto` into a guard and its margin request.
 
@@ -124,7 +154,7 @@ class Deployments:
     """
 
     store: ResultStore
-    options: Drives
+    options: DeploymentOptions
     ceiling: int = 0
     driven: int = 0
     kept: int = 0
@@ -282,6 +312,21 @@ def policy_lines(rows: Iterable[Row]) -> list[str]:
             f"{known['seed']}, {seconds} s of training, plan accuracy {accuracy} on held-out starts"
         )
     return list(dict.fromkeys(lines))
+
+
+def publish_deployments(
+    what: str,
+    deployments: Deployments,
+    output: Output,
+    section: Callable[[Sequence[Result]], list[str]],
+    table: Callable[[Sequence[Row]], Table[Any, Any]],
+) -> None:
+    """Write the page from all stored results, and show the requested ones."""
+    rows = rows_of(deployments.results)
+    shown = listed(what, rows, {}) if output.as_json else table(rows)
+    counts = {"driven": deployments.driven, "kept": deployments.kept}
+    everything = [*deployments.store.all().values()]
+    publish(what, output, lambda: section(everything), {"rows": shown}, **counts)
 
 
 def mean_and_half(metric: Mapping[str, Any] | None) -> str:

@@ -1,0 +1,103 @@
+"""`python -m benchmarks schema`: JSON Schema of the tables' documents, derived from the records of rows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import is_dataclass
+from functools import reduce
+from operator import or_
+from types import UnionType
+from typing import Any, Literal, NotRequired, TypedDict, Union, get_args, get_origin, get_type_hints
+
+from benchmarks.deployments import Row as DeploymentRow
+from benchmarks.feasible import KnownFeasible
+from benchmarks.formulas import Timing
+from benchmarks.repairs import Mended
+from benchmarks.steps import Speed, StepTiming
+from benchmarks.tables import ablation, family, latency, paper
+from stlc.cli.framework.documents import DocumentRecord, Num, schema_of
+from stlc.cli.framework.output import emit
+from stlc.cli.framework.program import command
+
+NAME = "benchmarks/1"
+_dictionary: Any = TypedDict
+
+
+class FailedTraining(TypedDict):
+    """A training that failed, and the reason."""
+
+    name: str
+    why: str
+
+
+class Facts(TypedDict):
+    """Entries of a result beside its rows; a table has some of them."""
+
+    page: NotRequired[str]
+    results: NotRequired[int]
+    trained: NotRequired[int]
+    kept: NotRequired[int]
+    driven: NotRequired[int]
+    failed: NotRequired[list[FailedTraining]]
+
+
+ROWS: dict[str, dict[str, type]] = {
+    "paper": {"rows": paper.Row, "known_feasible": KnownFeasible},
+    "ablation": {"rows": ablation.Row},
+    "family": {"rows": family.Row},
+    "worlds": {"rows": DeploymentRow},
+    "disturbed": {"rows": DeploymentRow},
+    "latency": {"rows": latency.Row},
+    "repair": {"rows": Mended},
+    "step": {"steps": StepTiming, "speeds": Speed},
+    "robustness": {"rows": Timing},
+}
+"""Name of a table -> key in its result -> record of a row."""
+
+
+@command("python -m benchmarks schema")
+def schema() -> None:
+    """Print the JSON Schema of the documents that tables print with --json.
+
+    Within a major version keys are only added.
+    """
+    emit(json.dumps(document_schema(), indent=2))
+
+
+def document_schema() -> dict[str, Any]:
+    """The schema of a whole document: the common frame, and the result of one table."""
+    results = [_result(name, rows) for name, rows in ROWS.items()]
+    frame = schema_of(DocumentRecord)
+    frame["properties"] |= {"schema": {"const": NAME}, "result": schema_of(reduce(or_, [*results, None]))}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": NAME, **frame}
+
+
+def _result(name: str, rows: Mapping[str, type]) -> Any:
+    hints = get_type_hints(Facts, include_extras=True)
+    lists = {key: list[document_type(row)] for key, row in rows.items()}  # type: ignore[misc]
+    return _dictionary(name, {"what": Literal[name], **hints, **lists})
+
+
+def document_type(kind: Any) -> Any:
+    """The type of the JSON form of a value; a record becomes a dictionary of its fields and properties."""
+    origin, args = get_origin(kind), get_args(kind)
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        hints |= {
+            name: get_type_hints(each.fget)["return"]
+            for name, each in vars(kind).items()
+            if isinstance(each, property)
+        }
+        return _dictionary("Record", {key: document_type(hint) for key, hint in hints.items()})
+    if kind is float:
+        return Num
+    if origin in (Union, UnionType):
+        return Union[tuple(map(document_type, args))]  # noqa: UP007
+    if origin is tuple and args[-1] is Ellipsis:
+        return list[document_type(args[0])]  # type: ignore[misc]
+    if origin is tuple:
+        return tuple[tuple(map(document_type, args))]  # type: ignore[misc]
+    if origin is Mapping:
+        return dict[str, document_type(args[1])]  # type: ignore[misc]
+    return kind
