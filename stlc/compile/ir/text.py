@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
@@ -38,7 +39,7 @@ def show_formula(formula: ir.Formula) -> str:
             return _operator(formula)
 
 
-def _operator(formula: ir.BoolOp | ir.Temporal | ir.PastTemporal | ir.Until | ir.Since) -> str:
+def _operator(formula: Any) -> str:
     """Return an operator with its window in samples: before its operand, or between several."""
     parts = [_operand(part) for part in _parts(formula)]
     if not isinstance(formula, ir.Windowed):

@@ -418,7 +418,7 @@ class CauseFinder:
         """The instants in the window of a temporal operator at which something is known, in order of time."""
         lowered = self._lowered(formula, wanted)
         match lowered:
-            case ir.Temporal(window=window) | ir.Until(window=window):
+            case ir.Windowed(window=window, back=False):
                 last, known = self.record.samples - 1, self._stop(lowered) - 1
                 end = known if self.stop is None else min(self.stop - 1, known)
                 high = (
@@ -427,7 +427,7 @@ class CauseFinder:
                     else min(sample + window.hi, known)
                 )
                 return range(sample + window.lo, high + 1)
-            case ir.PastTemporal(window=window) | ir.Since(window=window):
+            case ir.Windowed(window=window):
                 low = 0 if window.hi is None else max(sample - window.hi, 0)
                 return range(low, sample - window.lo + 1)
         raise TypeError(f"{type(lowered).__name__} has no window")
