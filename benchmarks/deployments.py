@@ -20,7 +20,7 @@ from benchmarks.training import Place, benchmark_order
 from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
 from stlc.cli.framework.ranges import parse_limit, parse_seeds
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
@@ -94,7 +94,7 @@ class DeploymentOptions:
 def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
     """Record a deployment under a guard in the world of its system."""
     recorder = Recorder(setting.agents)
-    drive(guard, world_type(guard.task.system.decl), setting, recorder)
+    simulate(guard, world_type(guard.task.system.decl), setting, recorder)
     recording = recorder.recording()
     assert recording is not None
     return recording
@@ -195,7 +195,7 @@ class Deployments:
         recording = recorded(guard, setting)
         seconds = perf_counter() - begin
         known = self.viable(run.task, torch.from_numpy(recording.states[:, 0]))
-        executed = judge_executed(run.task, recording, savable=known.numpy())
+        executed = judge_executed(run.task, recording, viable=known.numpy())
         metrics = measure(recording, executed, feasible_states(run.task, recording, setting.ceiling))
         return {
             "run": run.dir.name,

@@ -94,7 +94,7 @@ def test_what_was_driven_is_kept(
     assert f"| {' | '.join(columns)} |" in page
 
     with monkeypatch.context() as patch:
-        patch.setattr(deployments, "drive", lambda *_: pytest.fail("driven twice"))
+        patch.setattr(deployments, "simulate", lambda *_: pytest.fail("driven twice"))
         assert bench(run, tmp_path, *some, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert misfits(document, document_schema()) == []

@@ -11,7 +11,7 @@ from helpers.mission_strategies import augmented
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
@@ -200,7 +200,7 @@ def test_kernel_and_torch_agree_on_memory(task: Task) -> None:
 def deployed(task: Task, seeds: int = 6) -> DeploymentRecording:
     recorder = Recorder(4)
     guard = Guard(task, Steered(task), "none")
-    drive(guard, ModelWorld, Setting(tuple(range(seeds)), 4, 32), recorder)  # type: ignore[arg-type]
+    simulate(guard, ModelWorld, Setting(tuple(range(seeds)), 4, 32), recorder)  # type: ignore[arg-type]
     recording = recorder.recording()
     assert recording is not None
     return recording

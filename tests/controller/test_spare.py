@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.ir.nodes import Predicate, Signal
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.margins import tightened, with_margins
@@ -60,7 +60,7 @@ def driven(mode: Mode, margin: float, scenario: str = "") -> DeploymentRecording
     task = task_of(scenario)
     guard = Guard(task, Onward(task), mode, limits=Limits(margin={"clear": margin}, seconds=None))
     recorder = Recorder(8)
-    drive(guard, world_type(task.system.decl), Setting((0,), 8, 24, 4), recorder)
+    simulate(guard, world_type(task.system.decl), Setting((0,), 8, 24, 4), recorder)
     found = recorder.recording()
     assert found is not None
     return found
@@ -143,7 +143,7 @@ def test_what_nobody_has_planned_is_no_danger() -> None:
     guard = Guard(task, Faster(task), "full", limits=Limits(seconds=None))
     recorder = Recorder(8)
     watch = lambda moment: planned.append(moment.planned)  # noqa: E731
-    drive(guard, world_type(decl), Setting((0,), 8, 4, 4), recorder, watch)
+    simulate(guard, world_type(decl), Setting((0,), 8, 4, 4), recorder, watch)
     assert planned == [8, 0, 0, 0, 0]
     x = torch.from_numpy(recorder.recording().states[:, 3])  # type: ignore[union-attr]
     rest = recorder.decisions[0].later(3)
@@ -155,7 +155,7 @@ def test_the_full_guard_looks_at_all_that_is_left_of_a_plan() -> None:
     task = task_of("disturb-50")
     guard, recorder = Guard(task, Onward(task), "full", limits=Limits(seconds=None)), Recorder(8)
     planned: list[int] = []
-    drive(
+    simulate(
         guard,
         world_type(task.system.decl),
         Setting((1,), 8, 2, 4),

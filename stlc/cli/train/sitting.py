@@ -83,7 +83,7 @@ class Sitting:
     def _begun(self, chosen: dict[str, Any]) -> None:
         self.progress.chosen(chosen)
         if self._log is not None:
-            self._log.begun(chosen)
+            self._log.started(chosen)
 
     def _row(self, row: dict[str, Any]) -> None:
         self.progress.update(row)
@@ -160,7 +160,7 @@ class Sitting:
         if json:
             learning = _learning(outcome)
             result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
-            result |= {} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}
+            result |= {} if outcome.simulated is None else {"closed_loop": outcome.simulated.summary()}
             result |= {} if learning is None else {"verdict": learning.summary()}
             result |= {key: self.folder.record().get(key) for key in ("steps", "schedule")}
             emit_json("train/1", ok=found, exit_code=code, diagnostics=why, result=result)
@@ -232,7 +232,9 @@ def _summary(outcome: TrainingOutcome, *, pictures: bool) -> Summary:
         steps=outcome.steps,
         searched=int(score.searched.sum()),
         learning=learning,
-        driven=driven_lines({} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}),
+        driven=driven_lines(
+            {} if outcome.simulated is None else {"closed_loop": outcome.simulated.summary()}
+        ),
         judged=score.endless,
         where=where,
         unsolved=unsolved,

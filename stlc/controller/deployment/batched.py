@@ -68,7 +68,7 @@ class Worlds:
         self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
         self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
         self.truths = self.disturbance.truths(task.plain.truth)
-        self.quiet = torch.ones(setting.agents * len(setting.seeds), dtype=torch.bool)
+        self.eventless = torch.ones(setting.agents * len(setting.seeds), dtype=torch.bool)
         with blamed(make, "__init__", "be made"):
             pairs = zip(self.truths, self.generators, strict=True)
             self.worlds = [make(real, setting.agents, generator) for real, generator in pairs]
@@ -89,12 +89,12 @@ class Worlds:
             with blamed(world, "reset", "begin"):
                 given.append(world.reset())
         parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
-        begun = [self.system.begun(x, generator) for x, generator in parts]
+        starts = [self.system.begun(x, generator) for x, generator in parts]
         self.redrawn = 0
         if self.task.system.decl.test.starts == "any":
-            return torch.cat(begun)
+            return torch.cat(starts)
         return torch.cat(
-            [self._with_plans(*each) for each in zip(self.worlds, self.seeds, begun, strict=True)]
+            [self._with_plans(*each) for each in zip(self.worlds, self.seeds, starts, strict=True)]
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ class Worlds:
         """Advance step number `step`: (rows, n), (rows, m) -> (rows, n).
 
         Worlds do not know parameters and timers: parameters are kept, timers follow from the true states.
-        `quiet` marks the rows without exogenous event: the world moved exactly as the true dynamics.
+        `eventless` marks the rows without exogenous event: the world moved exactly as the true dynamics.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -132,7 +132,7 @@ class Worlds:
             with blamed(world, "advance", f"take step {step}"):
                 given.append(world.advance(state, act))
         reached = self._checked("advance", given, step)
-        self.quiet = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
+        self.eventless = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
         moved = self.disturbance.pushed(reached, known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
 

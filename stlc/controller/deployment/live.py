@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.controller.evaluation.executed import as_driven
+from stlc.controller.evaluation.executed import whole_run_rule
 from stlc.controller.guard.candidates import SOURCES
 from stlc.monitor.online.margins import Margin, Margins
 
@@ -32,7 +32,7 @@ class LiveMonitor:
         self.task, self.setting = task, setting
         self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
-        self._margins = Margins([as_driven(rule, task) for rule in task.rules], task.horizon)
+        self._margins = Margins([whole_run_rule(rule, task) for rule in task.rules], task.horizon)
 
     def push(self, moment: SimulationStep) -> None:
         """Append the next step of the deployment."""

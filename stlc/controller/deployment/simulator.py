@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stlc.controller.guard.guard import Guard, GuardDecision
     from stlc.controller.world import WorldType
 
-__all__ = ["DeploymentRecording", "Recorder", "Setting", "SimulationStep", "Watch", "drive"]
+__all__ = ["DeploymentRecording", "Recorder", "Setting", "SimulationStep", "Watch", "simulate"]
 
 Frame = Mapping[str, NDArray[Any]]
 
@@ -44,7 +44,7 @@ class DeploymentRecording:
             that maps planned states into its picture also `rejected` and `taken`, float32 (frames, agents,
             horizon + 1, 2 or 3): the policy plan that a guard replaced and the followed plan; NaN without
             intervention.
-        quiet: (rows, steps), whether there was no exogenous event; None where not recorded.
+        eventless: (rows, steps), whether there was no exogenous event; None where not recorded.
         options: (rows, steps, k, n), the options of the agents; None where the world offers none.
         redrawn: number of starts redrawn because no plan is known from them.
     """
@@ -61,7 +61,7 @@ class DeploymentRecording:
     units: Mapping[str, str]
     scene: Mapping[str, NDArray[Any]]
     options: NDArray[np.float64] | None = None
-    quiet: NDArray[np.bool_] | None = None
+    eventless: NDArray[np.bool_] | None = None
     redrawn: int = 0
 
     @property
@@ -84,7 +84,7 @@ class Recorder:
     decisions: list[GuardDecision] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
-    quiet: list[Tensor] = field(default_factory=list)
+    eventless: list[Tensor] = field(default_factory=list)
     replaced: list[Frame] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
@@ -131,7 +131,9 @@ class Recorder:
             units=self.units,
             scene=scene,
             options=torch.stack(self.options[:steps], 1).numpy(force=True) if self.options else None,
-            quiet=torch.stack(self.quiet[:steps], 1).numpy(force=True) if len(self.quiet) >= steps else None,
+            eventless=torch.stack(self.eventless[:steps], 1).numpy(force=True)
+            if len(self.eventless) >= steps
+            else None,
             redrawn=self.redrawn,
         )
 
@@ -166,7 +168,7 @@ class _Pilot:
     def __init__(self, guard: Guard, setting: Setting) -> None:
         self.guard, self.replan = guard, setting.replan
         columns = guard.task.plain.signature.columns
-        self.told = [index for index, column in enumerate(columns) if column.role == "env"]
+        self.exogenous = [index for index, column in enumerate(columns) if column.role == "env"]
         self.decision: GuardDecision | None = None
         self.age = torch.zeros(0, dtype=torch.int64)
 
@@ -181,19 +183,19 @@ class _Pilot:
             return torch.arange(len(x))
         left = (self.guard.task.horizon - 1 - self.age).clamp(min=self.replan - step % self.replan)
         danger = self.guard.endangered(seen, self.decision.later(self.age), left)
-        return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
+        return torch.nonzero((x != self.before)[:, self.exogenous].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
         """Option of each row, (rows,); rows that do not replan keep theirs."""
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
-            pick[due] = self.guard.prefer(options[due], self._begun(due, options[:, 0]))
+            pick[due] = self.guard.prefer(options[due], self._previous(due, options[:, 0]))
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
         """Decisions and actions (rows, m); rows `due` replan from the measured states `seen`."""
         if len(due):
-            new = self.guard.decide(seen[due], self._begun(due, seen))
+            new = self.guard.decide(seen[due], self._previous(due, seen))
             whole = self.decision is None or len(due) == len(x)
             self.decision = new if self.decision is None or whole else self.decision.with_new(due, new)
             self.age = torch.zeros(len(x), dtype=torch.int64) if whole else self.age.index_fill(0, due, 0)
@@ -202,7 +204,7 @@ class _Pilot:
         self.age, self.before = self.age + 1, x
         return self.decision, action
 
-    def _begun(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
+    def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
         """Remainders of the previous plans of rows `due`, from measured states `seen` (rows, n).
 
         With `replan` > 1 the policy continues a plan from its end: the last action, held for that long, may
@@ -211,10 +213,10 @@ class _Pilot:
         if self.decision is None:
             return None
         left = self.decision.of(due).later(self.age[due])
-        return left if self.replan == 1 else self.guard.carried_on(seen[due], left, self.age[due])
+        return left if self.replan == 1 else self.guard.extended(seen[due], left, self.age[due])
 
 
-def drive(
+def simulate(
     guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, watch: Watch | None = None
 ) -> None:
     """Simulate fresh worlds, one per seed, into `recorder`; `watch` is called at every step.
@@ -230,13 +232,13 @@ def drive(
     for step in range(setting.steps):
         seen = worlds.disturbance.seen(x, step)
         due = pilot.due(x, seen, step)
-        options, begun = worlds.options(x), perf_counter()
+        options, began = worlds.options(x), perf_counter()
         if options is not None:
             chosen = worlds.choose(pilot.prefer(options + (seen - x)[:, None], due), x)
             seen, x = seen + (chosen - x), chosen
             recorder.chosen(x, options)
         decision, action = pilot.decide(x, seen, due)
-        seconds = perf_counter() - begun
+        seconds = perf_counter() - began
         replaced = _replaced(worlds, guard, decision, seen, due) if recorder.pictured else None
         if replaced is not None:
             recorder.replaced.append(replaced)
@@ -245,7 +247,7 @@ def drive(
             watch(SimulationStep(step, setting.steps, x, decision, len(due), seconds))
         x = worlds.advance(x, action, step + 1)
         recorder.step(decision, action, x, worlds.snapshot())
-        recorder.quiet.append(worlds.quiet)
+        recorder.eventless.append(worlds.eventless)
         recorder.progress = worlds.progress()
     if watch is not None:
         watch(SimulationStep(setting.steps, setting.steps, x, None))
@@ -268,8 +270,8 @@ def _replaced(
         steps = guard.task.horizon + 1
         states = torch.full((agents, steps, worlds.size[1]), torch.nan, dtype=torch.float64)
         if len(rows):
-            foreseen = guard.task.rollout(seen[rows], plans[rows].to(torch.float64))
-            states[rows] = foreseen[..., : worlds.size[1]].to(states)
+            predicted = guard.task.rollout(seen[rows], plans[rows].to(torch.float64))
+            states[rows] = predicted[..., : worlds.size[1]].to(states)
         found[name] = worlds.charted(states).astype(np.float32)
     return found
 

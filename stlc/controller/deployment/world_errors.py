@@ -73,8 +73,8 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
         then, now = _shapes(before), _shapes(scene)
         for name in then | now:
             if then.get(name) != now.get(name):
-                told = f"gives `{name}` of shape {now.get(name)}, and {then.get(name)} before"
-                raise wrong(world, "snapshot", told)
+                change = f"gives `{name}` of shape {now.get(name)}, and {then.get(name)} before"
+                raise wrong(world, "snapshot", change)
     return scene
 
 

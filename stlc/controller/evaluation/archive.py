@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from stlc.compile.frontend.modules import spec_sha256
-from stlc.controller.evaluation.executed import as_foreseen
+from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.training.run import SPEC, SYSTEM, read_library
 from stlc.files import atomic_path, read_source
 from stlc.grammar import ast
@@ -57,7 +57,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
             "t0": recording.t0,
             "plan_rho": recording.rho,
             "policy_rho": recording.policy_rho,
-            "foreseen": as_foreseen(run.task, recording).astype(np.int8),
+            "foreseen": model_consistent(run.task, recording).astype(np.int8),
             "seed": np.array(setting.seeds)[rows // recording.agents],
             "agent": rows % recording.agents,
         },

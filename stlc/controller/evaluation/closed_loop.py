@@ -16,10 +16,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, SimulationStep, drive
+from stlc.controller.deployment.simulator import (
+    DeploymentRecording,
+    Recorder,
+    Setting,
+    SimulationStep,
+    simulate,
+)
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
-from stlc.controller.evaluation.rules import Rules, drives_of_plans, obeying, rules_of, verdict_on_drives
+from stlc.controller.evaluation.rules import Rules, judge_runs_by_plans, obeying, rules_of, verdict_on_runs
 from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.config import DRIVES
@@ -53,7 +59,7 @@ class Share:
 
     Attributes:
         guard: its name.
-        drives: number of runs, one agent over one seed each.
+        runs: number of runs, one agent over one seed each.
         satisfied: runs that satisfy the mission: the system's rules (`test: judge`), else the specification.
         safe: runs that satisfy its requirements tagged `@safety`; None where it has none.
         compared: runs that were also made without a guard from the same starts.
@@ -62,7 +68,7 @@ class Share:
     """
 
     guard: Mode
-    drives: int
+    runs: int
     satisfied: int
     safe: int | None
     compared: int = 0
@@ -72,24 +78,24 @@ class Share:
     @property
     def share(self) -> float:
         """Share of runs that satisfy the mission."""
-        return self.satisfied / self.drives
+        return self.satisfied / self.runs
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 % Wilson interval of the share."""
-        return wilson(self.share, self.drives)
+        return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
         """True if this guard is better by more than `NEAR`, with high probability where runs are few."""
         better = self.share > other.share + NEAR
-        return better and (self.drives >= LEAST or _superiority(self, other, NEAR) >= SURE)
+        return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
     def summary(self) -> dict[str, object]:
         """Entry for JSON documents."""
-        safe = None if self.safe is None else self.safe / self.drives
+        safe = None if self.safe is None else self.safe / self.runs
         return {
             "guard": self.guard,
-            "drives": self.drives,
+            "drives": self.runs,
             "satisfied": self.satisfied,
             "share": self.share,
             "interval": list(self.interval),
@@ -145,7 +151,7 @@ def _superiority(first: Share, second: Share, by: float) -> float:
     grid = np.linspace(0.0, 1.0, 2001)
     mass = []
     for share in (first, second):
-        density = grid**share.satisfied * (1.0 - grid) ** (share.drives - share.satisfied)
+        density = grid**share.satisfied * (1.0 - grid) ** (share.runs - share.satisfied)
         mass.append(density / density.sum())
     below = np.interp(grid + by, grid, np.cumsum(mass[0]))
     return float(((1.0 - below) * mass[1]).sum())
@@ -193,22 +199,22 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
     try:
         rules = rules_of(run)
         trial = _Trial(run, rules, left, most, seed)
-        trial.drive()
+        trial.simulate()
     except StlcError as error:
         return ClosedLoop((), test.steps, why=error.diagnostics[0].message)
     return ClosedLoop(trial.shares(), test.steps, None if rules is None else rules.name)
 
 
-def fresh_share(run: Run, guard: Mode, drives: int, seed: int = 0) -> Share:
-    """Simulate at least `drives` runs under one guard without time limit, with the seeds of `simulate`.
+def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
+    """Simulate at least `runs` runs under one guard without time limit, with the seeds of `simulate`.
 
     Raises:
         SystemFileError: the world fails. SpecError: the rules do not fit.
     """
-    trial = _Trial(run, rules_of(run), lambda: 1e9, drives, seed)
+    trial = _Trial(run, rules_of(run), lambda: 1e9, runs, seed)
     agents = trial.test.agents
-    seeds = tuple(range(seed, seed + -(-drives // agents)))
-    good, safe = trial._judged(trial._driven(guard, seeds, agents, share=1.0))
+    seeds = tuple(range(seed, seed + -(-runs // agents)))
+    good, safe = trial._judged(trial._simulated(guard, seeds, agents, share=1.0))
     return Share(guard, len(good), int(good.sum()), None if safe is None else int(safe.sum()))
 
 
@@ -224,7 +230,7 @@ class _Trial:
         self.test = self.task.system.decl.test
         self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
 
-    def drive(self) -> None:
+    def simulate(self) -> None:
         """Simulate seeds until every share is known well enough or the time is over."""
         while (mode := self._next()) is not None:
             self._more(mode)
@@ -239,11 +245,11 @@ class _Trial:
                 break
             if not known.seeds and not known.given_up:
                 return mode
-        driven = {mode: known for mode, known in self.known.items() if known.seeds and not known.given_up}
-        best = max((known.share for known in driven.values()), default=0.0)
+        simulated = {mode: known for mode, known in self.known.items() if known.seeds and not known.given_up}
+        best = max((known.share for known in simulated.values()), default=0.0)
         wide = {
             mode: known.interval[1] - known.interval[0]
-            for mode, known in driven.items()
+            for mode, known in simulated.items()
             if known.interval[1] >= best and len(known.found) < self.most
         }
         if not wide:
@@ -265,7 +271,7 @@ class _Trial:
         seeds = tuple(range(self.seed + known.seeds, self.seed + known.seeds + count))
         whole = self.left()
         try:
-            recording = self._driven(mode, seeds, known.agents, share=1.0 if known.seeds else 0.5)
+            recording = self._simulated(mode, seeds, known.agents, share=1.0 if known.seeds else 0.5)
         except _LateError:
             known.given_up = bool(known.seeds) or known.agents == 1 or self.left() <= 0.0
             known.agents = max(1, known.agents // FEWER)
@@ -277,19 +283,19 @@ class _Trial:
         known.cost = (whole - self.left()) / count
         known.seeds += count
 
-    def _driven(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
+    def _simulated(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
         """Completed runs. Raises _LateError where they would take more than `share` of the remaining time."""
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
-        begun, recorder = self.left(), Recorder(agents, pictured=False)
+        whole, recorder = self.left(), Recorder(agents, pictured=False)
 
         def watch(moment: SimulationStep) -> None:
-            spent = begun - self.left()
-            hopeless = moment.step >= 3 and spent * moment.steps / moment.step > 1.5 * max(begun, 0.0)
-            if self.left() <= 0.0 or spent > share * begun or hopeless:
+            spent = whole - self.left()
+            hopeless = moment.step >= 3 and spent * moment.steps / moment.step > 1.5 * max(whole, 0.0)
+            if self.left() <= 0.0 or spent > share * whole or hopeless:
                 raise _LateError
 
-        drive(guard, self.make, setting, recorder, watch)
+        simulate(guard, self.make, setting, recorder, watch)
         recording = recorder.recording()
         assert recording is not None
         return recording
@@ -298,10 +304,10 @@ class _Trial:
         """Masks of runs that satisfy the mission, and of those that satisfy its `@safety` requirements."""
         rows = len(recording.states)
         if self.rules is None:
-            executed = judge_executed(self.task, recording, savable=np.ones(rows, dtype=bool))
-            drives = drives_of_plans(executed.rules, executed.savable, self.task.dt)
-            return drives.obeyed, executed.agents(executed.safety) if executed.safety else None
-        verdict = verdict_on_drives(self.rules, self.task, recording)
+            executed = judge_executed(self.task, recording, viable=np.ones(rows, dtype=bool))
+            runs = judge_runs_by_plans(executed.rules, executed.viable, self.task.dt)
+            return runs.obeyed, executed.agents(executed.safety) if executed.safety else None
+        verdict = verdict_on_runs(self.rules, self.task, recording)
         found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
         names = [rule.name for rule in verdict.subject.compiled.safety]
         safe = obeying({name: found[name] for name in names}, rows) if names else None
@@ -319,7 +325,7 @@ class _Trial:
             shares.append(
                 Share(
                     mode,
-                    drives=len(known.found),
+                    runs=len(known.found),
                     satisfied=sum(good for good, _ in known.found.values()),
                     safe=None if None in safe else sum(map(bool, safe)),
                     compared=0 if mode == "none" else len(both),

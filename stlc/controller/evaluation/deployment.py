@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
-from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
+from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans, runs_json
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES, Limits, Mode
 from stlc.controller.guard.feasibility import solvable
@@ -47,7 +47,7 @@ class Unsafe:
 
     seed: int
     agent: int
-    savable: bool
+    viable: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Deployment:
         decisions: share of decisions by source; for the backup by T0 ("backup T0=1").
         latency: time of one decision.
         unsafe: the agents with an unsafe trajectory.
-        drives: verdicts of the rules for closed-loop runs.
+        runs: verdicts of the rules for closed-loop runs.
     """
 
     guard: Mode
@@ -71,7 +71,7 @@ class Deployment:
     decisions: Mapping[str, float]
     latency: DecisionLatency
     unsafe: tuple[Unsafe, ...]
-    drives: Drives
+    runs: RunVerdicts
 
 
 class InterruptedDeploymentError(Exception):
@@ -103,7 +103,7 @@ def deploy(
     guarded = Guard(task, policy, guard, limits=limits)
     recorder = Recorder(setting.agents)
     try:
-        drive(guarded, make, setting, recorder, watch)
+        simulate(guarded, make, setting, recorder, watch)
         recording = recorder.recording()
         assert recording is not None
         return judged(guarded, recording, setting.ceiling, rules)
@@ -119,10 +119,10 @@ def judged(
     Without `rules` a run is judged by the plans' specification from every start.
     """
     executed = judge_executed(guard.task, recording)
-    drives = (
-        drives_of_plans(executed.rules, executed.savable, guard.task.dt)
+    runs = (
+        judge_runs_by_plans(executed.rules, executed.viable, guard.task.dt)
         if rules is None
-        else judge_drives(rules, guard.task, recording, executed.savable)
+        else judge_runs(rules, guard.task, recording, executed.viable)
     )
     return Deployment(
         guard.mode,
@@ -131,14 +131,14 @@ def judged(
         decided(recording),
         latency(guard, recording),
         unsafe_agents(executed, recording.agents),
-        drives,
+        runs,
     )
 
 
 def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
     """Agents with an unsafe trajectory; `agents`: number per seed."""
     rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
-    return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
+    return tuple(Unsafe(*divmod(row, agents), bool(executed.viable[row])) for row in rows)
 
 
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
@@ -173,11 +173,11 @@ def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY
     picked, seconds, stop = np.random.default_rng(0).permutation(picked), [], perf_counter() + LATENCY_SECONDS
     for row, step in zip(picked // steps, picked % steps, strict=True):
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
-        begun = guard.decide(before).later()
+        previous = guard.decide(before).later()
         begin = perf_counter()
         if recording.options is not None:
-            guard.prefer(torch.from_numpy(recording.options[row, step])[None], begun)
-        guard.decide(now, begun)
+            guard.prefer(torch.from_numpy(recording.options[row, step])[None], previous)
+        guard.decide(now, previous)
         seconds.append(perf_counter() - begin)
         if perf_counter() > stop:
             break
@@ -202,11 +202,11 @@ def as_json(
         "guards": {
             name: {
                 "metrics": {key: metric.summary() for key, metric in found.metrics.items()},
-                "drives": drives_json(found.drives, setting.seeds, setting.agents),
+                "drives": runs_json(found.runs, setting.seeds, setting.agents),
                 "units": dict(found.recording.units),
                 "decisions": dict(found.decisions),
                 "unsafe": [
-                    {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.savable}
+                    {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.viable}
                     for each in found.unsafe
                 ],
                 "latency": {

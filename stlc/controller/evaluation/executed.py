@@ -35,50 +35,50 @@ class Executed:
     Attributes:
         rules: requirement -> satisfaction, (starts, rows); one start where it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        foreseen: (starts, rows), whether the window is model-consistent.
-        quiet: (starts, rows), whether the window has no exogenous event (the true dynamics alone, even if the
-            model is wrong); None where not recorded.
-        savable: (rows,), viable: the run is safe, or a safe plan from its first state is known.
+        consistent: (starts, rows), whether the window is model-consistent.
+        eventless: (starts, rows), whether the window has no exogenous event: the true dynamics alone acted,
+            even if the model is wrong; None where not recorded.
+        viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
     """
 
     rules: Mapping[str, Mask]
     safety: tuple[str, ...]
-    foreseen: Mask
-    savable: Mask
-    quiet: Mask | None = None
+    consistent: Mask
+    viable: Mask
+    eventless: Mask | None = None
 
     def agents(self, names: Sequence[str]) -> Mask:
         """Agents that satisfy all of `names` at all starts, (rows,)."""
         held = [self.rules[name].all(0) for name in names]
-        return np.logical_and.reduce(held) if held else np.ones(self.foreseen.shape[1], dtype=bool)
+        return np.logical_and.reduce(held) if held else np.ones(self.consistent.shape[1], dtype=bool)
 
     def starts(self, names: Sequence[str]) -> Mask:
         """Starts where all of `names` hold, (starts, rows); requirements without T count at every start."""
-        held = np.ones_like(self.foreseen)
+        held = np.ones_like(self.consistent)
         for name in names:
             held &= self.rules[name][: len(held)] if len(self.rules[name]) > 1 else self.rules[name]
         return held
 
 
-def judge_executed(task: Task, recording: DeploymentRecording, *, savable: Mask | None = None) -> Executed:
+def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask | None = None) -> Executed:
     """Judge a recording at every sample from which a whole horizon fits; a shorter one has no such sample.
 
-    `savable`: (rows,), starts with a known safe plan; a search finds them if not given.
+    `viable`: (rows,), starts with a known safe plan; a search finds them if not given.
     """
     columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
     starts = max(recording.steps + 1 - task.horizon, 0)
-    rules = {rule.name: _held(as_driven(rule, task), columns, task.horizon) for rule in task.rules}
+    rules = {rule.name: _held(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)
-    found = savable
+    found = viable
     if found is None:
         found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
-    quiet = None if recording.quiet is None else _throughout(recording.quiet, task, starts)
-    foreseen = _throughout(as_foreseen(task, recording), task, starts)
-    executed = Executed(rules, safety, foreseen, found, quiet)
-    return replace(executed, savable=found | executed.agents(safety))
+    eventless = None if recording.eventless is None else _throughout(recording.eventless, task, starts)
+    consistent = _throughout(model_consistent(task, recording), task, starts)
+    executed = Executed(rules, safety, consistent, found, eventless)
+    return replace(executed, viable=found | executed.agents(safety))
 
 
-def as_driven(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
+def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
     """Requirement as it judges a whole run: one on the mission clock is evaluated once, as written."""
     if not rule.absolute:
         return rule
@@ -106,7 +106,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
     return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
 
 
-def as_foreseen(task: Task, recording: DeploymentRecording) -> Mask:
+def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
     """Model-consistent steps, (rows, steps) booleans."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)

@@ -37,7 +37,7 @@ class Seed:
         safe_agents: (agents,), the same for the safety requirements.
         viable: (agents,), whether the run is safe, or a search finds a safe plan from its first state.
         consistent: whether the window of each start is model-consistent.
-        quiet: whether there was no exogenous event in it; None where not recorded.
+        eventless: whether its window has no exogenous event; None where not recorded.
         searched: visited states that were searched for a plan; None where none was.
         feasible: visited states with a known satisfying plan.
     """
@@ -51,7 +51,7 @@ class Seed:
     safe_agents: Mask
     viable: Mask
     consistent: Mask
-    quiet: Mask | None = None
+    eventless: Mask | None = None
     searched: Mask | None = None
     feasible: Mask | None = None
 
@@ -93,8 +93,8 @@ class Metric:
         return float(counted.mean()) if counted.size else math.nan
 
 
-def _quiet_and_viable(seed: Seed) -> Mask | None:
-    return None if seed.quiet is None else seed.quiet & seed.of_viable
+def _eventless_and_viable(seed: Seed) -> Mask | None:
+    return None if seed.eventless is None else seed.eventless & seed.of_viable
 
 
 _ALL = (
@@ -205,14 +205,14 @@ _ALL = (
         "quiet",
         "no exogenous event, starts",
         "share of starts through whose window there was no exogenous event",
-        lambda seed: seed.quiet,
+        lambda seed: seed.eventless,
     ),
     Metric(
         "quiet_safe_starts",
         "safe, starts without exogenous event",
         "share of those of viable agents from which the drive satisfies the requirements tagged @safety",
         lambda seed: seed.safe,
-        _quiet_and_viable,
+        _eventless_and_viable,
         safety=True,
     ),
 )
@@ -257,9 +257,9 @@ def _of_seed(
         safe=executed.starts(safety)[:, own],
         satisfied_agents=executed.agents(names)[own],
         safe_agents=executed.agents(safety)[own],
-        viable=executed.savable[own],
-        consistent=executed.foreseen[:, own],
-        quiet=None if executed.quiet is None else executed.quiet[:, own],
+        viable=executed.viable[own],
+        consistent=executed.consistent[:, own],
+        eventless=None if executed.eventless is None else executed.eventless[:, own],
         searched=None if feasible is None else np.isfinite(feasible[own]),
         feasible=None if feasible is None else feasible[own] == 1.0,
     )

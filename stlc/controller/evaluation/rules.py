@@ -112,7 +112,7 @@ class Broken:
 
 
 @dataclass(frozen=True, slots=True)
-class Drives:
+class RunVerdicts:
     """Verdicts on closed-loop runs, one agent over one seed each.
 
     Attributes:
@@ -203,7 +203,7 @@ def rules_of(run: Run) -> Rules | None:
     decl = run.task.system.decl
     judge, overrides = decl.test.judge, decl.overrides
     if (run.dir.path / _INDEX).is_file():
-        return None if judge is None else _kept(run.dir, judge, overrides)
+        return None if judge is None else _copied(run.dir, judge, overrides)
     if judge is None:
         judge = _named_since(run.dir, decl)
     if judge is None:
@@ -212,7 +212,7 @@ def rules_of(run: Run) -> Rules | None:
     return Rules(spec, str(judge.path), _own(spec, overrides))
 
 
-def _kept(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rules:
+def _copied(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rules:
     index = folder.read_json(_INDEX)
     if isinstance(index, dict) and judge.written not in index:
         spec = read_rules(judge)
@@ -257,35 +257,35 @@ def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
 # ----------------------------------------------------------------------- verdicts
 
 
-def judge_drives(
-    rules: Rules, task: Task, recording: DeploymentRecording, savable: NDArray[np.bool_]
-) -> Drives:
+def judge_runs(
+    rules: Rules, task: Task, recording: DeploymentRecording, viable: NDArray[np.bool_]
+) -> RunVerdicts:
     """Judge every run from its first sample to its last.
 
     Args:
         rules: specification of the runs.
         task: gives state names, time step and external functions.
         recording: the runs.
-        savable: (rows,), whether a safe plan from the start is known.
+        viable: (rows,), whether a safe plan from the start is known.
 
     Raises:
         SpecError: the rules do not fit the recording.
     """
-    verdict = verdict_on_drives(rules, task, recording)
+    verdict = verdict_on_runs(rules, task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
     safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
     broken = tuple(
-        replace(each, lost=_lost(each, safety, task, recording, bool(savable[each.row])))
+        replace(each, lost=_lost(each, safety, task, recording, bool(viable[each.row])))
         for each in _broken(verdict, found)
     )
-    viable = savable.copy()
+    viable = viable.copy()
     for each in broken:
         viable[each.row] = not each.excused
-    return Drives(found, broken, viable | obeying(found, len(savable)))
+    return RunVerdicts(found, broken, viable | obeying(found, len(viable)))
 
 
-def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
-    """Verdict on every run from its first sample to its last; raises SpecError like `judge_drives`."""
+def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
+    """Verdict on every run from its first sample to its last; raises SpecError like `judge_runs`."""
     outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
     decl = task.system.decl
     monitor = Monitor(
@@ -300,18 +300,18 @@ def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) 
 
 
 def _lost(
-    broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, savable: bool
+    broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
 ) -> Lost | None:
     """Time and cause of a loss, for the first broken rule tagged `@safety`, else the first broken one."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
-    looked = [time for time in times if time is not None]
-    if not looked:  # time not located: decided by the start alone
-        known = savable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
+    located = [time for time in times if time is not None]
+    if not located:  # time not located: decided by the start alone
+        known = viable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
         return None if known else Lost("start", 0.0)
     dt = float(task.system.decl.dt)
-    last = min(round(min(looked) / dt), recording.steps)
+    last = min(round(min(located) / dt), recording.steps)
     good = recording.safe[row] if unsafe else recording.rho[row] >= -TOLERANCE
     followed = np.flatnonzero(good[: last + 1])
     since = int(followed[-1]) + 1 if len(followed) else 0  # no satisfying plan is followed from here on
@@ -323,8 +323,8 @@ def _lost(
         return Lost("missed", dt * (since + int(np.flatnonzero(solved)[-1])))
     if not since:
         return Lost("start", 0.0)
-    told = recording.quiet is not None and not recording.quiet[row, since - 1]
-    return Lost("told" if told else "later", dt * since)
+    event = recording.eventless is not None and not recording.eventless[row, since - 1]
+    return Lost("told" if event else "later", dt * since)
 
 
 def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
@@ -335,25 +335,27 @@ def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.b
     return found
 
 
-def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.bool_], dt: float) -> Drives:
+def judge_runs_by_plans(
+    held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
+) -> RunVerdicts:
     """Verdicts where runs are judged by the plans' specification: requirement -> (starts, rows) booleans.
 
     A requirement is obeyed if it holds at every start; it is broken at the first start where it does not.
     """
     rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
-    rules |= {name: np.full(len(savable), "inconclusive") for name, starts in held.items() if not len(starts)}
-    names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(savable))}
+    rules |= {name: np.full(len(viable), "inconclusive") for name, starts in held.items() if not len(starts)}
+    names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(viable))}
     first = {name: starts.argmin(0) * dt for name, starts in held.items() if len(starts)}
     broken = (
         Broken(
             row,
             {name: float(first[name][row]) for name in each},
-            None if savable[row] else Lost("start", 0.0),
+            None if viable[row] else Lost("start", 0.0),
         )
         for row, each in names.items()
         if each
     )
-    return Drives(rules, tuple(broken), savable | obeying(rules, len(savable)))
+    return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)))
 
 
 def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:
@@ -376,40 +378,40 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 # ------------------------------------------------------------------------- JSON
 
 
-def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, Any]:
+def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
     """The entry `drives` of a guard in `eval/simulate.json`.
 
     Of `count` runs `obeyed` satisfy every rule and `undecided` are inconclusive; `lost` of the others were
-    lost (`Drives.viable`): `told` of them to a later exogenous event, the others from the start. `rules`: the
-    same per rule. `broken`: run, rules and times (seconds from the start, null where not located), and
-    `cause`: since when no plan is known and why (`Lost`).
+    lost (`RunVerdicts.viable`): `told` of them to a later exogenous event, the others from the start.
+    `rules`: the same per rule. `broken`: run, rules and times (seconds from the start, null where not
+    located), and `cause`: since when no plan is known and why (`Lost`).
     """
-    obeyed, rows = drives.obeyed, len(drives.viable)
-    violated = _violating(drives.rules, rows)
+    obeyed, rows = runs.obeyed, len(runs.viable)
+    violated = _violating(runs.rules, rows)
     return {
         "count": rows,
         "obeyed": int(obeyed.sum()),
         "undecided": int((~obeyed & ~violated).sum()),
-        "lost": int((~drives.viable).sum()),
-        "told": sum(each.lost is not None and each.lost.why == "told" for each in drives.broken),
+        "lost": int((~runs.viable).sum()),
+        "told": sum(each.lost is not None and each.lost.why == "told" for each in runs.broken),
         "rules": {
             name: {
                 "obeyed": int((statuses == "satisfied").sum()),
                 "broken": int((statuses == "violated").sum()),
                 "undecided": int((statuses == "inconclusive").sum()),
             }
-            for name, statuses in drives.rules.items()
+            for name, statuses in runs.rules.items()
         },
         "broken": [
             {
                 "seed": seeds[each.row // agents],
                 "agent": each.row % agents,
-                "lost": not bool(drives.viable[each.row]),
+                "lost": not bool(runs.viable[each.row]),
                 "rules": dict(each.rules),
                 "cause": None
                 if each.lost is None
                 else {"why": each.lost.why, "time": round(each.lost.time, 9)},
             }
-            for each in drives.broken
+            for each in runs.broken
         ],
     }

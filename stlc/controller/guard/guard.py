@@ -104,7 +104,7 @@ class Guard:
             self.backup = StagedSearch(self.strict, self.policy, mode, grid=grid, limits=limits)
 
     @torch.no_grad()
-    def decide(self, x: Tensor, begun: GuardDecision | None = None) -> GuardDecision:
+    def decide(self, x: Tensor, previous: GuardDecision | None = None) -> GuardDecision:
         """Decide for (agents, n) states; verdicts are computed in float64.
 
         A previous plan that still satisfies the specification is kept where the new one is no better;
@@ -113,18 +113,18 @@ class Guard:
 
         Args:
             x: (agents, n) states.
-            begun: remainder of the previous decision; see `GuardDecision.later`.
+            previous: remainder of the previous decision; see `GuardDecision.later`.
 
         Returns:
             The decision. Mode "none" passes a non-finite plan on, with robustness -inf.
         """
         x = x.to(torch.float64)
         fresh, judged = self.policy.plan_judged(x)
-        found = self._kept(x, begun, fresh, judged)
+        found = self._with_previous(x, previous, fresh, judged)
         failing = torch.nonzero(~found.satisfies).squeeze(1)
         if self.backup is not None and len(failing):
-            previous = None if begun is None else begun.plan[failing]
-            found.put(failing, self.backup.search(x[failing], fresh[failing], previous))
+            rest_plans = None if previous is None else previous.plan[failing]
+            found.put(failing, self.backup.search(x[failing], fresh[failing], rest_plans))
         decision = GuardDecision(
             found.plans[:, 0],
             found.plans,
@@ -144,12 +144,12 @@ class Guard:
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
     @torch.no_grad()
-    def endangered(self, x: Tensor, begun: GuardDecision, steps: int | Tensor) -> Tensor:
+    def endangered(self, x: Tensor, previous: GuardDecision, steps: int | Tensor) -> Tensor:
         """Agents whose previous plan, by the model, violates safety requirements in its next steps.
 
         Args:
             x: (agents, n) states.
-            begun: remainder of the previous decision.
+            previous: remainder of the previous decision.
             steps: number of steps to check, one number or (agents,).
 
         Returns:
@@ -158,16 +158,16 @@ class Guard:
         formulas = [rule.formula for rule in self.strict.compiled.safety]
         if self.mode != "full" or not formulas:
             return torch.zeros(len(x), dtype=torch.bool)
-        columns = self.strict.system.rollout_columns(x.to(torch.float64), begun.plan.to(torch.float64))
+        columns = self.strict.system.rollout_columns(x.to(torch.float64), previous.plan.to(torch.float64))
         return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)
 
     @torch.no_grad()
-    def prefer(self, options: Tensor, begun: GuardDecision | None = None) -> Tensor:
+    def prefer(self, options: Tensor, previous: GuardDecision | None = None) -> Tensor:
         """Option with the best plan for each agent; the first of equals.
 
         Args:
             options: (agents, k, n) states; option 0 is the present state.
-            begun: remainder of the previous decision, which belongs to option 0.
+            previous: remainder of the previous decision, which belongs to option 0.
 
         Returns:
             (agents,) int64.
@@ -176,8 +176,8 @@ class Guard:
         options = options.to(torch.float64)
         _, judged = self.policy.plan_judged(options.flatten(0, 1))
         score = self._score(judged).view(agents, count)
-        if begun is not None:
-            rest = self._score(self.strict.judge(options[:, 0], begun.plan))
+        if previous is not None:
+            rest = self._score(self.strict.judge(options[:, 0], previous.plan))
             score[:, 0] = torch.maximum(score[:, 0], rest)
         return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
 
@@ -185,12 +185,12 @@ class Guard:
         return rank(judged.rho, self.strict.cost(judged), judged.safe)
 
     @torch.no_grad()
-    def carried_on(self, x: Tensor, begun: GuardDecision, taken: Tensor) -> GuardDecision:
+    def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
         """Remainders of plans for (agents, n) states, extended by the policy at their ends.
 
         `taken`: executed steps per agent, (agents,); as many held actions at the end are replaced.
         """
-        x, plan = x.to(torch.float64), begun.plan.clone()
+        x, plan = x.to(torch.float64), previous.plan.clone()
         length = plan.shape[1]
         for steps in dict.fromkeys(taken.tolist()):
             rows = torch.nonzero(taken == steps).squeeze(1)
@@ -200,20 +200,20 @@ class Guard:
             end = self.task.rollout(x[rows], plan[rows, :left])[:, -1]
             tail = finite(self.policy.plan(end).to(plan.dtype), self.task)
             plan[rows] = torch.cat((plan[rows, :left], tail[:, : length - left]), 1)
-        return replace(begun, plan=plan, action=plan[:, 0])
+        return replace(previous, plan=plan, action=plan[:, 0])
 
-    def _kept(
-        self, x: Tensor, begun: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
+    def _with_previous(
+        self, x: Tensor, previous: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
         """The policy's plans, or the previous ones where they are kept."""
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
-        if begun is None:
+        if previous is None:
             return found
-        rest = self.strict.judge(x, begun.plan)
+        rest = self.strict.judge(x, previous.plan)
         better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
         keep = ((better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)).nonzero()[:, 0]
-        before = Candidates(begun.plan, rest.rho, rest.safe, found.cost, begun.source, begun.t0)
+        before = Candidates(previous.plan, rest.rho, rest.safe, found.cost, previous.source, previous.t0)
         found.put(keep, before.of(keep))
         return found
 

@@ -91,8 +91,8 @@ class Validation:
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
         """Shares of satisfying plans among those judged."""
-        shares = satisfied(judged.requirements).double().mean(0).tolist()
-        return cls(float(satisfied(judged.rho).double().mean()), tuple(shares))
+        shares = satisfied(judged.requirements).double().mean(0)
+        return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
 
     def mean(self, ranks: Ranks) -> Validation:
         """The validation over all ranks: means of shares, sums of counts."""

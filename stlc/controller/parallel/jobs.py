@@ -73,7 +73,7 @@ class JobResult:
 class Executor(Protocol):
     """Executor of jobs, on this machine or on others."""
 
-    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = ...) -> Iterator[JobResult]:
+    def run(self, jobs: Sequence[Job], started: Callable[[Job], None] = ...) -> Iterator[JobResult]:
         """Run jobs and give the result of each as it ends.
 
         When the caller is interrupted or closes the iterator, every process is asked to save and stop, and
@@ -81,7 +81,7 @@ class Executor(Protocol):
 
         Args:
             jobs: in order.
-            begun: called as each starts.
+            started: called as each job starts.
         """
 
 
@@ -98,12 +98,14 @@ class LocalExecutor:
     lock: threading.Lock = field(default_factory=threading.Lock)
     shares: SimpleQueue[frozenset[int]] = field(default_factory=SimpleQueue)
 
-    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
-        """Run jobs and yield the result of each as it ends; `begun` is called in another thread."""
+    def run(
+        self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
+    ) -> Iterator[JobResult]:
+        """Run jobs and yield the result of each as it ends; `started` is called in another thread."""
         for share in core_shares(self.workers):
             self.shares.put(share)
         with ThreadPoolExecutor(self.workers) as pool, leaving(self.kill):
-            futures = [pool.submit(self.send, job, begun) for job in jobs]
+            futures = [pool.submit(self.send, job, started) for job in jobs]
             try:
                 for future in as_completed(futures):
                     yield future.result()
@@ -113,14 +115,14 @@ class LocalExecutor:
                 self.stop()
                 raise
 
-    def send(self, job: Job, begun: Callable[[Job], None]) -> JobResult:
+    def send(self, job: Job, started: Callable[[Job], None]) -> JobResult:
         """Run one job to its end."""
         share = self.shares.get()
         try:
             process = self._start(job, share)
             if process is None:
                 return JobResult(job, -signal.SIGINT, None, "", len(share))
-            begun(job)
+            started(job)
             out, said = process.communicate()
             with self.lock:
                 self.live.discard(process)

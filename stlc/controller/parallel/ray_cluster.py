@@ -36,7 +36,9 @@ class RayExecutor:
     cores: int = 1
     gpus: int = 0
 
-    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
+    def run(
+        self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
+    ) -> Iterator[JobResult]:
         """Run jobs, each with its folder of runs, and yield the result of each as it ends.
 
         When the caller is interrupted or closes the iterator, saved results are fetched.
@@ -51,7 +53,7 @@ class RayExecutor:
             for job in jobs:
                 bundle = JobBundle.of(job, self.cores)
                 going[remote.remote(bundle)] = _Sent(job, bundle)
-                begun(job)
+                started(job)
             while going:
                 (done, *_), _ = ray.wait(list(going))
                 yield _received(ray, done, going.pop(done))

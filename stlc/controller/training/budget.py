@@ -79,13 +79,13 @@ class TimeBudget:
 
     Attributes:
         now: the clock, in seconds.
-        begun: its reading at the start, moved back by the time of earlier sessions of the run.
+        started: its reading at the start, moved back by the time of earlier sessions of the run.
         allowed: the user's budget in seconds; 0: unlimited.
         seconds: the part of it available to the training.
     """
 
     now: Callable[[], float]
-    begun: float
+    started: float
     allowed: float
     seconds: float
 
@@ -93,18 +93,18 @@ class TimeBudget:
     def of(
         cls,
         now: Callable[[], float],
-        begun: float,
+        started: float,
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
         """Budget reduced by the predicted overrun `late` of what surrounds the training, in seconds."""
         over = late(allowed) if allowed and late is not None else 0.0
-        return cls(now, begun, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
+        return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
 
     @property
     def spent(self) -> float:
         """Seconds since the start."""
-        return self.now() - self.begun
+        return self.now() - self.started
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,19 +190,19 @@ class Pace:
         self._every = every
         self._searching = searching
         self._seconds = seconds
-        self._begun = now
+        self._started = now
         self._apart = 0.0
-        self._since_look = 0.0
+        self._since_validation = 0.0
         self._marks: deque[tuple[int, float]] = deque()
         self._rounds: deque[float] = deque(maxlen=ROUNDS)
         self._search = FIRST_SEARCH * every if searching else 0.0
-        self._last_look: int | None = None
+        self._last_validation: int | None = None
         self._running = False
         self._left: float | None = None
 
     def stepped(self, step: int, now: float, *, search_runs: bool) -> None:
         """Record the end of gradient step `step` at `now`, and whether the search still runs."""
-        self._marks.append((step, now - self._begun - self._apart))
+        self._marks.append((step, now - self._started - self._apart))
         least = max(WINDOW * self._seconds, 1.0)
         while len(self._marks) > FIRST + 1 and self._marks[-1][1] - self._marks[1][1] >= least:
             self._marks.popleft()
@@ -212,21 +212,21 @@ class Pace:
     def searched(self, step: int, waited: float) -> None:
         """Record the end of the search at `step`, after `waited` seconds of waiting for it."""
         self._apart += waited
-        if self._running and self._last_look is not None and self.per_step > 0.0:
-            self._search = step - self._last_look + waited / self.per_step
+        if self._running and self._last_validation is not None and self.per_step > 0.0:
+            self._search = step - self._last_validation + waited / self.per_step
         self._running = False
 
     def saved(self, seconds: float) -> None:
         """Record the duration of a checkpoint."""
         self._apart += seconds
-        self._since_look += seconds
+        self._since_validation += seconds
 
-    def looked(self, step: int, seconds: float) -> None:
+    def validated(self, step: int, seconds: float) -> None:
         """Record the duration of a search round at `step`, which has started a search."""
         self.saved(seconds)
         if self.per_step > 0.0:
-            self._rounds.append(self._since_look / self.per_step)
-        self._since_look, self._last_look, self._running = 0.0, step, self._searching
+            self._rounds.append(self._since_validation / self.per_step)
+        self._since_validation, self._last_validation, self._running = 0.0, step, self._searching
 
     @property
     def per_step(self) -> float:
@@ -236,22 +236,22 @@ class Pace:
         (first, then), (last, now) = self._marks[0], self._marks[-1]
         return max(now - then, 0.0) / (last - first)
 
-    def remaining(self, step: int, steps: int, next_look: int) -> float:
-        """Predicted seconds from `step` to the end at `steps`, with the next round at `next_look`."""
+    def remaining(self, step: int, steps: int, next_validation: int) -> float:
+        """Predicted seconds from `step` to the end at `steps`, with the next round at `next_validation`."""
         if steps < step:
             return 0.0
-        looks = max(0, -(-(steps - next_look) // self._every))
-        last = next_look + (looks - 1) * self._every
+        rounds = max(0, -(-(steps - next_validation) // self._every))
+        last = next_validation + (rounds - 1) * self._every
         round_ = sum(self._rounds) / max(1, len(self._rounds))
         # each round, and the end, waits for the search of the round before, if that still runs
-        waits = max(0, looks - 1) * max(0.0, self._search - self._every)
-        if looks and self._running and self._last_look is not None:
-            waits += max(0.0, self._search - (next_look - self._last_look))
-        if looks or self._running:
+        waits = max(0, rounds - 1) * max(0.0, self._search - self._every)
+        if rounds and self._running and self._last_validation is not None:
+            waits += max(0.0, self._search - (next_validation - self._last_validation))
+        if rounds or self._running:
             waits += max(0.0, self._search - (steps - last))
-        return self.per_step * (steps - step + round_ * looks + waits)
+        return self.per_step * (steps - step + round_ * rounds + waits)
 
-    def plan(self, step: int, steps: int, next_look: int, left: float) -> int:
+    def plan(self, step: int, steps: int, next_validation: int, left: float) -> int:
         """Number of steps of a run with `left` seconds remaining; `steps` unchanged if the prediction fits.
 
         At least the steps already done, and at least one.
@@ -259,19 +259,19 @@ class Pace:
         cost = self.per_step
         if left > 0.0 and (cost <= 0.0 or (steps > step and not self._due(left))):
             return steps
-        missed = self.remaining(step, steps, next_look) - left
+        missed = self.remaining(step, steps, next_validation) - left
         if self.planned and abs(missed) <= max(TOLERANCE * self._seconds, SLACK * left):
             return steps
         self._left = left
         low, high = step, step + math.ceil(left / cost) if left > 0.0 else step
         while low < high:
             middle = (low + high + 1) // 2
-            if self.remaining(step, middle, next_look) <= left:
+            if self.remaining(step, middle, next_validation) <= left:
                 low = middle
             else:
                 high = middle - 1
-        over = self.remaining(step, low + 1, next_look) - left
-        under = left - self.remaining(step, low, next_look)
+        over = self.remaining(step, low + 1, next_validation) - left
+        under = left - self.remaining(step, low, next_validation)
         return max(low + 1 if 0.0 < over < under else low, 1)
 
     @property

@@ -75,8 +75,8 @@ class TrainingStep:
 
 def diagnose(step: TrainingStep) -> StlcError:
     """Find the first non-finite link of a training step, and its place."""
-    for look in (_plans, _motion, _robustness, _cost):
-        found = look(step)
+    for check in (_plans, _motion, _robustness, _cost):
+        found = check(step)
         if found is not None:
             return found
     return RunError(
@@ -130,13 +130,13 @@ def _robustness(step: TrainingStep) -> StlcError | None:
 
     An infinite value spoils the gradients of all requirements, so values are checked first.
     """
-    looks = [
+    checks = [
         _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
         for index in range(len(step.task.rules))
     ]
     for what, bad_of, way in _WRONG:
-        for rule, look in zip(step.task.rules, looks, strict=True):
-            row = _first(bad_of(*look))
+        for rule, check in zip(step.task.rules, checks, strict=True):
+            row = _first(bad_of(*check))
             if row is not None:
                 return RunError(
                     Diagnostic(

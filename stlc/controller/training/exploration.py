@@ -160,7 +160,7 @@ class Exploration:
         """
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         start = x.double().numpy(force=True)[None, None]
-        layers = [self._begun(start, np.empty((1, 0, len(self._low))))]
+        layers = [self._layer(start, np.empty((1, 0, len(self._low))))]
         layers += [layers[0].rows(np.empty(0, dtype=np.int64))] * self.task.horizon
         for sweep in range(sweeps):
             if sweep and enough():
@@ -249,9 +249,9 @@ class Exploration:
         piece, states = self._drawn(before, more, random), layer.states[chosen]
         with torch.no_grad():
             after = self.task.rollout(torch.from_numpy(states[:, -1]), torch.from_numpy(piece)).numpy()
-        return self._begun(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
+        return self._layer(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
-    def _begun(self, states: Numbers, plans: Numbers) -> Layer:
+    def _layer(self, states: Numbers, plans: Numbers) -> Layer:
         """Layer of the prefixes that may still satisfy the specification."""
         good = np.isfinite(states).all((1, 2))
         states, plans = states[good], plans[good]
@@ -313,12 +313,12 @@ class Exploration:
             parts.append((np.minimum((ends - low) / width, 1.0 - 1e-9) * cells).astype(np.int64))
         order = np.argsort(-layer.worth, kind="stable")
         _, first = np.unique(np.concatenate(parts, 1)[order], axis=0, return_index=True)
-        kept = order[first]
-        if len(kept) > KEPT:
-            kind = _numbered(layer.kind[kept])
-            weight = (1.0 + (layer.worth[kept] >= np.median(layer.worth[kept]))) / np.bincount(kind)[kind]
-            kept = random.choice(kept, KEPT, replace=False, p=weight / weight.sum())
-        return layer.rows(kept)
+        chosen = order[first]
+        if len(chosen) > KEPT:
+            kind = _numbered(layer.kind[chosen])
+            weight = (1.0 + (layer.worth[chosen] >= np.median(layer.worth[chosen]))) / np.bincount(kind)[kind]
+            chosen = random.choice(chosen, KEPT, replace=False, p=weight / weight.sum())
+        return layer.rows(chosen)
 
 
 def _numbered(kinds: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -39,7 +39,7 @@ class TrainingOutcome:
         ranks: number of processes that trained together.
         why: diagnosis of the conflicting requirements, where no plan was found for any start.
         steps: total number of steps.
-        driven: closed-loop results; None where not simulated.
+        simulated: closed-loop results; None where not simulated.
     """
 
     run: Run
@@ -49,7 +49,7 @@ class TrainingOutcome:
     ranks: int = 1
     why: Diagnostic | None = None
     steps: int = 0
-    driven: ClosedLoop | None = None
+    simulated: ClosedLoop | None = None
 
 
 @dataclass(slots=True)
@@ -86,25 +86,25 @@ class FinalEvaluation:
         self.writer.held_out(self.task, result)
         why = conflict(self.task, self._late) if result.feasible == 0.0 else None
         run = Run(self.writer.folder, self.task, policy)
-        driven = self._simulated(run) if why is None else None
+        simulated = self._simulated(run) if why is None else None
         found: dict[str, object] = {"seconds": self.time.spent}
         if why is not None:
             found |= {"why": why.message, "proved": refuted(self.task)}
-        found |= {} if driven is None else {"closed_loop": driven.summary()}
+        found |= {} if simulated is None else {"closed_loop": simulated.summary()}
         self.writer.close("finished", {**result.summary(), **found})
         seconds, ranks = self.time.spent, self.config.ranks
-        return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, driven=driven)
+        return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, simulated=simulated)
 
     def _simulated(self, run: Run) -> ClosedLoop | None:
         """Closed-loop results of the policy, within the remaining time."""
         if not self.config.drives:
             return None
-        time, begun = self.time, self.time.now()
+        time, started = self.time, self.time.now()
         if time.allowed:
-            end = time.begun + (1.0 + VERDICT_OVER) * time.seconds
-            end = max(end, begun + 0.5 * simulation_reserve(time.seconds))
+            end = time.started + (1.0 + VERDICT_OVER) * time.seconds
+            end = max(end, started + 0.5 * simulation_reserve(time.seconds))
         else:
-            end = begun + SIMULATION_SHARE * (begun - time.begun)
+            end = started + SIMULATION_SHARE * (started - time.started)
         return closed_loop(run, lambda: end - time.now(), self.config.drives)
 
     def _out_of_time(self) -> bool:
@@ -118,7 +118,7 @@ class FinalEvaluation:
     @property
     def _verdict_seconds(self) -> float:
         """Seconds left for the held-out evaluation; without budget a share of the duration of the steps."""
-        spent = self.trained - self.time.begun
+        spent = self.trained - self.time.started
         if not self.time.allowed:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)
         left = (1.0 + VERDICT_OVER) * self.time.seconds - self._for_simulations - spent

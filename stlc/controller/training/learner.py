@@ -334,7 +334,7 @@ class Trainer(Learner):
         if not self.ranks.first:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
             found["counts"] = torch.tensor(counts, dtype=torch.float64)
-        kept = len(self.buffer)
+        count = len(self.buffer)
         if isinstance(self.training, FixedSet):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
         found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
@@ -345,7 +345,7 @@ class Trainer(Learner):
             pending = {"states": self.repairing.states, "plans": self.repairing.plans}
             found.update({f"searching.{name}": value for name, value in pending.items()})
             found["searching.seed"] = torch.tensor(self.repairing.seed)
-        found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
+        found["buffer.states"], found["buffer.plans"] = self.buffer.states[:count], self.buffer.plans[:count]
         return found
 
     def facts(self) -> dict[str, float | int]:
@@ -374,18 +374,18 @@ class Trainer(Learner):
             index, name = key.split(".")
             layout["state"].setdefault(int(index), {})[name] = value
         self.optimizer.load_state_dict(layout)
-        kept = tensors["buffer.states"].shape[0]
-        self.buffer.states[:kept] = tensors["buffer.states"]
-        self.buffer.plans[:kept] = tensors["buffer.plans"]
+        count = tensors["buffer.states"].shape[0]
+        self.buffer.states[:count] = tensors["buffer.states"]
+        self.buffer.plans[:count] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
         self.supply.restore(_below(tensors, "supply"))
         if isinstance(self.training, FixedSet):
             self.training.restore(_below(tensors, "training"))
         if known := _below(tensors, "repairing"):
             self.repairing = Search.of(SearchResult(**known))
-        elif begun := _below(tensors, "searching"):
-            states, plans = begun["states"].to(self.device), begun["plans"].to(self.device)
-            self.repairing = self._begin(states, plans, int(begun["seed"]))
+        elif pending := _below(tensors, "searching"):
+            states, plans = pending["states"].to(self.device), pending["plans"].to(self.device)
+            self.repairing = self._begin(states, plans, int(pending["seed"]))
 
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
-BARREN_LOOKS, BARREN_SHARE = 5, 0.1
+BARREN_VALIDATIONS, BARREN_SHARE = 5, 0.1
 """Validations, and share of the steps, after which a search that never found a plan is given up.
 
 By then exploration has used its largest effort. If a plan is proved not to exist, the first validation ends
@@ -68,7 +68,7 @@ class Watch:
     """Callbacks of a training.
 
     Attributes:
-        begun: called once with the resolved options, including margin and number of steps.
+        started: called once with the resolved options, including margin and number of steps.
         row: called with every row of `train.jsonl`.
         stop: called after every step; True saves and ends the training.
         deferring: context of the steps, in which an interrupt waits until the step is finished and saved.
@@ -76,7 +76,7 @@ class Watch:
         late: wall-time budget -> seconds by which work before and after the training would exceed it.
     """
 
-    begun: Callable[[dict[str, Any]], None] = lambda _chosen: None
+    started: Callable[[dict[str, Any]], None] = lambda _chosen: None
     row: Callable[[dict[str, Any]], None] = lambda _row: None
     stop: Callable[[], bool] = never
     deferring: Callable[[], AbstractContextManager[object]] = nullcontext
@@ -109,14 +109,14 @@ def train(
         SystemFileError: S302, states are not finite.
     """
     now = clock_of(config.clock)
-    begun = now()
+    started = now()
     keep_freed_memory()
     resolved = replace(resolve_config(task, config), ranks=ranks.size)
     watch = watch or Watch()
     declared = task.system.decl.train
-    told = config.steps or (declared.steps if config.budget is None else None)
-    budget = 0.0 if told is not None else config.budget or declared.budget or DEFAULT_BUDGET
-    schedule = told if isinstance(told, StepSchedule) else StepSchedule.of(told or PROVISIONAL)
+    fixed = config.steps or (declared.steps if config.budget is None else None)
+    budget = 0.0 if fixed is not None else config.budget or declared.budget or DEFAULT_BUDGET
+    schedule = fixed if isinstance(fixed, StepSchedule) else StepSchedule.of(fixed or PROVISIONAL)
     writer = RunWriter(folder, writes=ranks.first)
     writer.config(resolved)
     writer.note({"engine": asdict(resolved), "schedule": str(schedule), "seconds_allowed": budget or None})
@@ -126,7 +126,7 @@ def train(
     torch.set_num_threads(resolved.threads)
     method: Method = METHODS.get(resolved.method)
     learner = method.learner(task, resolved, steps=schedule.at(0), device=device, ranks=ranks)
-    allowed = TimeBudget.of(now, begun, budget, watch.late if config.clock == "wall" else None)
+    allowed = TimeBudget.of(now, started, budget, watch.late if config.clock == "wall" else None)
     if learner is None:
         return _without_steps(method, task, resolved, writer, allowed, watch)
     writer.note({"margin": learner.margin})
@@ -161,7 +161,7 @@ def resume(
     config = load_config(folder)
     _require_as_many(config.ranks, ranks.size)
     now = clock_of(config.clock)
-    begun = now()
+    started = now()
     task = load_task(folder)
     method: Method = METHODS.get(config.method)
     watch, writer = watch or Watch(), RunWriter(folder, writes=ranks.first)
@@ -185,7 +185,7 @@ def resume(
             learner.restore(saved.tensors, saved.facts)
     late = watch.late if config.clock == "wall" else None
     if learner is None:
-        return _without_steps(method, task, config, writer, TimeBudget.of(now, begun, allowed, late), watch)
+        return _without_steps(method, task, config, writer, TimeBudget.of(now, started, allowed, late), watch)
     if steps is not None:
         schedule = schedule.with_steps(learner.step, steps)
         learner.steps = steps
@@ -202,7 +202,7 @@ def resume(
         )
     writer.before(learner.next_validation)
     writer.note({"status": "running", "seconds_allowed": allowed or None})
-    time_ = TimeBudget.of(now, begun - before, allowed, late)
+    time_ = TimeBudget.of(now, started - before, allowed, late)
     return _Session(writer, learner, watch, time_, schedule).finish()
 
 
@@ -212,7 +212,7 @@ def _without_steps(
     """Outcome of a planner, which is evaluated without training."""
     margin = task.system.decl.objective.gamma
     writer.note({"margin": margin, "steps": 0, "schedule": None})
-    watch.begun({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
+    watch.started({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
     with watch.deferring():
         policy = method.load(task, writer.folder, config, "cpu")
         return FinalEvaluation(writer, task, config, time).of(policy, 0)
@@ -279,7 +279,7 @@ class _Session:
         self.writer.note({"by_torch": reasons})
         self._note_schedule()
         chosen = {**asdict(learner.config), "margin": learner.margin, "budget": self.time.allowed or None}
-        self.watch.begun({**chosen, "steps": self._known_steps, "by_torch": reasons})
+        self.watch.started({**chosen, "steps": self._known_steps, "by_torch": reasons})
         try:
             with self.watch.deferring():
                 if not self._trained():
@@ -333,7 +333,7 @@ class _Session:
         """Number of steps planned at this moment: by the budget, or by the schedule."""
         learner = self.learner
         if self.time.allowed:
-            left = self.time.begun + self.time.seconds - self.evaluation.reserve - self.now()
+            left = self.time.started + self.time.seconds - self.evaluation.reserve - self.now()
             steps = self.pace.plan(learner.step, learner.steps, learner.next_validation, left)
             steps = int(learner.ranks.agree(steps))
             if steps != learner.steps:
@@ -354,7 +354,7 @@ class _Session:
         """Validate and write the row; `began`: clock reading before the round."""
         learner = self.learner
         found = learner.validate()
-        self.pace.looked(learner.step, self.now() - began)
+        self.pace.validated(learner.step, self.now() - began)
         self._row(found)
         self.barren = self.barren and found.accuracy == 0.0 and found.repaired + found.explored == 0
         self.exhausted = not learner.ranks.any(not learner.exhausted)
@@ -372,7 +372,7 @@ class _Session:
     def _hopeless(self) -> bool:
         """True if policy and search never satisfied the specification, after all effort or by proof."""
         learner = self.learner
-        enough = max(BARREN_LOOKS * learner.config.every, BARREN_SHARE * learner.steps)
+        enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:
             return False
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
@@ -391,7 +391,7 @@ class _Session:
         facts = {
             **self.learner.facts(),
             "schedule": str(self.schedule),
-            "seconds": began - self.time.begun,
+            "seconds": began - self.time.started,
         }
         self.writer.checkpoint(self.learner.tensors(), facts, step=self.learner.step)
         self.pace.saved(self.now() - began)
@@ -423,7 +423,7 @@ class _Session:
         if good:
             self._save()
         self.writer.close("failed")
-        kept = (
+        note = (
             "the run keeps the weights before that step" if good else "the last checkpoint of the run is kept"
         )
-        return type(error)(*(finding.with_note(kept) for finding in error.diagnostics))
+        return type(error)(*(finding.with_note(note) for finding in error.diagnostics))

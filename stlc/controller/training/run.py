@@ -114,10 +114,10 @@ class RunWriter:
         if self.writes:
             self.folder.update(facts)
 
-    def before(self, look: int) -> None:
-        """Drop the rows of the validation at step `look` and of later ones; these steps are run again."""
+    def before(self, step: int) -> None:
+        """Drop the rows of the validation at step `step` and of later ones; these steps are run again."""
         if self.writes:
-            self.folder.keep_rows(lambda row: row.get("step", 0) < look)
+            self.folder.keep_rows(lambda row: row.get("step", 0) < step)
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Append a row to `train.jsonl`."""
@@ -185,8 +185,8 @@ def trained_on(folder: RunDir) -> str:
 
 def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -> str:
     overrides = folder.record().get("overrides") or {}
-    kept = json.dumps(dict(sorted(library.items()))) if library else ""
-    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True) + kept)
+    imports = json.dumps(dict(sorted(library.items()))) if library else ""
+    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True) + imports)
 
 
 def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:

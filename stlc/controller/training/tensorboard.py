@@ -40,7 +40,7 @@ class TensorBoardLogger:
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
 
-    def begun(self, chosen: Mapping[str, Any]) -> None:
+    def started(self, chosen: Mapping[str, Any]) -> None:
         """Log the resolved options."""
         lines = "\n".join(f"| {markdown(key)} | {markdown(str(value))} |" for key, value in chosen.items())
         self._writer.add_text("engine", f"| | |\n|---|---|\n{lines}", 0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
 from stlc.controller.deployment.live import LiveMonitor
-from stlc.controller.deployment.simulator import Recorder, Setting, drive
+from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.guard.candidates import Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
@@ -81,7 +81,7 @@ def shown(
 
     view.start()
     made = world_type(task.system.decl)
-    drive(Guard(task, Away(task), guard), made, setting, Recorder(6), watch)
+    simulate(Guard(task, Away(task), guard), made, setting, Recorder(6), watch)
     view.stop()
     assert oversight.counts.sum() == seeds * 6 * steps
     return stream.getvalue()

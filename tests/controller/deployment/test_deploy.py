@@ -81,7 +81,7 @@ def test_a_plan_of_which_several_steps_were_taken_is_carried_on_by_the_policy(ca
     x = car_task.sample(4, seed=6).double()
     begun, taken = guard.decide(x), torch.tensor([0, 3, length - 1, length + 2])
     left = begun.later(taken)
-    found = guard.carried_on(x, left, taken)
+    found = guard.extended(x, left, taken)
     assert torch.equal(found.action, found.plan[:, 0])
     for row, steps in enumerate(taken.tolist()):
         kept = length - steps

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance, errors_of
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
@@ -77,7 +77,7 @@ def driven() -> Callable[[str], tuple[DeploymentRecording, Still]]:
     def drive_in(scenario: str) -> tuple[DeploymentRecording, Still]:
         task = task_of(scenario)
         policy, recorder = Still(task), Recorder(3)
-        drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), 3, 4), recorder)
+        simulate(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), 3, 4), recorder)
         found = recorder.recording()
         assert found is not None
         return found, policy
@@ -162,7 +162,7 @@ class Steady(Still):
 def steady(scenario: str, agents: int = 40) -> tuple[DeploymentRecording, Steady]:
     task = task_of(scenario)
     policy, recorder = Steady(task), Recorder(agents)
-    drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), agents, 2), recorder)
+    simulate(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), agents, 2), recorder)
     found = recorder.recording()
     assert found is not None
     return found, policy
@@ -237,10 +237,12 @@ def test_numbers_of_the_dynamics_are_wrong_for_each_agent_in_its_way() -> None:
 
 
 def test_who_meets_nothing_is_quiet_however_wrong_the_model_is(driven: Driven) -> None:
-    quiet = {name: driven(name)[0].quiet for name in ("nominal", "mismatch-20", "disturb", "noise", "called")}
+    eventless = {
+        name: driven(name)[0].eventless for name in ("nominal", "mismatch-20", "disturb", "noise", "called")
+    }
     for name in ("nominal", "mismatch-20", "disturb", "noise"):
-        assert quiet[name].all(), name  # type: ignore[union-attr]
-    assert quiet["called"].tolist() == [[True, False, True, True]] * 6  # type: ignore[union-attr]
+        assert eventless[name].all(), name  # type: ignore[union-attr]
+    assert eventless["called"].tolist() == [[True, False, True, True]] * 6  # type: ignore[union-attr]
 
 
 def test_what_is_wrong_is_told() -> None:
@@ -259,7 +261,7 @@ def test_worlds_are_the_same_whatever_is_disturbed() -> None:
     for scenario in ("nominal", "mismatch-20", "noise-10"):
         decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), scenario)
         task, recorder = Task.of(parse(Source("a.stl", SPEC)), System(decl)), Recorder(3)  # type: ignore[arg-type]
-        drive(Guard(task, Steady(task)), world_type(decl), Setting((0, 1), 3, 1), recorder)
+        simulate(Guard(task, Steady(task)), world_type(decl), Setting((0, 1), 3, 1), recorder)
         found.append(recorder.recording().states[:, 0, 0].tolist())  # type: ignore[union-attr]
     assert found[0] == found[1] == found[2]
 

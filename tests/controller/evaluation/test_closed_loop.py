@@ -54,14 +54,14 @@ def test_drives_are_repeated_and_recommended_by_what_they_show(run: Run) -> None
     assert first.judge == "driving_rules"
     none = first.shares[0]
     assert none.guard == "none"
-    assert 4 <= none.drives <= 8
-    assert none.drives % 4 == 0
+    assert 4 <= none.runs <= 8
+    assert none.runs % 4 == 0
     assert none.safe is None or none.safe >= none.satisfied
     best = first.recommended
     assert best is not None
     assert best.share >= none.share
     for share in first.shares[1:]:
-        assert share.compared <= share.drives
+        assert share.compared <= share.runs
         assert share.gained <= share.satisfied
 
 
@@ -87,15 +87,15 @@ def test_a_training_reports_its_drives(tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, budget=3.0, clock="processor", drives=4, batch=32, seed=1)
     outcome = train(task, config, open_folder(task, config, Launch(root=tmp_path)))
     record = outcome.run.dir.record()
-    assert outcome.driven is not None
-    assert record["result"]["closed_loop"] == outcome.driven.summary()
+    assert outcome.simulated is not None
+    assert record["result"]["closed_loop"] == outcome.simulated.summary()
     assert driven_lines(record["result"])
 
 
 def test_nothing_is_driven_where_nobody_wants_it(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, steps=3, drives=0, batch=16)
     outcome = train(car_task, config, open_folder(car_task, config, Launch(root=tmp_path)))
-    assert outcome.driven is None
+    assert outcome.simulated is None
     assert "closed_loop" not in outcome.run.dir.record()["result"]
 
 
@@ -111,7 +111,7 @@ def test_the_cheapest_guard_that_does_as_well_is_recommended(drawn: tuple[tuple[
     )
     best = ClosedLoop(shares, 10).recommended
     assert best is not None
-    assert all(share.share <= best.share + NEAR for share in shares if share.drives >= LEAST)
+    assert all(share.share <= best.share + NEAR for share in shares if share.runs >= LEAST)
     assert not any(share.share >= best.share for share in shares[: guards.index(best.guard)])
     low, high = best.interval
     assert low - 1e-9 <= best.share <= high + 1e-9

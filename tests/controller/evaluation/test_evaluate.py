@@ -11,7 +11,7 @@ import torch
 from helpers.traffic_drivers import careful
 from torch import Tensor
 
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.archive import save_scene, save_trace_of
 from stlc.controller.evaluation.deployment import (
     InterruptedDeploymentError,
@@ -50,7 +50,7 @@ def recorded(car_task: Task) -> DeploymentRecording:
     from stlc.controller.world import world_type
 
     recorder = Recorder(SETTING.agents)
-    drive(Guard(car_task, Careful(car_task)), world_type(car_task.system.decl), SETTING, recorder)
+    simulate(Guard(car_task, Careful(car_task)), world_type(car_task.system.decl), SETTING, recorder)
     found = recorder.recording()
     assert found is not None
     return found
@@ -126,7 +126,7 @@ def test_who_is_told_something_plans_at_once(car_task: Task) -> None:
         options = choose = None  # type: ignore[assignment]
 
     guard, recorder = Counting(car_task, Careful(car_task), "none"), Recorder(3)
-    drive(guard, Silent, Setting((0,), 3, 12, replan=4), recorder)
+    simulate(guard, Silent, Setting((0,), 3, 12, replan=4), recorder)
     assert asked == [3, 3, 1, 3, 1]  # steps 0, 4, 5, 8, 10
     found = recorder.recording()
     assert found is not None
@@ -142,7 +142,7 @@ def test_agents_choose_when_they_plan(car_task: Task) -> None:
         return worlds[-1]
 
     recorder = Recorder(3)
-    drive(Guard(car_task, Careful(car_task), "none"), make, Setting((0,), 3, 4, replan=2), recorder)  # type: ignore[arg-type]
+    simulate(Guard(car_task, Careful(car_task), "none"), make, Setting((0,), 3, 4, replan=2), recorder)  # type: ignore[arg-type]
     assert worlds[0].picks == [[0, 0, 0]] * 4
     found = recorder.recording()
     assert found is not None
@@ -231,8 +231,8 @@ def test_executed_verdicts_are_those_of_the_monitor(car_task: Task, recorded: De
 
 def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: DeploymentRecording) -> None:
     executed = judge_executed(car_task, recorded)
-    assert 0 < executed.foreseen.mean() < 1
-    for start, row in np.argwhere(executed.foreseen)[::17]:
+    assert 0 < executed.consistent.mean() < 1
+    for start, row in np.argwhere(executed.consistent)[::17]:
         window = slice(start, start + car_task.horizon)  # one step each: rounding decides who stops
         x, u = (torch.from_numpy(each[row, window]) for each in (recorded.states, recorded.actions))
         predicted = car_task.rollout(x, u[:, None])[:, 1]
@@ -254,10 +254,10 @@ def test_metrics_are_means_over_seeds(car_task: Task, recorded: DeploymentRecord
 def test_the_ceiling_is_searched_for_in_visited_states(car_task: Task, recorded: DeploymentRecording) -> None:
     assert np.isnan(feasible_states(car_task, recorded, 0)).all()
     some = feasible_states(car_task, recorded, 60)
-    looked, good = np.isfinite(some), recorded.rho >= -1e-6
-    assert looked.sum() == 60
-    assert (some[looked & good] == 1.0).all()
-    open_ = looked & ~good
+    validated, good = np.isfinite(some), recorded.rho >= -1e-6
+    assert validated.sum() == 60
+    assert (some[validated & good] == 1.0).all()
+    open_ = validated & ~good
     found = solvable(car_task, torch.from_numpy(recorded.states[:, :-1][open_])).numpy()
     assert np.array_equal(some[open_], found)
     assert open_.sum() > 0

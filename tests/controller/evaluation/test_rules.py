@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from stlc.controller.deployment.simulator import DeploymentRecording
-from stlc.controller.evaluation.rules import Lost, Rules, drives_json, drives_of_plans, judge_drives, rules_of
+from stlc.controller.evaluation.rules import Lost, Rules, judge_runs, judge_runs_by_plans, rules_of, runs_json
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
@@ -103,9 +103,7 @@ def test_a_run_judges_by_the_rules_that_it_was_made_with(home: Path) -> None:
     assert rules.spec.library == {"parts/limit.stl": LIMIT}
     assert rules.docs == {"stay": "Never at the wall.", "home": ""}
     assert rules.path.endswith("rules/cart.stl")
-    drives = judge_drives(
-        rules, opened(folder).task, driven([[0, 1, 2], [0, 1, 3.5], [-3, 0, 0]]), savable(3)
-    )
+    drives = judge_runs(rules, opened(folder).task, driven([[0, 1, 2], [0, 1, 3.5], [-3, 0, 0]]), viable(3))
     assert {name: list(each == "satisfied") for name, each in drives.rules.items()} == {
         "stay": [True, False, True],
         "home": [True, True, False],
@@ -184,7 +182,7 @@ def test_a_copy_that_is_damaged_is_said(home: Path, broken: str) -> None:
 # ------------------------------------------------------------------------- who obeyed
 
 
-def savable(rows: int, *lost: int) -> np.ndarray:
+def viable(rows: int, *lost: int) -> np.ndarray:
     able = np.ones(rows, dtype=bool)
     able[list(lost)] = False
     return able
@@ -200,8 +198,8 @@ def test_drives_are_counted(home: Path, monkeypatch: pytest.MonkeyPatch) -> None
     task, rules = opened(run_of(home)).task, found(opened(run_of(home)))
     searched(monkeypatch, -1)
     recording = replace(driven([[0, 1, 2], [0, 3.5, 1], [-3, -2.5, 0], [0, 0, 0]], good=False), agents=2)
-    drives = judge_drives(rules, task, recording, savable(4, 2, 3))
-    document = drives_json(drives, (7, 8), 2)
+    drives = judge_runs(rules, task, recording, viable(4, 2, 3))
+    document = runs_json(drives, (7, 8), 2)
     assert json.loads(json.dumps(document)) == {
         "count": 4,
         "obeyed": 2,
@@ -246,7 +244,7 @@ def test_who_only_comes_late_is_lost_where_no_plan_keeps_all(
     (home / "car/cart.stl").write_text(PLAN + "require go: always x > -99\n")
     rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, -1)
     recording = driven([[0, 1, 2], [-2, -1, 0.5], [-0.5, -0.5, 1], [-3, -1, 3.5]], good=False)
-    drives = judge_drives(rules, opened(run_of(home)).task, recording, savable(4, 0, 1))
+    drives = judge_runs(rules, opened(run_of(home)).task, recording, viable(4, 0, 1))
     assert asked == [  # not who obeyed; of who hit something, a safe plan until then
         (2, [-2.0, -1.0]),
         (2, [-0.5, -0.5]),
@@ -260,24 +258,24 @@ def test_who_only_comes_late_is_lost_where_no_plan_keeps_all(
     ]
 
 
-@pytest.mark.parametrize("quiet", [True, False, None])
-def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, quiet: bool | None) -> None:
+@pytest.mark.parametrize("calm", [True, False, None])
+def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, calm: bool | None) -> None:
     """The plan of the first instant was good; from the second on none is known; the fourth breaks a rule."""
     rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
     recording = driven([[1, 2, 2.5, 3.5, 1]], good=False)
     recording.safe[0, 0] = True
-    recording = replace(recording, quiet=None if quiet is None else np.array([[quiet, True, True, True]]))
-    (broken,) = judge_drives(rules, opened(run_of(home)).task, recording, savable(1)).broken
+    recording = replace(recording, eventless=None if calm is None else np.array([[calm, True, True, True]]))
+    (broken,) = judge_runs(rules, opened(run_of(home)).task, recording, viable(1)).broken
     assert asked == [(1, [2.0, 2.5, 3.5])]
-    assert broken.lost == Lost("told" if quiet is False else "later", 1.0)
-    assert broken.excused == (quiet is False)
+    assert broken.lost == Lost("told" if calm is False else "later", 1.0)
+    assert broken.excused == (calm is False)
 
 
 def test_a_plan_that_was_good_until_a_rule_was_broken_is_no_excuse(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
-    drives = judge_drives(rules, opened(run_of(home)).task, driven([[1, 2, 3.5, 1]]), savable(1, 0))
+    drives = judge_runs(rules, opened(run_of(home)).task, driven([[1, 2, 3.5, 1]]), viable(1, 0))
     assert (asked, drives.broken[0].lost, drives.viable.tolist()) == ([], None, [True])
 
 
@@ -285,7 +283,7 @@ def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:
     text = "spec soon\nsignal x [m]\nrequire soon: eventually[0 s, 5 s] x > 1\n"
     rules = Rules(parse(text_of(home, text)), "soon.stl")
     task = opened(run_of(home)).task
-    document = drives_json(judge_drives(rules, task, driven([[0, 2, 0], [0, 0, 0]]), savable(2)), (0,), 2)
+    document = runs_json(judge_runs(rules, task, driven([[0, 2, 0], [0, 0, 0]]), viable(2)), (0,), 2)
     assert (document["obeyed"], document["undecided"], document["broken"]) == (1, 1, [])
 
 
@@ -296,7 +294,7 @@ def text_of(home: Path, text: str):  # type: ignore[no-untyped-def]
 
 def test_without_rules_every_start_counts() -> None:
     held = {"a": np.array([[True, True], [True, False], [False, False]]), "b": np.ones((0, 2), dtype=bool)}
-    drives = drives_of_plans({"a": held["a"]}, savable(2, 1), 0.5)
+    drives = judge_runs_by_plans({"a": held["a"]}, viable(2, 1), 0.5)
     assert [each.rules for each in drives.broken] == [{"a": 1.0}, {"a": 0.5}]
     assert drives.viable.tolist() == [True, False]
-    assert drives_json(drives_of_plans({"b": held["b"]}, savable(2), 0.5), (0,), 2)["undecided"] == 2
+    assert runs_json(judge_runs_by_plans({"b": held["b"]}, viable(2), 0.5), (0,), 2)["undecided"] == 2

@@ -65,9 +65,9 @@ class Machine:
     def train(self, seconds: float) -> float:
         self.spend(1.0)
         pace = Pace(every=EVERY, searching=True, now=self.now, seconds=seconds)
-        step, steps, next_look, found_at, end = 0, PROVISIONAL, EVERY, 0.0, seconds
+        step, steps, next_validation, found_at, end = 0, PROVISIONAL, EVERY, 0.0, seconds
         while True:
-            planned = pace.plan(step, steps, next_look, end - self.now)
+            planned = pace.plan(step, steps, next_validation, end - self.now)
             if planned != steps:
                 steps = planned
                 self.plannings.append(Planned(step, steps))
@@ -76,11 +76,11 @@ class Machine:
             if step >= steps:
                 pace.searched(step, self.wait(found_at))
                 continue
-            if step >= next_look:
+            if step >= next_validation:
                 pace.searched(step, self.wait(found_at))
-                pace.looked(step, self.spend(2 * self.step_cost))
+                pace.validated(step, self.spend(2 * self.step_cost))
                 found_at = self.now + self.search(step) * self.slow(self.now)
-                next_look = step + EVERY
+                next_validation = step + EVERY
             self.spend(self.step_cost)
             step += 1
             pace.stepped(step, self.now, search_runs=self.now < found_at)

@@ -106,14 +106,14 @@ def test_a_training_explores_where_climbing_leads_nowhere(
         resolve_config(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1
     )
     trainer = Trainer(puzzle, engine, steps=8, device=torch.device("cpu"))
-    looks: list[Validation] = []
-    while sum(look.explored for look in looks) == 0 and trainer.step < 6:
+    rounds: list[Validation] = []
+    while sum(look.explored for look in rounds) == 0 and trainer.step < 6:
         trainer.advance()
         assert trainer.explore()
-        looks.append(trainer.validate())
-    assert [look.explored for look in looks[:2]] == [0, 0]  # climbing is tried first
-    assert looks[-1].explored > 0
-    assert trainer.buffer.count >= looks[-1].explored
+        rounds.append(trainer.validate())
+    assert [look.explored for look in rounds[:2]] == [0, 0]  # climbing is tried first
+    assert rounds[-1].explored > 0
+    assert trainer.buffer.count >= rounds[-1].explored
 
 
 def test_pieces_are_what_a_formula_is_the_conjunction_of() -> None:

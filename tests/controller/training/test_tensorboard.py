@@ -36,7 +36,7 @@ class Kept:
 def test_numbers_stand_under_their_names() -> None:
     kept = Kept()
     log = TensorBoardLogger(kept)
-    log.begun({"plans": 4})
+    log.started({"plans": 4})
     row = {"accuracy": 0.9, "feasible": None, "loss": 0.5, "requirements": {"stop": 0.8}, "repaired": 3}
     log.row({"step": 7, **row, "failing": 4})
     log.row({"step": 8, **row, "failing": 0})

@@ -108,8 +108,8 @@ class GradientAscent:
             if not len(left) or perf_counter() >= until:
                 break
             far = np.broadcast_to(self._far[at], (len(left), *self._far[at].shape))
-            begun = np.concatenate((self._changed(best[left]), far), 1)
-            best[left], value[left] = self._round(x[left], begun, rate, until)
+            starts = np.concatenate((self._changed(best[left]), far), 1)
+            best[left], value[left] = self._round(x[left], starts, rate, until)
         done = np.flatnonzero(value[:, 0] >= APART + self.enough)
         best[done, 0] = self._eased(x[done], places[done, 0], best[done, 0])
         return best
