@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int
@@ -11,6 +12,7 @@ from stlc.escape import unseen
 from stlc.registry import closest
 from stlc.source import Source, Span
 
+V = TypeVar("V")
 MAX_NAME = 200
 """Maximum length of a free-text name: of a system, an event, a scenario, a word of an enum."""
 _OPENING, _CLOSING = "([{", ")]}"
@@ -52,7 +54,7 @@ class Reader:
     # ------------------------------------------------------------------ collections
 
     def entries(self, node: Node | None, where: str) -> tuple[Entry, ...]:
-        """Entries of a mapping with free keys."""
+        """Entries of a mapping with free keys; none for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Mapping):
@@ -89,13 +91,13 @@ class Reader:
         )
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
-        """Items of a sequence."""
+        """Items of a sequence; none for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Sequence):
             self.wrong(node, where, "a list")
             return ()
-        cut = next((item for item in node.items if isinstance(item, Scalar) and _closes_more(item)), None)
+        cut = next((item for item in node.items if isinstance(item, Scalar) and _balance(item) < 0), None)
         if cut is not None:
             self._chopped(cut.span)
             return ()
@@ -107,14 +109,14 @@ class Reader:
         open_value = False
         for entry in entries:
             empty = isinstance(entry.value, Scalar) and entry.value.is_null
-            if empty and (open_value or _closes_more(entry.key)):
+            if empty and (open_value or _balance(entry.key) < 0):
                 self._chopped(entry.key.span)
                 if open_value:
                     kept.pop()
-                open_value = open_value and not _closes_more(entry.key)
+                open_value = open_value and _balance(entry.key) >= 0
                 continue
             kept.append(entry)
-            open_value = isinstance(entry.value, Scalar) and _opens_more(entry.value)
+            open_value = isinstance(entry.value, Scalar) and _balance(entry.value) > 0
         return tuple(kept)
 
     def _chopped(self, span: Span) -> None:
@@ -133,67 +135,53 @@ class Reader:
 
     def text(self, node: Node | None, where: str) -> str | None:
         """A text."""
-        if node is None:
-            return None
-        if not isinstance(node, Scalar) or node.is_null:
-            self.wrong(node, where, "a text")
-            return None
-        return node.text
+        found = node.text if isinstance(node, Scalar) and not node.is_null else None
+        return self._valid(node, where, "a text", found)
 
     def name(self, node: Node | None, where: str) -> str | None:
         """A text that can be a name: printable and not too long."""
         text = self.text(node, where)
-        return text if text is None or self.nameable(node, where) else None
+        return text if isinstance(node, Scalar) and text is not None and self.nameable(node, where) else None
 
-    def nameable(self, node: Node | None, where: str) -> bool:
+    def nameable(self, node: Scalar, where: str) -> bool:
         """True if a text can be a name: printable and not too long; otherwise reports the reason."""
-        assert isinstance(node, Scalar)
         hidden = unseen(node.text)
         if not hidden and len(node.text) <= MAX_NAME:
             return True
         wanted = f"a text of at most {MAX_NAME} characters that can all be seen"
-        told = f"of {len(node.text)} characters" if not hidden else f"with the character U+{ord(hidden):04X}"
-        self.report("S103", f"{where} must be {wanted}, this is one {told}", first_line(node.span))
+        flaw = f"with the character U+{ord(hidden):04X}" if hidden else f"of {len(node.text)} characters"
+        self.report("S103", f"{where} must be {wanted}, this is one {flaw}", first_line(node.span))
         return False
+
+    def _valid(self, node: Node | None, where: str, wanted: str, value: V | None) -> V | None:
+        """The value of a node; reports a node without one."""
+        if node is not None and value is None:
+            self.wrong(node, where, wanted)
+        return value
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
         """An integer between `low` and `high`."""
-        if node is None:
-            return None
         value = as_int(node) if isinstance(node, Scalar) else None
-        if value is None or not low <= value <= high:
-            bounds = (
-                f"between {low} and {high}" if value is not None and value > high else f"of at least {low}"
-            )
-            self.wrong(node, where, f"a whole number {bounds}")
-            return None
-        return value
+        above = value is not None and value > high
+        bounds = f"between {low} and {high}" if above else f"of at least {low}"
+        value = value if value is not None and low <= value <= high else None
+        return self._valid(node, where, f"a whole number {bounds}", value)
 
     def number(self, node: Node | None, where: str, *, low: float = 0.0) -> float | None:
         """A finite number of at least `low`."""
-        if node is None:
-            return None
         value = as_float(node) if isinstance(node, Scalar) else None
-        if value is None or value < low:
-            self.wrong(node, where, f"a number of at least {low:g}")
-            return None
-        return value
+        value = value if value is not None and value >= low else None
+        return self._valid(node, where, f"a number of at least {low:g}", value)
 
     def flag(self, node: Node | None, where: str) -> bool | None:
         """`true` or `false`."""
-        if node is None:
-            return None
         value = as_bool(node) if isinstance(node, Scalar) else None
-        if value is None:
-            self.wrong(node, where, "`true` or `false`")
-        return value
+        return self._valid(node, where, "`true` or `false`", value)
 
     def option(self, node: Node | None, where: str, options: Collection[str]) -> str | None:
         """One of a few words."""
         word = self.text(node, where)
-        if node is None or word is None:
-            return None
-        if word in options:
+        if node is None or word is None or word in options:
             return word
         near = closest(word, options)
         guess = f"did you mean `{near}`?" if near else ""
@@ -220,15 +208,7 @@ def first_line(span: Span) -> Span:
     return span if length < 0 else Span(span.source, span.start, span.start + max(length, 1))
 
 
-def _opens_more(node: Scalar) -> bool:
-    """True if a plain text leaves a bracket open."""
-    return node.style == "plain" and _balance(node.text) > 0
-
-
-def _closes_more(node: Scalar) -> bool:
-    """True if a plain text closes a bracket that it did not open."""
-    return node.style == "plain" and _balance(node.text) < 0
-
-
-def _balance(text: str) -> int:
-    return sum((char in _OPENING) - (char in _CLOSING) for char in text)
+def _balance(node: Scalar) -> int:
+    """Number of brackets that a plain text opens, less those that it closes; 0 for a quoted text."""
+    plain = node.text if node.style == "plain" else ""
+    return sum((char in _OPENING) - (char in _CLOSING) for char in plain)

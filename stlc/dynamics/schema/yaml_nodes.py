@@ -29,14 +29,7 @@ _LAX = re.compile("[\t?\ufeff]")
 _PLAIN_WORDS = (("character '\\t'", "a tab"), ("'<stream end>'", "the end of the file"), ("'", "`"))
 
 Style: TypeAlias = Literal["plain", "single", "double", "block"]
-_STYLES: dict[str | None, Style] = {
-    None: "plain",
-    "": "plain",
-    "'": "single",
-    '"': "double",
-    "|": "block",
-    ">": "block",
-}
+_STYLES: dict[str, Style] = {"": "plain", "'": "single", '"': "double", "|": "block", ">": "block"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +50,9 @@ class Scalar:
     @property
     def inside(self) -> Span:
         """The span of the value's characters, without quotes or block header."""
-        match self.style:
-            case "plain":
-                return self.span
-            case "block":
-                header = self.span.text.find("\n") + 1
-                return Span(self.span.source, self.span.start + header, self.span.end)
-            case _:
-                return Span(self.span.source, self.span.start + 1, self.span.end - 1)
+        quote = self.style in ("single", "double")
+        head = self.span.text.find("\n") + 1 if self.style == "block" else int(quote)
+        return Span(self.span.source, self.span.start + head, self.span.end - quote)
 
     @property
     def escaped(self) -> bool:
@@ -95,7 +83,7 @@ class Entry:
     value: Node
 
     def place(self, key: str) -> Span:
-        """Source location of the value of `key` within this one, else that of the whole."""
+        """Source location of the value of `key` in the value of this entry, or of the whole value."""
         node = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.value.span if node is None else node.span
 
@@ -165,27 +153,17 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
     there is no such document, or it is not safe to read.
     """
     node = load_node(source, sink=sink)
+    if isinstance(node, Mapping):
+        return node
     if node is None or (isinstance(node, Scalar) and node.is_null):
-        raise SystemFileError(
-            Diagnostic(
-                "S100",
-                f"`{source.name}` is empty",
-                source.span(0, min(1, len(source.text))),
-                help=("a system file starts with `stlc: 1` and `name: …`",),
-            )
-        )
-    if not isinstance(node, Mapping):
+        problem, span = "empty", source.span(0, min(1, len(source.text)))
+        advice = "a system file starts with `stlc: 1` and `name: …`"
+    else:
         start = node.span.start
         stop = min(node.span.end, source.text.find("\n", start) % (len(source.text) + 1))
-        raise SystemFileError(
-            Diagnostic(
-                "S100",
-                f"`{source.name}` is not a mapping of keys to values",
-                source.span(start, max(stop, start + 1)),
-                help=("a system file consists of lines `key: value`",),
-            )
-        )
-    return node
+        problem, span = "not a mapping of keys to values", source.span(start, max(stop, start + 1))
+        advice = "a system file consists of lines `key: value`"
+    raise SystemFileError(Diagnostic("S100", f"`{source.name}` is {problem}", span, help=(advice,)))
 
 
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
@@ -260,11 +238,11 @@ class _Builder:
         """S100 error at the location of an event."""
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
-    def span(self, event: Any) -> Span:
-        """The span of an event without trailing blanks."""
-        start, end = event.start_mark.index, event.end_mark.index
-        end = start + len(self.source.text[start:end].rstrip())
-        return self.source.span(start, max(end, min(start + 1, len(self.source.text))))
+    def span(self, start: Any, end: Any = None) -> Span:
+        """Span of an event, or from one to another, without trailing blanks."""
+        first, last = start.start_mark.index, (end or start).end_mark.index
+        last = first + len(self.source.text[first:last].rstrip())
+        return self.source.span(first, max(last, min(first + 1, len(self.source.text))))
 
     def node(self, event: Any, depth: int) -> Node:
         """The node that starts with `event`."""
@@ -288,12 +266,17 @@ class _Builder:
 
     def collection(self, event: Any, depth: int) -> Node:
         """A scalar, a sequence or a mapping."""
-        if isinstance(event, yaml.ScalarEvent):
-            span = self.span(event) if event.value or event.style else self.here(event)
-            return Scalar(span, self.joined(event), _STYLES[event.style])
+        if isinstance(event, yaml.MappingStartEvent):
+            return self.mapping(event, depth)
         if isinstance(event, yaml.SequenceStartEvent):
-            return self.sequence(event, depth)
-        return self.mapping(event, depth)
+            items: list[Node] = []
+            while not isinstance(end := next(self.events), yaml.SequenceEndEvent):
+                items.append(self.node(end, depth + 1))
+            return Sequence(self.span(event, end), tuple(items), 1 + sum(item.size for item in items))
+        index = event.start_mark.index
+        missing = not event.value and not event.style
+        span = self.source.span(index, index) if missing else self.span(event)
+        return Scalar(span, self.joined(event), _STYLES[event.style or ""])
 
     def joined(self, event: Any) -> str:
         """The value of a scalar; surrogate pairs from escapes are joined."""
@@ -306,11 +289,6 @@ class _Builder:
             message = "half of a character (U+D800 to U+DFFF), which no file can hold"
             raise self.refuse(event, message) from None
 
-    def here(self, event: Any) -> Span:
-        """The empty span of a missing value."""
-        index = event.start_mark.index
-        return self.source.span(index, index)
-
     def alias(self, event: Any) -> Node:
         """The node that an alias names."""
         node = self.anchors.get(event.anchor)
@@ -319,14 +297,6 @@ class _Builder:
             problem = "stands inside the value that it names" if inside else "names no anchor"
             raise self.refuse(event, f"the alias `*{event.anchor}` {problem}")
         return node
-
-    def sequence(self, start: Any, depth: int) -> Sequence:
-        """Read items up to the end of the sequence."""
-        items: list[Node] = []
-        while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
-            items.append(self.node(event, depth + 1))
-        span = self.whole(start, event)
-        return Sequence(span, tuple(items), 1 + sum(item.size for item in items))
 
     def mapping(self, start: Any, depth: int) -> Mapping:
         """Read a mapping up to its end event; merged entries come after its own."""
@@ -347,7 +317,7 @@ class _Builder:
         kept = tuple(written.get(name, entry) for name, entry in merged.items())
         entries = (*kept, *(entry for name, entry in written.items() if name not in merged))
         size = 1 + sum(1 + entry.value.size for entry in entries)
-        return Mapping(self.whole(start, event), entries, size)
+        return Mapping(self.span(start, event), entries, size)
 
     def merge(self, key: Scalar, value: Node) -> tuple[Entry, ...]:
         """Entries merged by `<<`."""
@@ -371,9 +341,3 @@ class _Builder:
                 help=("remove one of the two",),
             )
         )
-
-    def whole(self, start: Any, end: Any) -> Span:
-        """Span from the start event to the end event, without trailing blanks."""
-        first, last = start.start_mark.index, end.end_mark.index
-        last = first + len(self.source.text[first:last].rstrip())
-        return self.source.span(first, max(last, first + 1))
