@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from typing import Any
 
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
-from stlc.compile.frontend.values import Number, VectorValue
+from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
 from stlc.dynamics.model.algebra import names_in, substitute
 from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context
+from stlc.dynamics.schema.names import Context, ControlDecl, each_number
 from stlc.dynamics.schema.record import (
     EXPRESSION,
     NAME,
     OF,
-    SECONDS,
     VECTOR,
     Kind,
+    by_name,
     integer,
     items_of,
     json_schema,
@@ -31,9 +32,11 @@ from stlc.dynamics.schema.record import (
     reads,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar, Sequence, as_int
+from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar, as_int
 from stlc.grammar import ast
 from stlc.registry import METHODS
+from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit
 
@@ -51,11 +54,13 @@ OUTCOME = {
 
 @reads(EXPRESSION)
 def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
+    """Read a number in SI units from absolute zero."""
     value = cx.here.number(node, label)
     return None if value is None else absolute(value).num
 
 
 def _term_label(found: Mapping[str, Node]) -> str:
+    """Label of a performance term: its name, or its expression."""
     name = found.get("name")
     shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
     return f"the term `{shown}`"
@@ -73,40 +78,28 @@ class Term:
 @reads(items_of(json_schema(Term)), Term)
 def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
     """Read performance terms; they may use `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
-    names = cx.names
-    entries = {name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()}
-    entries["t"] = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the plan")
-    entries |= {
-        f"{each}{START}": _first(names.entries[each]) for each in names.states if each in names.entries
+    known = cx.names.entries
+    entries: dict[str, Entry] = {
+        name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()
     }
+    entries["t"] = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the plan")
+    for state in cx.names.states:
+        if isinstance(entry := known.get(state), Known):
+            about = "its value at the start of the plan"
+            entries[state + START] = each_number(replace(entry, about=about, span=None), _at_start)
     plain = cx.plain
-    here = plain.here.extended({name: e for name, e in entries.items() if name not in names.entries})
+    here = plain.here.extended({name: entry for name, entry in entries.items() if name not in known})
     terms = []
     for item in cx.reader.items(node, label):
         term = read(Term, replace(plain, here=here), item, "a term")
         if term.value is not None:
-            terms.append(replace(term, name=term.name or _term_label_of(item)))
+            expr = item.get("expr") if isinstance(item, MappingNode) else None
+            terms.append(replace(term, name=term.name or written(expr)))
     return tuple(terms)
 
 
-def _term_label_of(node: Node) -> str:
-    return written(node.get("expr")) if not isinstance(node, (Scalar, Sequence)) else ""
-
-
-def _first(state: Entry) -> Known:
-    """Value of a state at the start of the plan; a column may be converted to another unit."""
-    assert isinstance(state, Known)
-    about = "its value at the start of the plan"
-    match state.value:
-        case Number() as number:
-            return Known(_at_start(number), about)
-        case VectorValue(items) as vector:
-            return Known(replace(vector, items=tuple(map(_at_start, items))), about)
-        case _:
-            return state
-
-
 def _at_start(number: Number) -> Number:
+    """A number with its columns replaced by their values at the start of the plan."""
     table = {name: ir.Signal(name + START) for name in names_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 
@@ -147,54 +140,34 @@ class Feedback:
     authority: tuple[float, ...]
 
 
-def _by_column(cx: Context, node: Node | None, label: str, known: Mapping[str, Unit]) -> dict[str, Node]:
-    """Read values by the names of columns."""
-    found = {}
-    for entry in cx.reader.entries(node, label):
-        if entry.key.text in known:
-            found[entry.key.text] = entry.value
-        else:
-            cx.reader.unknown(entry.key, label, tuple(known))
-    return found
-
-
-def _units(cx: Context) -> dict[str, Unit]:
-    """The units of states and controls."""
-    states = {each.name: each.unit for each in cx.names.columns}
-    return states | {each.name: each.unit for each in cx.names.controls}
+def _units(columns: Iterable[Column | ControlDecl]) -> dict[str, Unit]:
+    """Units of states or controls, by name."""
+    return {each.name: each.unit for each in columns}
 
 
 @reads(mapping_of(EXPRESSION))
 def _around(cx: Context, node: Node, label: str) -> dict[str, float]:
-    units = _units(cx)
-    points = {
-        name: cx.here.constant(each, f"`{name}`", units[name])
-        for name, each in _by_column(cx, node, label, units).items()
-    }
-    return {name: value for name, value in points.items() if value is not None}
+    known = _units((*cx.names.columns, *cx.names.controls))
+    return by_name(cx, node, label, known, lambda n, name, unit: cx.here.constant(n, f"`{name}`", unit))
 
 
 @reads(mapping_of({"type": "number", "minimum": 0}))
 def _weights(cx: Context, node: Node, label: str) -> dict[str, float]:
-    costs = {
-        name: cx.reader.number(each, f"the weight of `{name}`")
-        for name, each in _by_column(cx, node, label, _units(cx)).items()
-    }
-    return {name: value for name, value in costs.items() if value is not None}
+    known = _units((*cx.names.columns, *cx.names.controls))
+    return by_name(cx, node, label, known, lambda n, name, _: cx.reader.number(n, f"the weight of `{name}`"))
 
 
 @reads(mapping_of(mapping_of(EXPRESSION)))
 def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
-    states = {each.name: each.unit for each in cx.names.columns}
-    controls = {each.name: each.unit for each in cx.names.controls}
-    found: dict[str, dict[str, float]] = {}
-    for control, row in _by_column(cx, node, label, controls).items():
-        entries = {
-            name: cx.here.constant(each, f"the gain of `{name}`", controls[control] / states[name])
-            for name, each in _by_column(cx, row, f"{label} of {control}", states).items()
-        }
-        found[control] = {name: value for name, value in entries.items() if value is not None}
-    return found
+    states = _units(cx.names.columns)
+
+    def row(node: Node, control: str, of: Unit) -> dict[str, float]:
+        def entry(node: Node, state: str, unit: Unit) -> float | None:
+            return cx.here.constant(node, f"the gain of `{state}`", of / unit)
+
+        return by_name(cx, node, f"{label} of {control}", states, entry)
+
+    return by_name(cx, node, label, _units(cx.names.controls), row)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,16 +183,16 @@ class FeedbackDecl:
 
 
 @reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
-def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
+def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """Read the requested feedback: `lqr`, or a mapping."""
-    if isinstance(node, Scalar) and node.is_null:
-        return {"feedback_span": node.span}
+    asked = None
     if not isinstance(node, Scalar):
-        return {"feedback": read(FeedbackDecl, cx, node, label), "feedback_span": node.span}
-    if node.text == "lqr":
-        return {"feedback": FeedbackDecl(), "feedback_span": node.span}
-    cx.reader.wrong(node, label, "`lqr`, or a mapping", "feedback: {weights: {angle: 10}}")
-    return None
+        asked = read(FeedbackDecl, cx, node, label)
+    elif node.text == "lqr":
+        asked = FeedbackDecl()
+    elif not node.is_null:
+        cx.reader.wrong(node, label, "`lqr`, or a mapping", "feedback: {weights: {angle: 10}}")
+    return {"feedback": asked, "feedback_span": node.span}
 
 
 @reads(items_of(VECTOR))
@@ -264,12 +237,10 @@ def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 def _integers(cx: Context, node: Node, label: str) -> tuple[int, ...] | None:
-    if isinstance(node, Scalar) and as_int(node) is not None:
-        node = Sequence(node.span, (node,), 1)
-    items = [
-        cx.reader.integer(item, f"an entry of {label}", high=65_536) for item in cx.reader.items(node, label)
-    ]
-    return tuple(value for value in items if value is not None) or None
+    single = isinstance(node, Scalar) and as_int(node) is not None
+    items = (node,) if single else cx.reader.items(node, label)
+    values = [cx.reader.integer(item, f"an entry of {label}", high=65_536) for item in items]
+    return tuple(value for value in values if value is not None) or None
 
 
 _WHOLE = {"type": "integer", "minimum": 1, "maximum": 65_536}
@@ -303,7 +274,7 @@ class TrainDecl:
     """Training defaults of this system; None leaves the choice to the method."""
 
     budget: float | None = key(
-        Kind(lambda cx, node, label: _float(SECONDS.read(cx, node, label)), EXPRESSION), "time for training"
+        Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION), "time for training"
     )
     steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
     seed: int = key(integer(0, 2**63 - 1), "of everything random in training", 0)
@@ -313,5 +284,5 @@ class TrainDecl:
     method: str | None = key(word(METHODS), "training method")
 
 
-def _float(value: Any) -> float | None:
+def _seconds(value: Fraction | None) -> float | None:
     return None if value is None else float(value)

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from stlc.compile.frontend.scope import Definition, Entry, Known
-from stlc.compile.frontend.values import Number, VectorValue
+from stlc.compile.frontend.scope import Definition, Known
+from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import moving_parts
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
 from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.names import Names, base_name
+from stlc.dynamics.schema.names import Names, base_name, each_number
 from stlc.dynamics.schema.reader import Reader
 from stlc.grammar import ast
 from stlc.grammar.traverse import children, descendants
@@ -77,7 +78,8 @@ def perturbable(decl: SystemDecl) -> Perturbable:
         names, entries=dict(names.entries), rewrite=used.rewritten if listed is None else None
     )
     for name in chosen:
-        rewriting.entries[name] = _times(names.entries[name], ir.Signal(_factor(name)))
+        scaled = partial(_scaled, factor=ir.Signal(_factor(name)))
+        rewriting.entries[name] = each_number(names.entries[name], scaled)
     for factor in texts:
         rewriting.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
     loose = _laid_over(decl, *read(rewriting))
@@ -123,18 +125,6 @@ def _is_point(node: ast.Quantity) -> bool:
 
 def _place(node: ast.Quantity) -> str:
     return f"?{node.span.source.name}:{node.span.start}"
-
-
-def _times(entry: Entry, factor: ir.Num) -> Entry:
-    """Constant times a factor, the same for all components of a vector."""
-    assert isinstance(entry, Known)
-    match entry.value:
-        case Number() as number:
-            return replace(entry, value=_scaled(number, factor))
-        case VectorValue(items=items) as vector:
-            return replace(entry, value=replace(vector, items=tuple(_scaled(item, factor) for item in items)))
-        case _:
-            return entry
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:

@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import Literal, TypeAlias
 
 from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
-from stlc.compile.frontend.values import Number
+from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Label, SystemFileError
 from stlc.dynamics.schema.expressions import SECOND, Expressions
@@ -42,6 +42,17 @@ class ControlDecl:
     high: float
     squash: Squash = "tanh"
     levels: tuple[float, ...] = ()
+
+
+def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
+    """A name with its number, or every component of its vector, changed."""
+    match entry:
+        case Known(value=Number() as number):
+            return replace(entry, value=change(number))
+        case Known(value=VectorValue(items) as vector):
+            return replace(entry, value=replace(vector, items=tuple(map(change, items))))
+        case _:
+            return entry
 
 
 def base_name(column: str) -> str:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from stlc.dynamics.schema.yaml_nodes import Node
 
 R = TypeVar("R")
+T = TypeVar("T")
+V = TypeVar("V")
 _Read: TypeAlias = "Callable[[Context, Node, str], Any]"
 Json = dict[str, Any]
 _KEY = "key"
@@ -223,6 +225,20 @@ def section(record: type, *, free: bool = False) -> Kind:
     """A section of the file, as its node; with `free` a mapping of names to records."""
     schema = json_schema(record)
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
+
+
+def by_name(
+    cx: Context, node: Node, label: str, known: Mapping[str, T], read: Callable[[Node, str, T], V | None]
+) -> dict[str, V]:
+    """Valid values of a mapping whose keys are in `known`; `read` takes the node, the key and its entry."""
+    found: dict[str, V] = {}
+    for entry in cx.reader.entries(node, label):
+        name = entry.key.text
+        if name not in known:
+            cx.reader.unknown(entry.key, label, tuple(known))
+        elif (value := read(entry.value, name, known[name])) is not None:
+            found[name] = value
+    return found
 
 
 # ------------------------------------------------------------------- schema and documentation
