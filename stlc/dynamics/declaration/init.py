@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping as MappingType
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 from stlc.compile.frontend.scope import Entry as Name
 from stlc.compile.frontend.scope import Known
@@ -131,24 +133,6 @@ class AxisKeys:
 # ------------------------------------------------------------------------------ situations
 
 
-@dataclass(frozen=True, slots=True)
-class _Drawn:
-    """States and local names that have a value so far in a situation."""
-
-    states: frozenset[str] = frozenset()
-    locals: tuple[tuple[str, Number | VectorValue], ...] = ()
-
-    def drawing(self, cx: Context) -> Context:
-        """Context for expressions that may draw, and read names with a value."""
-        entries: dict[str, Name] = {name: Known(number, "local name") for name, number in self.locals}
-        ready = self.states | {name for local, value in self.locals for name in _columns_of(local, value)}
-        return cx.drawing(entries, ready)
-
-
-def _columns_of(name: str, value: Number | VectorValue) -> tuple[str, ...]:
-    return component_names(name, len(value.items) if isinstance(value, VectorValue) else None)
-
-
 def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
     """Read the section `init`; `params` are drawn before everything else."""
     reader = cx.reader
@@ -162,7 +146,7 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
     if len(given) > 1:
         message = f"`init` takes one of `mixture`, `grid` and `from`, not {len(given)}"
         reader.report("S102", message, first_line(node.span))
-    drawn = _Drawn(frozenset(assign.name for assign in params))
+    draws = _Draws(cx, frozenset(assign.name for assign in params))
     if "mixture" in given or not given:
         for name, value in (("draw", keys.draw), ("let", keys.let)):
             if value is not None:
@@ -170,9 +154,9 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
         if not keys.mixture:
             message, advice = "`init` lacks a `mixture` of situations", "mixture: [{draw: {x: 0}}]"
             reader.report("S102", message, first_line(node.span), advice)
-        mixture = _mixture(keys.mixture, drawn, cx)
+        mixture = _mixture(keys.mixture, draws)
     else:
-        mixture = (_known(keys, node, drawn, cx),)
+        mixture = (_given(keys, node, draws),)
     items = reader.items(keys.where, "`where`")
     formulas = [cx.here.formula(item, "a line of `where`") for item in items]
     span = node.span if keys.where is None else keys.where.span
@@ -180,45 +164,58 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
     return InitDecl(mixture, where, tuple(map(written, items)), params, span=first_line(span))
 
 
-def _mixture(items: tuple[Node, ...], drawn: _Drawn, cx: Context) -> tuple[Situation, ...]:
+def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
     """Read situations; not all weights may be 0."""
-    situations = [_situation(item, drawn, cx) for item in items]
+    situations = [_situation(item, outer) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
-        cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
+        outer.cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
     return tuple(situations)
 
 
-def _situation(node: Node, drawn: _Drawn, cx: Context) -> Situation:
+def _situation(node: Node, outer: _Draws) -> Situation:
     """Read one situation, or one of its branches."""
-    keys = read(SituationKeys, cx, node, "a situation")
-    draws = _Draws(cx, drawn)
+    keys = read(SituationKeys, outer.cx, node, "a situation")
+    draws = _Draws(outer.cx, outer.ready, outer.locals)
     draws.read(keys)
-    choices = cx.reader.items(keys.choose, "`choose`")
-    branches = _mixture(choices, draws.drawn, cx)
+    choices = outer.cx.reader.items(keys.choose, "`choose`")
+    branches = _mixture(choices, draws)
     if not choices and isinstance(node, Mapping):
-        _all_drawn(f"the situation `{keys.name}`" if keys.name else "this situation", draws, node, cx)
+        draws.require_all(f"the situation `{keys.name}`" if keys.name else "this situation", node)
     return Situation(keys.name, keys.weight, tuple(draws.found), branches)
 
 
-def _all_drawn(called: str, draws: _Draws, node: Node, cx: Context) -> None:
-    """Report states without initial value."""
-    undrawn = [column.name for column in cx.names.columns if column.name not in draws.drawn.states]
-    missing = list(dict.fromkeys(map(base_name, undrawn)))
-    if missing and not draws.failed:
-        listed = ", ".join(f"`{column}`" for column in missing)
-        message = f"{called} draws no value for {listed}"
-        cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
-
-
 class _Draws:
-    """The assignments of one situation; local names are resolved where they are first needed."""
+    """The assignments of one situation; local names are resolved where they are first needed.
 
-    def __init__(self, cx: Context, drawn: _Drawn) -> None:
+    Attributes:
+        found: assignments, in order.
+        ready: columns, and components of local names, that have a value so far.
+        locals: local names that have a value so far.
+    """
+
+    def __init__(
+        self, cx: Context, ready: frozenset[str], known: MappingType[str, Name] = MappingProxyType({})
+    ) -> None:
         self.cx = cx
-        self.drawn = drawn
         self.found: list[Assign] = []
         self.failed = False
-        self.lets: dict[str, Node] = {}
+        self.ready = ready
+        self.locals = dict(known)
+        self.unresolved: dict[str, Node] = {}
+
+    @property
+    def drawing(self) -> Context:
+        """Context for expressions that may draw, and read names with a value."""
+        return self.cx.drawing(self.locals, self.ready)
+
+    def require_all(self, called: str, node: Node) -> None:
+        """Report states without initial value."""
+        undrawn = [column.name for column in self.cx.names.columns if column.name not in self.ready]
+        missing = list(dict.fromkeys(map(base_name, undrawn)))
+        if missing and not self.failed:
+            listed = ", ".join(f"`{column}`" for column in missing)
+            message = f"{called} draws no value for {listed}"
+            self.cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
 
     def read(self, keys: SituationKeys | InitKeys) -> None:
         """`let`, `draw` and `also`, in the order of their dependencies."""
@@ -229,14 +226,14 @@ class _Draws:
                 message = f"`{entry.key.text}` is already the name of something"
                 reader.report("E102", message, entry.key.span)
             else:
-                self.lets[entry.key.text] = entry.value
+                self.unresolved[entry.key.text] = entry.value
         also_node = keys.also if isinstance(keys, SituationKeys) else None
         also = {entry.key.text: entry for entry in reader.entries(also_node, "`also`")}
         for entry in reader.entries(keys.draw, "`draw`"):
             self._draw(also.pop(entry.key.text, entry), "`draw`")
         for entry in also.values():
             self._draw(entry, "`also`")
-        for name in list(self.lets):
+        for name in list(self.unresolved):
             self._let(name)
         self.failed = len(reader.findings) > before
 
@@ -246,61 +243,60 @@ class _Draws:
         if not columns:
             return
         self._needed(entry.value)
-        self.found.extend(shared_draws(state_assigns(entry, where, self.drawn.drawing(self.cx))))
-        self.drawn = replace(self.drawn, states=self.drawn.states | {column.name for column in columns})
+        self.found.extend(shared_draws(state_assigns(entry, where, self.drawing)))
+        self.ready |= {column.name for column in columns}
 
     def _needed(self, node: Node) -> None:
         """Resolve the local names that an expression mentions."""
         texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
-        for name in list(self.lets):
+        for name in list(self.unresolved):
             if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
                 self._let(name)
 
     def _let(self, name: str) -> None:
         """Resolve a local name, and the local names that it reads."""
-        if name not in self.lets:
+        if name not in self.unresolved:
             return
-        node = self.lets.pop(name)
+        node = self.unresolved.pop(name)
         self._needed(node)
-        numbers = self.drawn.drawing(self.cx).here.numbers(node, f"`{name}`")
+        numbers = self.drawing.here.numbers(node, f"`{name}`")
         known: Number | VectorValue = Number(ir.Const(0.0), flexible=True)
         if numbers is not None:
             vector = len(numbers) > 1 or isinstance(node, Sequence)
             called = component_names(name, len(numbers) if vector else None)
-            assigns = [
-                Assign(each, number.num, written(node)) for each, number in zip(called, numbers, strict=True)
-            ]
-            self.found.extend(shared_draws(assigns))
+            pairs = list(zip(called, numbers, strict=True))
+            self.found.extend(shared_draws([Assign(each, num.num, written(node)) for each, num in pairs]))
             items = tuple(
                 replace(number, num=ir.Signal(each), exact=None, span=None, origin=None)
-                for each, number in zip(called, numbers, strict=True)
+                for each, number in pairs
             )
             known = VectorValue(items) if vector else items[0]
-        self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))
+            self.ready |= set(called)
+        self.locals[name] = Known(known, "local name")
 
 
 # ---------------------------------------------------------------------------- given states
 
 
-def _known(keys: InitKeys, node: Node, drawn: _Drawn, cx: Context) -> Situation:
+def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
     """Situation whose states come from a grid or a file, except for those that it draws."""
+    cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
         column.name
         for column in cx.names.columns
-        if column.name not in drawn.states and not {column.name, base_name(column.name)} & rest
+        if column.name not in draws.ready and not {column.name, base_name(column.name)} & rest
     ]
     points: GridDecl | FileDecl | None
     if keys.grid is not None:
         points = _grid(keys.grid, cx)
-        taken = {name for name, _ in points.axes}
+        draws.ready |= {name for name, _ in points.axes}
     else:
         assert keys.from_ is not None
         points = _file(keys.from_, tuple(missing), cx)
-        taken = set(missing)
-    draws = _Draws(cx, replace(drawn, states=drawn.states | taken))
+        draws.ready |= set(missing)
     draws.read(keys)
-    _all_drawn("the grid", draws, node, cx)
+    draws.require_all("the grid", node)
     return Situation("grid" if keys.grid is not None else "from", 1.0, tuple(draws.found), (), points)
 
 

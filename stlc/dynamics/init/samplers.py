@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -40,7 +39,11 @@ class _Draws:
         self.weight = situation.weight
         self.draws = tuple(Drawing(assign) for assign in situation.draws)
         self.mixture = _Mixture(situation.branches) if situation.branches else None
-        self.points = points_of(situation.points) if situation.points is not None else None
+        self.points: _Grid | _File | None = None
+        if isinstance(situation.points, GridDecl):
+            self.points = _Grid(situation.points)
+        elif situation.points is not None:
+            self.points = _File(situation.points)
 
     def __call__(self, table: Table, rows: Rows) -> Table:
         """`table` with the names of this situation added, (count,) each."""
@@ -88,11 +91,7 @@ class InitialStates:
         self._params = tuple(Drawing(assign) for assign in decl.params)
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
-        self._where = (
-            ArrayProgram({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)})
-            if decl.where
-            else None
-        )
+        self._where = ArrayProgram({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)})
 
     @property
     def acceptance(self) -> float:
@@ -104,7 +103,7 @@ class InitialStates:
 
         Raises SystemFileError (S301) where (nearly) every proposed state is rejected.
         """
-        if self._where is None:
+        if not self.decl.where:
             self.drawn, self.kept = self.drawn + n, self.kept + n
             return self._propose(n, generator)
         found: list[Tensor] = []
@@ -141,11 +140,10 @@ class InitialStates:
 
     def _each_holds(self, states: Tensor) -> Tensor:
         """Mask of the states per condition of `where`, (conditions, n)."""
-        if self._where is None:
-            return torch.ones(0, len(states), dtype=torch.bool, device=states.device)
         env = dict(zip(self.names, states.unbind(1), strict=True))
         marks = self._where(env, TORCH, _HARD)
-        return torch.stack([mark.expand(len(states)) > 0.5 for mark in marks.values()])
+        found = [mark.expand(len(states)) > 0.5 for mark in marks.values()]
+        return torch.stack(found) if found else torch.ones(0, len(states), dtype=torch.bool)
 
     def require_many(self, n: int = 256, *, seed: int = 0) -> None:
         """Raise SystemFileError (S301) where less than 1 % of proposed states is accepted."""
@@ -156,16 +154,15 @@ class InitialStates:
             raise self._rejected(drawn, kept)
 
     def _rejected(self, drawn: int, kept: int) -> SystemFileError:
+        message = f"of {drawn} initial states that were drawn, {kept} meet every condition of `where`"
         return SystemFileError(
-            Diagnostic(
-                "S301",
-                f"of {drawn} initial states that were drawn, {kept} meet every condition of `where`",
-                self.decl.span,
-                label="too narrow, or it contradicts `mixture`",
-                help=("draw the states closer to what `where` asks for",),
-                note=self._rates(),
-            )
+            self._finding("S301", message, "too narrow, or it contradicts `mixture`", self._rates())
         )
+
+    def _finding(self, code: str, message: str, label: str, note: tuple[str, ...] = ()) -> Diagnostic:
+        """A finding about the conditions of `where`."""
+        advice = "draw the states closer to what `where` asks for"
+        return Diagnostic(code, message, self.decl.span, label, help=(advice,), note=note)
 
     def _rates(self) -> tuple[str, ...]:
         """Share of proposed states that meet each condition, the smallest first."""
@@ -178,30 +175,11 @@ class InitialStates:
         """W601 where few of the proposed states were accepted."""
         if self.acceptance >= FEW:
             return ()
-        return (
-            Diagnostic(
-                "W601",
-                f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`",
-                self.decl.span,
-                label="sampling is slow",
-                help=("draw the states closer to what `where` asks for",),
-            ),
-        )
+        message = f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`"
+        return (self._finding("W601", message, "sampling is slow"),)
 
 
 # ------------------------------------------------------------------------- given states
-
-
-class Points(Protocol):
-    """A set of given states."""
-
-    def __call__(self, rows: Rows) -> dict[str, Tensor]:
-        """Draw a given state for every row, (count,) float64 by name."""
-
-
-def points_of(decl: GridDecl | FileDecl) -> Points:
-    """The given states of a declaration; a file is read at the first draw."""
-    return _Grid(decl) if isinstance(decl, GridDecl) else _File(decl)
 
 
 class _Grid:

@@ -7,9 +7,12 @@ components with feedback are stepped, after the loop invariants have been comput
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import TypeAlias
+
+import numpy as np
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import add, map_parts, multiply, names_in
@@ -136,44 +139,21 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
 
 
 def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
-    """Strongly connected components, dependencies first (Tarjan's algorithm, without recursion)."""
-    order: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-    for root in reads:
-        path: list[tuple[str, Iterator[str]]] = (
-            [] if root in order else [_enter(root, reads, order, low, stack)]
-        )
-        while path:
-            name, rest = path[-1]
-            other = next(rest, None)
-            if other is None:
-                path.pop()
-                if path:
-                    low[path[-1][0]] = min(low[path[-1][0]], low[name])
-                if low[name] == order[name]:
-                    at = stack.index(name)
-                    found.append(stack[at:])
-                    del stack[at:]
-            elif other not in order:
-                path.append(_enter(other, reads, order, low, stack))
-            elif other in stack:
-                low[name] = min(low[name], order[other])
-    return found
+    """Strongly connected components, dependencies first.
 
-
-def _enter(
-    name: str,
-    reads: Mapping[str, frozenset[str]],
-    order: dict[str, int],
-    low: dict[str, int],
-    stack: list[str],
-) -> tuple[str, Iterator[str]]:
-    """Number a name at its first visit."""
-    order[name] = low[name] = len(order)
-    stack.append(name)
-    return name, iter(sorted(reads[name]))
+    Names of one component reach the same names, and a component reaches more names than those it depends on.
+    """
+    names = list(reads)
+    index = {name: i for i, name in enumerate(names)}
+    reach = np.eye(len(names), dtype=np.float32)
+    for name, others in reads.items():
+        reach[index[name], [index[other] for other in others]] = 1.0
+    for _ in range(len(names).bit_length()):
+        reach = np.minimum(reach @ reach, 1.0)
+    groups: dict[bytes, list[str]] = {}
+    for i in np.argsort(reach.sum(1), kind="stable"):
+        groups.setdefault(reach[i].tobytes(), []).append(names[i])
+    return list(groups.values())
 
 
 # ------------------------------------------------------------------------------ hoisting
@@ -231,10 +211,7 @@ class Hoist:
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
         steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
-        moving.sort(key=lambda pair: pair[0] < 0)
-        total = _signed(*moving[0])
-        for sign, term in moving[1:]:
-            total = ir.Op("add" if sign > 0 else "sub", (total, term))
+        total = _signed_sum(moving)
         rest = _total(steady)
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
@@ -243,15 +220,8 @@ class Hoist:
         factors = _factors(num)
         moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
         steady = [factor for factor in factors if not names_in(factor) & self.moving]
-        result = moving[0]
-        for factor in moving[1:]:
-            result = multiply(result, factor)
-        if not steady:
-            return result
-        scale = steady[0]
-        for factor in steady[1:]:
-            scale = multiply(scale, factor)
-        return multiply(result, self._steady(scale))
+        result = reduce(multiply, moving)
+        return multiply(result, self._steady(reduce(multiply, steady))) if steady else result
 
 
 def _terms(num: ir.Num, sign: int = 1) -> list[tuple[int, ir.Num]]:
@@ -276,18 +246,20 @@ def _factors(num: ir.Num) -> list[ir.Num]:
             return [num]
 
 
-def _signed(sign: int, num: ir.Num) -> ir.Num:
-    return num if sign > 0 else ir.Op("neg", (num,))
+def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
+    """Sum of signed terms, positive ones first."""
+    (sign, total), *rest = sorted(terms, key=lambda pair: pair[0] < 0)
+    total = total if sign > 0 else ir.Op("neg", (total,))
+    for sign, term in rest:
+        total = ir.Op("add" if sign > 0 else "sub", (total, term))
+    return total
 
 
 def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
     """Invariant terms as one number, constants folded."""
     constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
-    total: ir.Num | None = None
-    for sign, term in sorted(
-        ((s, t) for s, t in terms if not isinstance(t, ir.Const)), key=lambda pair: pair[0] < 0
-    ):
-        total = _signed(sign, term) if total is None else ir.Op("add" if sign > 0 else "sub", (total, term))
-    if total is None:
+    variable = [(sign, term) for sign, term in terms if not isinstance(term, ir.Const)]
+    if not variable:
         return ir.Const(constant)
+    total = _signed_sum(variable)
     return total if constant == 0.0 else add(total, ir.Const(constant))

@@ -7,6 +7,7 @@ and sums: the torch graph and the C kernel compute the same few operations.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import TypeAlias
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.robots.urdf import Doubles, Joint
 
-Point: TypeAlias = tuple[ir.Num, ir.Num, ir.Num]
+Point: TypeAlias = tuple[ir.Num, ...]
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
@@ -22,7 +23,7 @@ def position(joints: Sequence[Joint]) -> ir.Body:
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
     writer = _Lines()
-    point: Point = (ir.Const(0.0), ir.Const(0.0), ir.Const(0.0))
+    point: Point = (ir.Const(0.0),) * 3
     for joint in reversed(joints):
         if joint.kind == "revolute":
             point = _turned(joint.axis, point, ir.Signal(formals[joint.name]), writer)
@@ -56,41 +57,35 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point
     x, y, z = axis
     aside = _linear(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), point)
     cosine, sine = (writer.name(ir.Op(name, (angle,))) for name in ("cos", "sin"))
-    a, b, c = (
+    return tuple(
         writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)))
         for kept, part, turned in zip(along, across, aside, strict=True)
     )
-    return a, b, c
 
 
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Point:
     """A point translated along an axis."""
-    a, b, c = (
+    return tuple(
         writer.name(_sum(part, _product(ir.Const(float(share)), length)))
         for part, share in zip(point, axis, strict=True)
     )
-    return a, b, c
 
 
 def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: _Lines) -> Point:
     """`rotation @ point + offset`."""
-    a, b, c = (
+    return tuple(
         writer.name(_sum(part, ir.Const(float(shift))))
         for part, shift in zip(_linear(rotation, point), offset, strict=True)
     )
-    return a, b, c
 
 
 def _linear(matrix: Doubles, point: Point) -> Point:
     """`matrix @ point`, constants folded."""
-    rows: list[ir.Num] = []
-    for row in matrix:
-        total: ir.Num = ir.Const(0.0)
-        for factor, part in zip(row, point, strict=True):
-            total = _sum(total, _product(ir.Const(float(factor)), part))
-        rows.append(total)
-    a, b, c = rows
-    return a, b, c
+    zero: ir.Num = ir.Const(0.0)
+    return tuple(
+        reduce(_sum, (_product(ir.Const(float(a)), part) for a, part in zip(row, point, strict=True)), zero)
+        for row in matrix
+    )
 
 
 def _sum(left: ir.Num, right: ir.Num) -> ir.Num:
