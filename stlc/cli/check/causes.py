@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import typer
+from typing import TYPE_CHECKING
 
 from stlc.cli.check.text import in_unit
-from stlc.cli.framework.output import emit, emit_json, wants_color
+from stlc.cli.framework.documents import CauseNodeRecord, Explanation, ViolationCause
+from stlc.cli.framework.output import Answer, emit, wants_color
 from stlc.compile.ir.traverse import margin_unit
 from stlc.escape import visible
 
@@ -23,27 +22,25 @@ if TYPE_CHECKING:
 _WIDTH = 72
 
 
-def explain_trace(name: str, question: Question, runs: Path, *, as_json: bool) -> None:
-    """Judge a trace, print the tree of causes of every violation, and exit with the verdict's code."""
+def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> Answer[Explanation]:
+    """Judge a trace and explain every violation; the exit code is that of the verdict."""
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
-    result = judge(name, question, runs, talk=not as_json)
-    code = EXIT_CODES.get(result.verdict.overall, SATISFIED)
-    if as_json:
-        causes = [_values(cause, result) for cause in result.causes.values()]
-        found = {"trace": result.trace.name, "verdict": result.verdict.overall, "causes": causes}
-        emit_json("explain/1", ok=code == 0, exit_code=code, diagnostics=result.warnings, result=found)
-    else:
-        emit(_told(result), styled=True)
-    raise typer.Exit(code)
-
-
-def _told(result: Checked) -> str:
-    blocks = ["\n".join(_lines(cause, result)) for cause in result.causes.values()]
-    if blocks:
-        return "\n\n".join(blocks)
-    return f"{visible(result.trace.name)}: nothing is violated ({result.verdict.overall})"
+    result = judge(name, question, runs, talk=talk)
+    causes = result.causes.values()
+    text = "\n\n".join("\n".join(_lines(cause, result)) for cause in causes)
+    nothing = f"{visible(result.trace.name)}: nothing is violated ({result.verdict.overall})"
+    return Answer(
+        {
+            "trace": result.trace.name,
+            "verdict": result.verdict.overall,
+            "causes": [_record(cause, result) for cause in causes],
+        },
+        lambda: emit(text or nothing, styled=True),
+        EXIT_CODES.get(result.verdict.overall, SATISFIED),
+        result.warnings,
+    )
 
 
 def _lines(cause: Cause, result: Checked) -> Iterator[str]:
@@ -82,12 +79,12 @@ def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
     if node.until is not None and node.until > node.sample:
         when = f"from {when} to {subject.moment(node.until)}".replace("to t = ", "to ")
     values = _readings(node, cause, result)
-    said = f", {', '.join(values)}" if values else ""
+    shown = f", {', '.join(values)}" if values else ""
     margin = in_unit(f"{node.rho:+.6g}", margin_unit(node.formula))
-    return f"{short}    is {str(node.holds).lower()} at {when}{said}, robustness {margin}"
+    return f"{short}    is {str(node.holds).lower()} at {when}{shown}, robustness {margin}"
 
 
-def _readings(node: CauseNode, cause: Cause, result: Checked) -> Sequence[str]:
+def _readings(node: CauseNode, cause: Cause, result: Checked) -> list[str]:
     from stlc.monitor.explain.report import shown
 
     subject = result.verdict.subject
@@ -101,10 +98,10 @@ def _readings(node: CauseNode, cause: Cause, result: Checked) -> Sequence[str]:
     return found
 
 
-def _values(cause: Cause, result: Checked) -> dict[str, Any]:
-    """A cause as JSON values; the tree as a list of nodes with depths."""
+def _record(cause: Cause, result: Checked) -> ViolationCause:
+    """The record of a cause; the tree is a list of nodes with depths."""
     subject = result.verdict.subject
-    nodes = [
+    nodes: list[CauseNodeRecord] = [
         {
             "depth": depth,
             "text": " ".join(node.span.text.split()),

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from stlc.cli.framework import documents
 from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides, spec_files
-from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 
 if TYPE_CHECKING:
-    from stlc.compile.augment.timers import Timer
-    from stlc.compile.ir import typed
     from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.grammar import ast
 
 Part = Literal["all", "steps", "states", "ir", "ast", "dot"]
 
@@ -37,46 +35,43 @@ def compile_(
         Part, typer.Option("--show", metavar="PART", help="all, steps, states, ir, ast, or dot.")
     ] = "all",
     watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+    json: JsonOption = False,
+) -> Answer[documents.CompileResult]:
     """Show the compiled form of a specification, or its syntax tree.
 
     Intervals in seconds and in steps, added states, the safety part, the horizon. --show ast prints the
     syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc lint` also names, types
     and units.
     """
-    from stlc.diagnostics import Diagnostic, StlcError, UsageError
+    from stlc.diagnostics import Diagnostic, UsageError
 
     if show == "ast" or show == "dot":
-        _trees(spec_files(files), show, as_json=as_json)
-        return
+        return _trees(spec_files(files), show)
     if len(files) > 1:
         help_ = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")
         raise UsageError(Diagnostic("U101", "one specification is compiled at a time", help=help_))
     spec = Path(files[0])
     if not watch:
-        _show(spec, system, set_, show, as_json=as_json)
-        return
+        return _compiled(spec, system, set_, show)
     from stlc.cli.framework.watch import watch as watch_files
 
-    def again() -> None:
-        try:
-            _show(spec, system, set_, show, as_json=as_json)
-        except StlcError as error:
-            show_diagnostics(error.diagnostics)
-
-    watch_files(_files(spec, system), again)
+    watch_files(
+        _files(spec, system),
+        lambda: _compiled(spec, system, set_, show).print("compile/1", as_json=json),
+    )
+    raise typer.Exit
 
 
-def _trees(names: Sequence[str], show: Part, *, as_json: bool) -> None:
-    """Print syntax trees; the syntax errors of all files are raised together."""
+def _trees(
+    names: Sequence[str], show: Literal["ast", "dot"]
+) -> Answer[documents.ParsedFile | documents.ParsedFiles]:
+    """Parse specifications; the syntax errors of all files are raised together."""
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
     from stlc.grammar.parse.parser import parse
 
-    specs: list[ast.Spec] = []
-    findings: list[Diagnostic] = []
+    specs, findings = [], list[Diagnostic]()
     for name in names:
         try:
             specs.append(parse(read_source(name)))
@@ -84,11 +79,13 @@ def _trees(names: Sequence[str], show: Part, *, as_json: bool) -> None:
             findings += error.diagnostics
     if findings:
         raise SpecError(*findings)
-    if as_json:
-        trees = [{"file": name, "tree": as_values(spec)} for name, spec in zip(names, specs, strict=True)]
-        emit_json("compile/1", ok=True, exit_code=0, result=trees[0] if len(trees) == 1 else {"files": trees})
-    else:
-        emit(as_dot(specs) if show == "dot" else "\n\n".join(map(as_tree, specs)))
+    trees: list[documents.ParsedFile] = [
+        {"file": name, "tree": as_values(spec)} for name, spec in zip(names, specs, strict=True)
+    ]
+    return Answer(
+        trees[0] if len(trees) == 1 else {"files": trees},
+        lambda: emit(as_dot(specs) if show == "dot" else "\n\n".join(map(as_tree, specs))),
+    )
 
 
 def _files(spec: Path, system: str | None) -> list[str]:
@@ -105,31 +102,17 @@ def _files(spec: Path, system: str | None) -> list[str]:
         return [str(spec)]
 
 
-def _show(
-    spec: Path,
+def _compiled(
+    path: Path,
     system: str | None,
     set_: list[str] | None,
     show: Literal["all", "steps", "states", "ir"],
-    *,
-    as_json: bool,
-) -> None:
-    from stlc.compile.dump import dump
-
-    compiled, decl = _compiled(spec, system, parse_overrides(set_))
-    if as_json:
-        result = _result(compiled, decl)
-        emit_json("compile/1", ok=True, exit_code=0, diagnostics=compiled.warnings, result=result)
-        return
-    say(f"system {decl.path}")
-    show_diagnostics(compiled.warnings)
-    emit(dump(compiled, show).rstrip("\n"))
-
-
-def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
+) -> Answer[documents.CompiledSpec]:
     """Read both files and run the compiler; torch is not needed.
 
     A specification that judges closed-loop runs of its system is compiled for recorded traces.
     """
+    from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
     from stlc.diagnostics import Diagnostic, UsageError
@@ -137,67 +120,65 @@ def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> t
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
 
+    overrides = parse_overrides(set_)
     path = find_spec(path)
     spec = parse(read_source(path))
     wanted = system or spec.system
     if wanted is None:
-        raise UsageError(
-            Diagnostic(
-                "U101",
-                f"`{path}` names no system",
-                help=(f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification'),
-            )
-        )
+        help_ = (f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification')
+        raise UsageError(Diagnostic("U101", f"`{path}` names no system", help=help_))
     decl = load_system_decl(find_system(wanted, path), overrides)
-    grid = Grid(decl.dt, decl.horizon)
-    interface = decl.interface()
     purpose: Purpose = "check" if decl.judges_by(path) else "train"
-    return compile_spec(spec, grid=grid, interface=interface, overrides=overrides, purpose=purpose), decl
+    grid = Grid(decl.dt, decl.horizon)
+    compiled = compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides, purpose=purpose)
+
+    def tell() -> None:
+        say(f"system {decl.path}")
+        show_diagnostics(compiled.warnings)
+        emit(dump(compiled, show).rstrip("\n"))
+
+    return Answer(_record(compiled, decl), tell, diagnostics=compiled.warnings)
 
 
-def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
+def _record(compiled: Compiled, decl: SystemDecl) -> documents.CompiledSpec:
     from stlc.provenance import sha256
 
     steps = compiled.grid.horizon or 0
     source = compiled.spec.source
-    added = [*map(_parameter, compiled.parameters), *map(_added, compiled.timers)]
+    added: list[documents.AddedState] = [
+        {
+            "name": each.column.name,
+            "kind": "param",
+            "initial": None,
+            "range": [each.column.low, each.column.high],
+            "about": f"{each.text}, drawn for every trajectory",
+        }
+        for each in compiled.parameters
+    ]
+    added += [
+        {
+            "name": timer.name,
+            "kind": timer.kind,
+            "initial": timer.initial,
+            "range": [timer.low, timer.high],
+            "about": timer.about,
+        }
+        for timer in compiled.timers
+    ]
     return {
         "spec": source.name,
         "spec_sha256": sha256(source.text),
         "system": str(decl.path),
         "dt": float(decl.dt),
         "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
-        "states": [*decl.signature.names, *(item["name"] for item in added)],
+        "states": [*decl.signature.names, *(state["name"] for state in added)],
         "added": added,
         "safety": [rule.name for rule in compiled.safety],
         "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
     }
 
 
-def _parameter(each: typed.Parameter) -> dict[str, Any]:
-    """A parameter that the compiler adds to the state."""
-    column = each.column
-    return {
-        "name": column.name,
-        "kind": "param",
-        "initial": None,
-        "range": [column.low, column.high],
-        "about": f"{each.text}, drawn for every trajectory",
-    }
-
-
-def _added(timer: Timer) -> dict[str, Any]:
-    """A timer that the compiler adds to the state."""
-    return {
-        "name": timer.name,
-        "kind": timer.kind,
-        "initial": timer.initial,
-        "range": [timer.low, timer.high],
-        "about": timer.about,
-    }
-
-
-def _requirement(rule: CompiledRequirement, dt: float) -> dict[str, Any]:
+def _requirement(rule: CompiledRequirement, dt: float) -> documents.RequirementInSteps:
     return {
         "name": rule.name,
         "doc": rule.doc,
@@ -209,7 +190,7 @@ def _requirement(rule: CompiledRequirement, dt: float) -> dict[str, Any]:
     }
 
 
-def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[dict[str, Any]]:
+def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[documents.WrittenInterval]:
     """The windows of a compiled formula; an upper end of None is the end of the trace."""
     from stlc.compile.ir import nodes as ir
     from stlc.compile.ir.traverse import nodes
@@ -217,7 +198,7 @@ def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[dict[str, Any]]
     for node in nodes(rule.formula):
         if not isinstance(node, ir.Windowed):
             continue
-        steps = (node.window.lo, node.window.hi)
+        steps = [node.window.lo, node.window.hi]
         yield {
             "operator": node.op,
             "steps": steps,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated
@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework.options import (
-    JsonOption,
-    parse_overrides,
-)
-from stlc.cli.framework.output import emit, emit_json, table
+from stlc.cli.framework import documents
+from stlc.cli.framework.options import JsonOption, parse_overrides
+from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, UsageError
 from stlc.registry import closest
@@ -48,8 +46,14 @@ def explain(
         typer.Option("--guarantee", help="Of a run: how likely its backup meets a plan that works."),
     ] = False,
     reading: given.Traces = given.TRACES,
-    as_json: JsonOption = False,
-) -> None:
+    json: JsonOption = False,
+) -> Answer[
+    documents.CodeList
+    | documents.ManualPage
+    | documents.SpecInWords
+    | documents.Explanation
+    | documents.Guarantee
+]:
     """Explain a code, a specification, or the violations of a trace.
 
     A code's page has a wrong and a right example; without an argument all codes are listed. `precedence`
@@ -57,26 +61,18 @@ def explain(
     trace, each violation is traced back to the sub-formula, the instant, the signal and its value.
     """
     if guarantee:
-        _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_), as_json=as_json)
-    elif what is None:
-        _list_codes(as_json=as_json)
-    elif _CODE.fullmatch(what):
-        _page(_code(what.upper()), as_json=as_json)
-    elif what in _TOPICS:
-        _page(what, as_json=as_json)
-    elif what == "-" or Path(what).suffix in (".stl", ".stlc"):
-        _spec(what, reading.require or [], as_json=as_json)
-    else:
-        from stlc.cli.check.causes import explain_trace
+        return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
+    if what is None:
+        return Answer({"codes": CODES}, lambda: emit(table(list(CODES.items()), indent="")))
+    if _CODE.fullmatch(what):
+        return _page(_code(what.upper()))
+    if what in _TOPICS:
+        return _page(what)
+    if what == "-" or Path(what).suffix in (".stl", ".stlc"):
+        return _spec(what, reading.require or [])
+    from stlc.cli.check.causes import explain_trace
 
-        explain_trace(what, reading.question(at=at), reading.runs, as_json=as_json)
-
-
-def _list_codes(*, as_json: bool) -> None:
-    if as_json:
-        emit_json("explain/1", ok=True, exit_code=0, result={"codes": CODES})
-    else:
-        emit(table(list(CODES.items()), indent=""))
+    return explain_trace(what, reading.question(at=at), reading.runs, talk=not json)
 
 
 def _code(code: str) -> str:
@@ -87,21 +83,24 @@ def _code(code: str) -> str:
     return code
 
 
-def _page(name: str, *, as_json: bool) -> None:
+def _page(name: str) -> Answer[documents.ManualPage]:
     page = read_page(name)
     assert page is not None, f"{name} has no page"
-    if as_json:
-        examples = [
-            {"language": example.language, "notes": example.notes, "text": example.body}
-            for example in page.examples
-        ]
-        result = {"name": name, "title": page.title, "text": page.text, "examples": examples}
-        emit_json("explain/1", ok=True, exit_code=0, result=result)
-    else:
-        emit(in_terminal(page).rstrip("\n"))
+    return Answer(
+        {
+            "name": name,
+            "title": page.title,
+            "text": page.text,
+            "examples": [
+                {"language": example.language, "notes": list(example.notes), "text": example.body}
+                for example in page.examples
+            ],
+        },
+        lambda: emit("\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()),
+    )
 
 
-def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
+def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
     """Every requirement of a specification in English."""
     from stlc.files import find_spec, read_source
     from stlc.grammar import ast
@@ -116,7 +115,7 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
             advice = (f"did you mean `{near}`?",) if near else ()
             raise UsageError(Diagnostic("U101", f"`{name}` has no requirement `{one}`", help=advice))
     meanings = Meanings(spec)
-    told = [
+    found: list[documents.RequirementInWords] = [
         {
             "name": item.name,
             "kind": "require" if isinstance(item, ast.Require) else "assume",
@@ -128,23 +127,17 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
         for item in items
         if not wanted or item.name in wanted
     ]
-    if as_json:
-        emit_json("explain/1", ok=True, exit_code=0, result={"spec": name, "requirements": told})
-    else:
-        emit("\n\n".join(map(_told, told)) if told else f"{name} requires nothing")
+    text = "\n\n".join("\n".join(_in_words(each)) for each in found)
+    return Answer({"spec": name, "requirements": found}, lambda: emit(text or f"{name} requires nothing"))
 
 
-def _told(entry: Mapping[str, object]) -> str:
-    tags, doc, where = entry["tags"], entry["doc"], entry["where"]
-    head = f"{entry['name']}" if entry["kind"] == "require" else f"{entry['name']} (assumed)"
-    lines = [head + (f"  [{', '.join(tags)}]" if isinstance(tags, list) and tags else "")]
-    lines += [f"  # {line}" for line in str(doc).splitlines()]
-    lines.append(fill(str(entry["sentence"]), 96, initial_indent="  ", subsequent_indent="  "))
-    if isinstance(where, dict):
-        for name, meaning in where.items():
-            text = f"{name}: {meaning}"
-            lines.append(fill(text, 96, initial_indent="    where ", subsequent_indent="          "))
-    return "\n".join(lines)
+def _in_words(requirement: documents.RequirementInWords) -> Iterator[str]:
+    tags = f"  [{', '.join(requirement['tags'])}]" if requirement["tags"] else ""
+    yield requirement["name"] + (" (assumed)" if requirement["kind"] == "assume" else "") + tags
+    yield from (f"  # {line}" for line in requirement["doc"].splitlines())
+    yield fill(requirement["sentence"], 96, initial_indent="  ", subsequent_indent="  ")
+    for name, meaning in requirement["where"].items():
+        yield fill(f"{name}: {meaning}", 96, initial_indent="    where ", subsequent_indent="          ")
 
 
 # -------------------------------------------------------------------------- pages of codes
@@ -198,12 +191,8 @@ def read_page(name: str) -> Page | None:
     return Page(title.removeprefix("# "), text.strip("\n") + "\n")
 
 
-def in_terminal(page: Page) -> str:
-    """The page as plain text: blocks indented, mark-up removed."""
-    return "\n".join([page.title, "", *_plain_lines(page.text)]).rstrip() + "\n"
-
-
 def _plain_lines(text: str) -> Iterator[str]:
+    """The lines of a page as plain text: blocks indented, mark-up removed."""
     inside = False
     for line in text.splitlines():
         if line.startswith("```"):
@@ -228,8 +217,8 @@ ASSUMED = (
 )
 
 
-def _guarantee(run: str, runs: Path, overrides: Mapping[str, str], *, as_json: bool) -> None:
-    """Print the probabilities for the grid of a run's system, and what they assume."""
+def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
+    """Probabilities for the grid of a run's system, and their assumptions."""
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances
     from stlc.controller.training.run import load_task
@@ -239,16 +228,15 @@ def _guarantee(run: str, runs: Path, overrides: Mapping[str, str], *, as_json: b
     task = load_task(folder, overrides)
     grid = grid_of(task)
     axes, found = axes_of(task, grid), chances(task, grid)
-    if as_json:
-        result = {
+    return Answer(
+        {
             "run": folder.name,
             "assumptions": list(ASSUMED),
-            "controls": [asdict(axis) for axis in axes],
-            "chances": [asdict(each) for each in found],
-        }
-        emit_json("explain/1", ok=True, exit_code=0, result=result)
-    else:
-        emit("\n".join(_guarantee_lines(folder.name, axes, found)))
+            "controls": [documents.record(documents.TriedControl, axis) for axis in axes],
+            "chances": [documents.record(documents.ChanceOfPrefix, each) for each in found],
+        },
+        lambda: emit("\n".join(_guarantee_lines(folder.name, axes, found))),
+    )
 
 
 def _guarantee_lines(run: str, axes: Sequence[Axis], found: Sequence[Chance]) -> list[str]:

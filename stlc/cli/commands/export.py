@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption
-from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.documents import ExportCheck, ExportedRun, record
+from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 
@@ -24,8 +25,7 @@ def export(
         typer.Option("--output", "-o", "--out", metavar="DIR", help="By default in the run's folder."),
     ] = None,
     runs: RunsOption = Path("runs"),
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer[ExportedRun]:
     """Export a trained controller, monitor included.
 
     `torch` is a torch.export program: states in, plans and their robustness out. `c` is a C99 header that
@@ -41,25 +41,32 @@ def export(
     opened = Run.open(run, root=runs)
     shown = output or Path(opened.dir.shown) / "export" / target
     done = write(opened, target, shown)
-    found = done.agreement
-    if as_json:
-        checked = None if found is None else {"states": found.states, "plan": found.plan, "rho": found.rho}
-        taken = done.latency
-        latency = None if taken is None else {"median_ms": taken.median, "p99_ms": taken.p99}
-        result = {"run": opened.dir.shown, "target": target, "folder": str(shown), "files": list(done.files)}
-        emit_json("export/1", ok=True, exit_code=0, result={**result, "checked": checked, "latency": latency})
-        return
-    if found is None:
-        say(f"not checked: {done.unchecked}")
-    else:
-        say(
-            f"checked in {found.states} random states: plans within {found.plan:.1e} of a range, "
-            f"robustness within {found.rho:.1e}"
-        )
-    if done.latency is not None:
-        say(
-            f"decides in {done.latency.median:.2f} ms, 99 % within {done.latency.p99:.2f} ms: "
-            "one agent, one thread, stlc.runtime"
-        )
-    for name in done.files:
-        emit(visible(str(shown / name)))
+    found, taken = done.agreement, done.latency
+
+    def show() -> None:
+        if found is None:
+            say(f"not checked: {done.unchecked}")
+        else:
+            say(
+                f"checked in {found.states} random states: plans within {found.plan:.1e} of a range, "
+                f"robustness within {found.rho:.1e}"
+            )
+        if taken is not None:
+            say(
+                f"decides in {taken.median:.2f} ms, 99 % within {taken.p99:.2f} ms: "
+                "one agent, one thread, stlc.runtime"
+            )
+        for name in done.files:
+            emit(visible(str(shown / name)))
+
+    return Answer(
+        {
+            "run": opened.dir.shown,
+            "target": target,
+            "folder": str(shown),
+            "files": list(done.files),
+            "checked": None if found is None else record(ExportCheck, found),
+            "latency": None if taken is None else {"median_ms": taken.median, "p99_ms": taken.p99},
+        },
+        show,
+    )

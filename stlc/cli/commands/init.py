@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption
-from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.documents import CreatedFiles
+from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.escape import operand, shell, visible
@@ -65,8 +65,7 @@ def init(
         str | None, typer.Option("--system", metavar="NAME", help="Write this system file only.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer[CreatedFiles]:
     """Create a project, or one specification or system.
 
     The example trains in a minute; settings for git and the editor are included. Existing files are
@@ -91,12 +90,13 @@ def init(
     if spec is None and system is None:
         for name in ("specs", "systems"):
             (folder / name).mkdir(parents=True, exist_ok=True)
-    if as_json:
-        emit_json("init/1", ok=True, exit_code=0, result={"files": [str(path) for path in files]})
-        return
-    for path in files:
-        emit(visible(str(path)))
-    say(f"next: {following}")
+
+    def show() -> None:
+        for path in files:
+            emit(visible(str(path)))
+        say(f"next: {following}")
+
+    return Answer({"files": [str(path) for path in files]}, show)
 
 
 def _require_new(paths: Iterable[Path], *, force: bool) -> None:

@@ -3,52 +3,30 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from stlc.cli.framework.documents import LintedFiles
 from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
-from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, wants_color
+from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, Diagnostic, SpecError, StlcError, UsageError
+from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
 from stlc.source import Span
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from stlc.lint.lint import Selection, Surroundings
+    from stlc.lint.lint import Surroundings
     from stlc.source import Source
 
 Format = Literal["text", "json", "github", "sarif"]
 
 CLEAN, FOUND, INVALID = 0, 1, 3
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """Options for every file."""
-
-    selection: Selection
-    system: str | None
-    fix: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Result:
-    """Findings and number of repairs."""
-
-    files: tuple[str, ...]
-    findings: tuple[Diagnostic, ...]
-    fixed: int
-
-    def code(self, *, strict: bool) -> int:
-        """The exit code."""
-        if any(finding.severity == "error" for finding in self.findings):
-            return INVALID
-        return FOUND if strict and self.findings else CLEAN
 
 
 @command(
@@ -68,80 +46,58 @@ def lint(
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
     system: SystemOption = None,
     watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+    json: JsonOption = False,
+) -> Answer[LintedFiles]:
     """Report errors and warnings in specifications.
 
     Syntax, types, units, parentheses, unused names, vacuous requirements; with --system also checks against
     the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors. `stlc explain CODE` says what a
     code means.
     """
+    from stlc.files import find_spec, read_source, write_atomic
     from stlc.lint.lint import Selection
+    from stlc.lint.lint import fix as repair
+    from stlc.lint.lint import lint as lint_text
 
-    layout: Format = "json" if as_json else format_
     names = spec_files(files or ["."])
-    job = _Job(Selection(_codes(select), _codes(ignore)), system, fix)
-    if watch or fix:
-        for option, wanted in (("--watch", watch), ("--fix", fix)):
-            if wanted and STDIN in names:
-                raise UsageError(Diagnostic("U101", f"`{option}` needs files, not the standard input"))
+    for option, wanted in (("--watch", watch), ("--fix", fix)):
+        if wanted and STDIN in names:
+            raise UsageError(Diagnostic("U101", f"`{option}` needs files, not the standard input"))
+
+    selection = Selection(_codes(select), _codes(ignore))
+
+    def linted() -> Answer[LintedFiles]:
+        repairs, findings = 0, list[Diagnostic]()
+        for name in names:
+            try:
+                source = read_source(name if fix else find_spec(name))
+            except SpecError as error:
+                findings += error.diagnostics
+                continue
+            look = partial(lint_text, within=_surroundings(system, source), selection=selection)
+            if not fix:
+                findings += look(source)
+                continue
+            repaired = repair(source, look)
+            if repaired.count:
+                write_atomic(source.name, repaired.source.text)
+            repairs += repaired.count
+            findings += repaired.findings
+        errors = any(finding.severity == "error" for finding in findings)
+        result: LintedFiles = {"files": list(names), "findings": len(findings), "fixed": repairs}
+        code = INVALID if errors else FOUND if strict and findings else CLEAN
+        return Answer(result, lambda: _show(format_, result, findings, code), code, findings)
+
     if not watch:
-        result = _look(names, job)
-        code = result.code(strict=strict)
-        _show(result, layout, code)
-        raise typer.Exit(code)
+        return linted()
     from stlc.cli.framework.watch import watch as watch_files
 
-    def again() -> None:
-        try:
-            result = _look(names, job)
-        except StlcError as error:
-            show_diagnostics(error.diagnostics)
-            return
-        _show(result, layout, result.code(strict=strict))
-
-    watch_files(names, again)
+    watch_files(names, lambda: linted().print("lint/1", as_json=json))
+    raise typer.Exit
 
 
 def _codes(text: str | None) -> tuple[str, ...]:
     return tuple(code.strip().upper() for code in (text or "").split(",") if code.strip())
-
-
-def _look(names: Sequence[str], job: _Job) -> _Result:
-    """Lint every file, after repairing it if requested."""
-    from stlc.files import find_spec, read_source
-
-    findings: list[Diagnostic] = []
-    fixed = 0
-    for name in names:
-        try:
-            source = read_source(name if job.fix else find_spec(name))
-        except SpecError as error:
-            findings += error.diagnostics
-            continue
-        count, found = _one(source, job)
-        fixed += count
-        findings += found
-    return _Result(tuple(names), tuple(findings), fixed)
-
-
-def _one(source: Source, job: _Job) -> tuple[int, Sequence[Diagnostic]]:
-    """Number of repairs in a file, and the remaining findings."""
-    from stlc.files import write_atomic
-    from stlc.lint.lint import fix
-    from stlc.lint.lint import lint as lint_text
-
-    within = _surroundings(job.system, source)
-
-    def look(text: Source) -> Sequence[Diagnostic]:
-        return lint_text(text, within=within, selection=job.selection)
-
-    if not job.fix:
-        return 0, look(source)
-    done = fix(source, look)
-    if done.count:
-        write_atomic(source.name, done.source.text)
-    return done.count, done.findings
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
@@ -159,13 +115,12 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon), purpose)
 
 
-def _show(result: _Result, layout: Format, code: int) -> None:
-    """Print the findings; the layout never changes the exit code."""
-    findings = result.findings
-    match layout:
+def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], code: int) -> None:
+    """Print the findings; the format never changes the exit code."""
+    match format_:
         case "json":
-            entry = {"files": result.files, "findings": len(findings), "fixed": result.fixed}
-            emit_json("lint/1", ok=code == CLEAN, exit_code=code, diagnostics=findings, result=entry)
+            ok = code == CLEAN
+            emit_json("lint/1", ok=ok, exit_code=code, diagnostics=findings, result=result)
         case "github":
             if findings:
                 emit(github(findings))
@@ -173,25 +128,23 @@ def _show(result: _Result, layout: Format, code: int) -> None:
             from stlc.jsontext import dumps
 
             emit(dumps(sarif(findings), indent=2))
-        case _:
+        case "text":
             if findings:
                 from stlc.cli.framework.render import render_text
 
                 emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n", styled=True)
-            say(_summary(result))
+            say(_summary(result, findings))
 
 
-def _summary(result: _Result) -> str:
+def _summary(result: LintedFiles, findings: Sequence[Diagnostic]) -> str:
     """The last line: numbers of findings and files, and the next step."""
-    count = {"error": 0, "warning": 0}
-    for finding in result.findings:
-        count[finding.severity] += 1
-    files = _several(len(result.files), "file")
-    fixed = f"fixed {_several(result.fixed, 'finding')}; " if result.fixed else ""
-    if not result.findings:
+    count = Counter(finding.severity for finding in findings)
+    files = _several(len(result["files"]), "file")
+    fixed = f"fixed {_several(result['fixed'], 'finding')}; " if result["fixed"] else ""
+    if not findings:
         return f"{fixed}{files}, nothing to say"
-    found = ", ".join(_several(number, kind) for kind, number in count.items() if number)
-    repairable = sum(finding.fix is not None for finding in result.findings)
+    found = ", ".join(_several(count[kind], kind) for kind in ("error", "warning") if count[kind])
+    repairable = sum(finding.fix is not None for finding in findings)
     more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
     return f"{fixed}{found} in {files}{more}"
 

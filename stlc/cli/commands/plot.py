@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework.options import (
-    JsonOption,
-)
-from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.documents import PlottedTrace
+from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.escape import visible
@@ -42,8 +40,7 @@ def plot(
         bool, typer.Option("--places", help="Paths over the places of the specification.")
     ] = False,
     reading: given.Traces = given.TRACES,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer[PlottedTrace]:
     """Draw signals, and below them the robustness of the requirements.
 
     For a run, the trace in its folder is drawn. The worst and a typical trace are shown unless --trace
@@ -75,14 +72,13 @@ def plot(
         picture = draw_signals(_with_units(recorded, monitor.spec), margins, choices, units)
         shown = [choice.index for choice in choices]
     _save(picture, target)
-    if as_json:
-        result = {"trace": str(path), "picture": str(target), "shown": shown}
-        emit_json("plot/1", ok=True, exit_code=0, result=result)
-        return
-    say(f"trace {path}")
-    if note:
-        say(note)
-    emit(visible(str(target)))
+
+    def show() -> None:
+        for remark in filter(None, (f"trace {path}", note)):
+            say(remark)
+        emit(visible(str(target)))
+
+    return Answer({"trace": str(path), "picture": str(target), "shown": shown}, show)
 
 
 def _find(what: str, runs: Path) -> Path:
@@ -110,11 +106,8 @@ def _find(what: str, runs: Path) -> Path:
 def _target(output: Path | None, trace: Path) -> Path:
     target = output or trace.with_suffix(".svg")
     if target.suffix not in _FORMATS:
-        raise UsageError(
-            Diagnostic(
-                "U101", f"`{target}` is no picture", help=(f"its suffix is one of {' '.join(_FORMATS)}",)
-            )
-        )
+        advice = (f"its suffix is one of {' '.join(_FORMATS)}",)
+        raise UsageError(Diagnostic("U101", f"`{target}` is no picture", help=advice))
     return target
 
 
@@ -150,9 +143,8 @@ def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
     chart = map_of(monitor.spec, monitor.check(trace, require=wanted), trace)
     if chart is None:
         advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
-        raise UsageError(
-            Diagnostic("U101", f"no requirement of `{monitor.spec.name}` names a place", help=advice)
-        )
+        message = f"no requirement of `{monitor.spec.name}` names a place"
+        raise UsageError(Diagnostic("U101", message, help=advice))
     return draw_map(chart)
 
 
@@ -177,11 +169,10 @@ def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice
     return choose_traces(np.where(np.isfinite(least), least, np.nan), names, acted_in(trace))
 
 
-def _save(picture: object, target: Path) -> None:
+def _save(picture: Picture, target: Path) -> None:
     from stlc.files import atomic_path, write_atomic
-    from stlc.view.style import Picture, picture_style
+    from stlc.view.style import picture_style
 
-    assert isinstance(picture, Picture)
     match target.suffix:
         case ".svg":
             write_atomic(target, picture.svg())

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption
-from stlc.cli.framework.output import PULSE, emit, emit_json, say
+from stlc.cli.framework.documents import WrittenReport, verdict_record
+from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.output import PULSE, Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 
 
 @command("stlc report latest")
-def report(
-    run: RunArgument = "latest",
-    runs: RunsOption = Path("runs"),
-    as_json: JsonOption = False,
-) -> None:
+def report(run: RunArgument = "latest", runs: RunsOption = Path("runs")) -> Answer[WrittenReport]:
     """Write a self-contained report.html with the pictures of a run.
 
     It is written to the run's folder: training curves, signals with the robustness of each requirement, and
@@ -31,17 +28,19 @@ def report(
     path = f"{folder.shown}/report.html"
     record = folder.record()
     learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
-    if as_json:
-        result: dict[str, object] = {"run": folder.shown, "report": path}
-        result |= {} if learning is None else {"verdict": learning.summary()}
-        emit_json("report/1", ok=True, exit_code=0, result=result)
-    else:
+    result: WrittenReport = {"run": folder.shown, "report": path}
+    if learning is not None:
+        result["verdict"] = verdict_record(learning)
+
+    def show() -> None:
         for line in driven_lines(record.get("result") or {}):
             say(line)
         if learning is not None:
             say(f"{learning.level}: {learning.sentence}")
             if learning.worst:
                 say(learning.worst)
-        for advice in () if learning is None else learning.advice:
-            say(f"what helps: {advice}")
+            for advice in learning.advice:
+                say(f"what helps: {advice}")
         emit(visible(path))
+
+    return Answer(result, show)

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from stlc.cli.framework import documents
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import JsonOption, RunArgument
-from stlc.cli.framework.output import emit, emit_json, say, table
+from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.escape import visible
-from stlc.rundir import RunDir, every_run
+from stlc.rundir import RUNS, RunDir, every_run, remove_run
 
 Sort = Literal["time", "acc", "name"]
-
-_Runs = Annotated[Path, typer.Option("--runs", help="Folder of all runs.")]
-RUNS = Path("runs")
 
 
 def _default(context: typer.Context) -> None:
     """Without a command: list."""
     if context.invoked_subcommand is None:
-        list_()
+        list_().show()
 
 
 GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_default)
@@ -35,44 +32,48 @@ GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_defa
 @subcommand(GROUP, "list", "stlc runs list --sort acc")
 def list_(
     sort: Annotated[Sort, typer.Option(help="Newest last, best last, or by name.")] = "time",
-    runs: _Runs = RUNS,
-    as_json: JsonOption = False,
-) -> None:
+    runs: RunsOption = RUNS,
+) -> Answer[documents.RunList]:
     """List all runs."""
-    rows = overview(runs, sort)
-    if as_json:
-        emit_json("runs/1", ok=True, exit_code=0, result={"runs": [row.values() for row in rows]})
-    elif rows:
+    found = [(run, *_record(run)) for run in every_run(runs)]
+    if sort == "acc":
+        found.sort(key=lambda each: -1.0 if (share := _accuracy(each[1])) is None else share)
+    if sort == "time":
+        found.sort(key=lambda each: str(each[1].get("started", "")))
+
+    def show() -> None:
         header = ("run", "system", "status", "accuracy", "steps", "time", "started")
-        emit(table([row.cells() for row in rows], header=header))
-    else:
-        say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
+        if found:
+            emit(table([_cells(*each) for each in found], header=header))
+        else:
+            say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
+
+    return Answer({"runs": [_listed(*each) for each in found]}, show)
 
 
 @subcommand(GROUP, "show", "stlc runs show latest")
-def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) -> None:
+def show(run: RunArgument = "latest", runs: RunsOption = RUNS) -> Answer[documents.RunContent]:
     """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
     files = sorted(str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if path.is_file())
-    if as_json:
-        result = {"run": folder.shown, "record": record, "files": files}
-        emit_json("runs/1", ok=True, exit_code=0, result=result)
-        return
-    emit(visible(folder.shown))
-    facts = flattened(record)
-    width = max(map(len, facts), default=0)
-    emit("\n".join(visible(f"  {key:<{width}}  {value}") for key, value in facts.items()))
-    emit("files\n" + "\n".join(visible(f"  {name}") for name in files))
+
+    def tell() -> None:
+        emit(visible(folder.shown))
+        facts = flattened(record)
+        width = max(map(len, facts), default=0)
+        emit("\n".join(visible(f"  {key:<{width}}  {value}") for key, value in facts.items()))
+        emit("files\n" + "\n".join(visible(f"  {name}") for name in files))
+
+    return Answer({"run": folder.shown, "record": record, "files": files}, tell)
 
 
 @subcommand(GROUP, "diff", "stlc runs diff 1 2")
 def diff(
     first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
-    runs: _Runs = RUNS,
-    as_json: JsonOption = False,
-) -> None:
+    runs: RunsOption = RUNS,
+) -> Answer[documents.RunComparison]:
     """Show the differences of two runs: options, inputs, results.
 
     Exit code: 0, or 1 if they differ.
@@ -82,16 +83,14 @@ def diff(
     texts = [
         name for name in ("spec.stl", "system.yaml") if _text(one.path / name) != _text(other.path / name)
     ]
-    code = 1 if facts or texts else 0
-    if as_json:
-        rows = [{"key": key, "values": values} for key, *values in facts]
-        result = {"runs": [one.shown, other.shown], "facts": rows, "files": texts}
-        emit_json("runs/1", ok=code == 0, exit_code=code, result=result)
-    else:
-        rows_ = [*facts, *((name, "differs", "differs") for name in texts)]
-        header = ("", one.name, other.name)
-        emit(table(rows_, header=header) if rows_ else f"{one.name} and {other.name} do not differ")
-    raise typer.Exit(code)
+    rows = [*facts, *((name, "differs", "differs") for name in texts)]
+    text = table(rows, header=("", one.name, other.name))
+    values: list[documents.DifferentFact] = [{"key": key, "values": list(pair)} for key, *pair in facts]
+    return Answer(
+        {"runs": [one.shown, other.shown], "facts": values, "files": texts},
+        lambda: emit(text if rows else f"{one.name} and {other.name} do not differ"),
+        1 if rows else 0,
+    )
 
 
 @subcommand(GROUP, "rm", "stlc runs rm 3")
@@ -100,15 +99,12 @@ def rm(
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
     ],
     force: Annotated[bool, typer.Option("--force", help="Also those that are still going.")] = False,
-    runs: _Runs = RUNS,
-    as_json: JsonOption = False,
-) -> None:
+    runs: RunsOption = RUNS,
+) -> Answer[documents.RemovedRuns]:
     """Remove the folders of runs.
 
     A running one needs --force. The links to the newest run are updated.
     """
-    from stlc.rundir import remove_run
-
     folders = [RunDir.open(name, runs) for name in names]
     going = [folder.shown for folder in folders if folder.status == "running"]
     if going and not force:
@@ -117,11 +113,12 @@ def rm(
     for folder in folders:
         remove_run(folder)
     removed = [folder.shown for folder in folders]
-    if as_json:
-        emit_json("runs/1", ok=True, exit_code=0, result={"removed": removed})
-    else:
+
+    def tell() -> None:
         for name in removed:
             say(f"removed {name}")
+
+    return Answer({"removed": removed}, tell)
 
 
 def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -142,70 +139,52 @@ def _text(path: Path) -> str:
         return ""
 
 
-# -------------------------------------------------------------------------- table
-
-_VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
-
-
-@dataclass(frozen=True, slots=True)
-class RunRow:
-    """One run.
-
-    Attributes:
-        run: `spec/number-words`.
-        path: of its folder.
-        record: of `run.json`; empty where it is damaged.
-        status: of the run, or "damaged".
-    """
-
-    run: str
-    path: str
-    record: Mapping[str, Any]
-    status: str
-
-    @property
-    def accuracy(self) -> float | None:
-        """Share of held-out starts whose plan satisfies the specification."""
-        result = self.record.get("result")
-        value = result.get("accuracy") if isinstance(result, Mapping) else None
-        return float(value) if isinstance(value, int | float) else None
-
-    def cells(self) -> tuple[str, ...]:
-        """Table cells as text."""
-        record, accuracy = self.record, self.accuracy
-        result = record.get("result")
-        seconds = result.get("seconds") if isinstance(result, Mapping) else None
-        return (
-            self.run,
-            Path(str(record.get("system_path", ""))).name,
-            self.status,
-            "" if accuracy is None else f"{accuracy:.4f}",
-            str(record.get("steps") or ""),
-            f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
-            str(record.get("started", "")),
-        )
-
-    def values(self) -> dict[str, Any]:
-        """The row as JSON values."""
-        kept = {key: self.record.get(key) for key in ("spec", "system_path", "steps", "seed", "started")}
-        return {"run": self.run, "path": self.path, "status": self.status, "accuracy": self.accuracy, **kept}
-
-
-def overview(root: Path, sort: str) -> list[RunRow]:
-    """All runs below a folder; a damaged one is listed instead of raising an error."""
-    rows = [_row(run) for run in every_run(root)]
-    if sort == "acc":
-        return sorted(rows, key=lambda row: -1.0 if row.accuracy is None else row.accuracy)
-    return sorted(rows, key=lambda row: str(row.record.get("started", ""))) if sort == "time" else rows
-
-
-def _row(run: RunDir) -> RunRow:
-    name = f"{run.path.parent.name}/{run.name}"
+def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:
+    """Content of `run.json` and the status of a run; empty and "damaged" if it cannot be read."""
     try:
         record = run.record()
     except StlcError:
-        return RunRow(name, run.shown, {}, "damaged")
-    return RunRow(name, run.shown, record, str(record.get("status", "running")))
+        return {}, "damaged"
+    return record, str(record.get("status", "running"))
+
+
+def _accuracy(record: Mapping[str, Any]) -> float | None:
+    """Share of held-out starts whose plan satisfies the specification."""
+    result = record.get("result")
+    value = result.get("accuracy") if isinstance(result, Mapping) else None
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ...]:
+    """Row of the table."""
+    accuracy, result = _accuracy(record), record.get("result")
+    seconds = result.get("seconds") if isinstance(result, Mapping) else None
+    return (
+        f"{run.path.parent.name}/{run.name}",
+        Path(str(record.get("system_path", ""))).name,
+        status,
+        "" if accuracy is None else f"{accuracy:.4f}",
+        str(record.get("steps") or ""),
+        f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+        str(record.get("started", "")),
+    )
+
+
+def _listed(run: RunDir, record: Mapping[str, Any], status: str) -> documents.ListedRun:
+    return {
+        "run": f"{run.path.parent.name}/{run.name}",
+        "path": run.shown,
+        "status": status,
+        "accuracy": _accuracy(record),
+        "spec": record.get("spec"),
+        "system_path": record.get("system_path"),
+        "steps": record.get("steps"),
+        "seed": record.get("seed"),
+        "started": record.get("started"),
+    }
+
+
+_VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
 
 
 def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:

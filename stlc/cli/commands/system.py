@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption, parse_overrides
-from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, table
+from stlc.cli.framework import documents
+from stlc.cli.framework.options import SetOption, parse_overrides
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
 
@@ -27,27 +28,29 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 
 @subcommand(GROUP, "show", "stlc system show car.yaml")
-def show(system: _File, set_: SetOption = None, as_json: JsonOption = False) -> None:
+def show(system: _File, set_: SetOption = None) -> Answer[documents.SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.describe import describe as in_words
 
     decl = _load(system, parse_overrides(set_))
-    if as_json:
-        emit_json("system/1", ok=True, exit_code=0, diagnostics=decl.warnings, result=_values(decl))
-        return
-    say(f"system {decl.path}")
-    show_diagnostics(decl.warnings)
-    emit(in_words(decl))
+
+    def tell() -> None:
+        say(f"system {decl.path}")
+        show_diagnostics(decl.warnings)
+        emit(in_words(decl))
+
+    return Answer(_facts(decl), tell, diagnostics=decl.warnings)
 
 
 @subcommand(GROUP, "check", "stlc system check car.yaml", "stlc system check examples/car.yaml --steps 64")
 def check(
     system: _File,
-    steps: Annotated[int, typer.Option(min=0, help="How far to drive random starts; 0 reads only.")] = 32,
+    steps: Annotated[
+        int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
+    ] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Of the states and controls.")] = 0,
     set_: SetOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer[documents.SystemFacts]:
     """Validate a system file with random rollouts.
 
     With --steps 0 the file is only read, without torch; otherwise random rollouts find initial sets that
@@ -55,37 +58,41 @@ def check(
     pytorch-kinematics if that is installed.
     """
     decl = _load(system, parse_overrides(set_))
-    warnings = [*decl.warnings, *(_drive(decl, steps, seed) if steps else ())]
-    looked = _kinematics(decl) if steps else []
-    if as_json:
-        robots = [
-            {"name": one.name, "distance_m": one.distance, "why_not": one.why or None} for one in looked
-        ]
-        result = {**_values(decl), "driven": {"steps": steps, "seed": seed}, "kinematics": robots}
-        emit_json("system/1", ok=True, exit_code=0, diagnostics=warnings, result=result)
-        return
-    show_diagnostics(warnings)
-    for one in looked:
-        if one.distance is None:
-            say(f"{one.name}: not compared; {one.why}")
-        else:
-            say(f"{one.name}: within {one.distance:.1e} m of pytorch-kinematics in 256 random positions")
-    moved = f", {_DRAWN} starts driven {steps} steps" if steps else ""
-    size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
-    emit(f"{visible(str(decl.path))} is valid: {size}{moved}")
+    warnings = [*decl.warnings, *(_roll_out(decl, steps, seed) if steps else ())]
+    compared = _kinematics(decl) if steps else []
+
+    def tell() -> None:
+        show_diagnostics(warnings)
+        for one in compared:
+            if one.distance is None:
+                say(f"{one.name}: not compared; {one.why}")
+            else:
+                say(f"{one.name}: within {one.distance:.1e} m of pytorch-kinematics in 256 random positions")
+        ran = f", {steps} steps from {_DRAWN} starts" if steps else ""
+        size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
+        emit(f"{visible(str(decl.path))} is valid: {size}{ran}")
+
+    result = _facts(decl)
+    result["driven"] = {"steps": steps, "seed": seed}
+    result["kinematics"] = [
+        {"name": one.name, "distance_m": one.distance, "why_not": one.why or None} for one in compared
+    ]
+    return Answer(result, tell, diagnostics=warnings)
 
 
 @subcommand(GROUP, "list", "stlc system list")
-def list_(as_json: JsonOption = False) -> None:
+def list_() -> Answer[documents.SystemList]:
     """List the systems that are found by name."""
     found = list(_all_systems())
-    if as_json:
-        rows = [{"name": name, "path": path, "doc": doc} for name, path, doc in found]
-        emit_json("system/1", ok=True, exit_code=0, result={"systems": rows})
-    elif found:
-        emit(table(found, header=("name", "file", "")))
-    else:
-        say("no system here; write one: stlc init --system cart")
+
+    def tell() -> None:
+        if found:
+            rows = [(each["name"], each["path"], each["doc"]) for each in found]
+            emit(table(rows, header=("name", "file", "")))
+        else:
+            say("no system here; write one: stlc init --system cart")
+
+    return Answer({"systems": found}, tell)
 
 
 _DRAWN = 256
@@ -102,7 +109,7 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
     return load_system_decl(find_system(name), overrides)
 
 
-def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
+def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
     """Roll out random controls from drawn states. Raises SystemFileError on failures."""
     import torch
 
@@ -128,8 +135,8 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
     return [compared(function) for function in robots]
 
 
-def _values(decl: SystemDecl) -> dict[str, Any]:
-    """The declarations as JSON values."""
+def _facts(decl: SystemDecl) -> documents.SystemFacts:
+    """The record of a system's declarations."""
     flow = {assign.name: assign.text for assign in decl.flow}
     return {
         "name": decl.name,
@@ -138,15 +145,15 @@ def _values(decl: SystemDecl) -> dict[str, Any]:
         "dt": float(decl.dt),
         "horizon": {"seconds": float(decl.dt * decl.horizon), "steps": decl.horizon},
         "states": [
-            {
-                **{"name": column.name, "kind": column.kind, "unit": str(column.unit), "role": column.role},
-                **{"low": column.low, "high": column.high, "labels": dict(column.labels)},
-                "flow": flow.get(column.name),
-            }
+            documents.record(
+                documents.StateFacts,
+                column,
+                **{"unit": str(column.unit), "labels": dict(column.labels), "flow": flow.get(column.name)},
+            )
             for column in decl.signature.columns
         ],
         "controls": [
-            {"name": control.name, "unit": str(control.unit), "low": control.low, "high": control.high}
+            documents.record(documents.ControlRange, control, unit=str(control.unit))
             for control in decl.controls
         ],
         "constants": {name: value for name, (value, _) in decl.constants.items()},
@@ -155,8 +162,8 @@ def _values(decl: SystemDecl) -> dict[str, Any]:
     }
 
 
-def _all_systems() -> Iterator[tuple[str, str, str]]:
-    """Name, path and first sentence of every system file in the search path."""
+def _all_systems() -> Iterator[documents.ListedSystem]:
+    """Every system file in the search path; the text of a valid one is its first sentence."""
     from stlc.diagnostics import StlcError
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS
@@ -171,6 +178,7 @@ def _all_systems() -> Iterator[tuple[str, str, str]]:
                 decl = load_system_decl(path)
             except StlcError as error:
                 finding = error.diagnostics[0]
-                yield path.stem, str(path), f"invalid: {finding.code}, {finding.message}"
+                invalid = f"invalid: {finding.code}, {finding.message}"
+                yield {"name": path.stem, "path": str(path), "doc": invalid}
             else:
-                yield decl.name, str(path), decl.doc
+                yield {"name": decl.name, "path": str(path), "doc": decl.doc}

@@ -4,26 +4,39 @@ Times are in seconds, positions in files count from 1; a `Num` that is not finit
 Within a major number of a schema keys are added and never taken away.
 """
 
-from __future__ import annotations
-
 from types import NoneType
 from typing import (
+    TYPE_CHECKING,
     Annotated,
     Any,
     Literal,
     NotRequired,
     TypeAlias,
     TypedDict,
+    TypeVar,
     get_args,
     get_origin,
     get_type_hints,
     is_typeddict,
 )
 
+if TYPE_CHECKING:
+    from stlc.view.learning import Learning
+
+R = TypeVar("R")
+
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
 Positive = Annotated[float, 0]
 """Numbers of at least 0."""
+
+
+def record(kind: type[R], source: object, **given: object) -> R:
+    """A record of the attributes of an object with the names of the keys; `given` has the other keys."""
+    names = [name for name in kind.__annotations__ if name not in given]
+    made: Any = {name: getattr(source, name) for name in names} | given
+    found: R = made
+    return found
 
 
 class Horizon(TypedDict):
@@ -120,6 +133,10 @@ class CheckedTraces(TypedDict):
 
 class AddedState(TypedDict):
     name: str
+    kind: str
+    initial: Num | None
+    range: list[Num | None]
+    about: str
 
 
 class WrittenInterval(TypedDict):
@@ -230,7 +247,7 @@ class ViolationCause(TypedDict):
 
 class Explanation(TypedDict):
     trace: str
-    verdict: Literal["satisfied", "violated", "inconclusive"]
+    verdict: Literal["satisfied", "violated", "inconclusive", "out of scope"]
     causes: list[ViolationCause]
 
 
@@ -354,19 +371,42 @@ class TrainingVerdict(TypedDict):
     worst: NotRequired[str]
 
 
+def verdict_record(learning: "Learning") -> TrainingVerdict:
+    """The record of the verdict on a training."""
+    share, following = learning.share, learning.command
+    return record(TrainingVerdict, learning, share_of_feasible=share, next=following)
+
+
 class WrittenReport(TypedDict):
     run: str
     report: str
     verdict: NotRequired[TrainingVerdict]
 
 
+class ListedRun(TypedDict):
+    run: str
+    path: str
+    status: str
+    accuracy: float | None
+    spec: Any
+    system_path: Any
+    steps: Any
+    seed: Any
+    started: Any
+
+
 class RunList(TypedDict):
-    runs: list[dict[str, Any]]
+    runs: list[ListedRun]
+
+
+class DifferentFact(TypedDict):
+    key: str
+    values: list[str]
 
 
 class RunComparison(TypedDict):
     runs: list[str]
-    facts: list[dict[str, Any]]
+    facts: list[DifferentFact]
     files: list[str]
 
 
@@ -614,11 +654,15 @@ class TrainedRuns(TypedDict):
     runs: list[TrainedJob]
 
 
+CheckResult: TypeAlias = CheckedTrace | CheckedTraces
+CompileResult: TypeAlias = CompiledSpec | ParsedFile | ParsedFiles
+ExplainResult: TypeAlias = CodeList | ManualPage | SpecInWords | Explanation | Guarantee
+
 RESULTS: dict[str, Any] = {
-    "check": CheckedTrace | CheckedTraces,
-    "compile": CompiledSpec | ParsedFile | ParsedFiles,
+    "check": CheckResult,
+    "compile": CompileResult,
     "doctor": InstallationReport,
-    "explain": CodeList | ManualPage | SpecInWords | Explanation | Guarantee,
+    "explain": ExplainResult,
     "export": ExportedRun,
     "fmt": FormattedFiles,
     "init": CreatedFiles,

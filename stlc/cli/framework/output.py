@@ -10,10 +10,11 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal, TextIO, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, Literal, TextIO, TypeVar, cast
 
 from stlc.diagnostics import Diagnostic, Notice
 from stlc.escape import screen, visible
@@ -21,6 +22,8 @@ from stlc.jsontext import dumps, plain
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+R = TypeVar("R", covariant=True)
 
 ColorMode = Literal["auto", "always", "never"]
 
@@ -55,14 +58,14 @@ def emit_json(
     diagnostics: Iterable[Diagnostic] = (),
     result: object = None,
 ) -> None:
-    """Write the one JSON document of a command to the standard output.
+    """Write the JSON document of a command to the standard output.
 
     Args:
         schema: name and major number, such as "check/1".
         ok: whether the answer is yes.
-        exit_code: of the command.
-        diagnostics: findings, warnings among them.
-        result: computed values; non-finite numbers become texts.
+        exit_code: exit code of the command.
+        diagnostics: errors and warnings.
+        result: record of the command; non-finite numbers become texts.
     """
     from stlc.cli.framework.render import to_json
     from stlc.version import __version__
@@ -76,6 +79,32 @@ def emit_json(
         "result": plain(result),
     }
     emit(dumps(document, indent=2))
+
+
+@dataclass(frozen=True, slots=True)
+class Answer(Generic[R]):
+    """Outcome of a command, printed as a JSON document or as text.
+
+    Attributes:
+        result: record printed with `--json`.
+        show: function that prints the text.
+        code: exit code.
+        diagnostics: errors and warnings in the JSON document.
+    """
+
+    result: R
+    show: Callable[[], object]
+    code: int = 0
+    diagnostics: Iterable[Diagnostic] = ()
+
+    def print(self, schema: str, *, as_json: bool) -> int:
+        """Print the outcome and return the exit code."""
+        if as_json:
+            ok, findings = self.code == 0, self.diagnostics
+            emit_json(schema, ok=ok, exit_code=self.code, diagnostics=findings, result=self.result)
+        else:
+            self.show()
+        return self.code
 
 
 def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:

@@ -24,11 +24,12 @@ import typer
 
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
-from stlc.cli.framework.output import COLOR, PULSE, QUIET, ColorMode, emit, noticing, silence
+from stlc.cli.framework.options import JsonOption
+from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.version import __version__
 
-F = TypeVar("F", bound=Callable[..., None])
+F = TypeVar("F", bound=Callable[..., Any])
 
 HELP_NAMES = ("-h", "--help")
 _MARKED: dict[str, tuple[str, ...]] = {}
@@ -73,7 +74,7 @@ def describe(sentence: str, *examples: str, note: str = "") -> str:
     return "\n\n".join(part for part in (sentence, shown + lines if examples else "", note) if part)
 
 
-def _help(function: Callable[..., None], examples: Sequence[str]) -> str:
+def _help(function: Callable[..., Any], examples: Sequence[str]) -> str:
     paragraphs = [" ".join(part.split()) for part in inspect.cleandoc(function.__doc__ or "").split("\n\n")]
     return describe(paragraphs[0], *examples, note="\n\n".join(paragraphs[1:]))
 
@@ -85,16 +86,19 @@ def only_help(context: typer.Context) -> None:
         raise typer.Exit(2)
 
 
-def flat(function: Callable[..., None]) -> Callable[..., None]:
-    """Flatten option groups: each field of a dataclass parameter becomes an option of the command.
+def flat(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The callback of a command: a function with option groups flattened, and its `Answer` printed.
 
-    The defaults are the fields of the parameter's default value.
+    Each field of a dataclass parameter becomes an option; the defaults are the fields of the parameter's
+    default value. A function declared to return an `Answer` gets the option `--json`, whose value is passed
+    on if the function has a parameter `json`. The callback returns the exit code.
     """
     signature = inspect.signature(function, eval_str=True)
     groups: dict[str, Any] = {
         name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)
     }
-    if not groups:
+    answers, passed = get_origin(signature.return_annotation) is Answer, "json" in signature.parameters
+    if not groups and not answers:
         return function
     spread: list[inspect.Parameter] = []
     for name, parameter in signature.parameters.items():
@@ -109,10 +113,18 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
             for each in fields(groups[name])
         ]
 
-    def run(**values: Any) -> None:
+    if answers and not passed:
+        option = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        spread.append(inspect.Parameter("json", option, default=False, annotation=JsonOption))
+
+    def run(**values: Any) -> Any:
+        as_json = values["json"] if passed else values.pop("json", False)
         for name, kind in groups.items():
             values[name] = kind(**{each.name: values.pop(each.name) for each in fields(kind)})
-        function(**values)
+        answer = function(**values)
+        if not isinstance(answer, Answer):
+            return answer
+        return answer.print(f"{function.__module__.rpartition('.')[2]}/1", as_json=as_json)
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
     run.__signature__ = signature.replace(parameters=spread)  # type: ignore[attr-defined]

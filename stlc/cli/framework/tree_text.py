@@ -8,6 +8,7 @@ from dataclasses import fields
 from fractions import Fraction
 from typing import Any
 
+from stlc.cli.framework.documents import SyntaxTree
 from stlc.escape import dot
 from stlc.grammar import ast
 from stlc.grammar.traverse import children
@@ -67,13 +68,14 @@ def _short(value: object) -> str:
             return str(value)
 
 
-def as_values(node: ast.Node) -> dict[str, Any]:
-    """`{"node", "line", "column", …}` with the children under the names of the parts."""
-    values: dict[str, Any] = {"node": type(node).__name__, "line": node.span.line, "column": node.span.column}
+def as_values(node: ast.Node) -> SyntaxTree:
+    """The record of a syntax tree; further keys are the fields of the node."""
+    values: Any = {"node": type(node).__name__, "line": node.span.line, "column": node.span.column}
     for part in fields(node):
         if part.name not in _HIDDEN:
             values[part.name] = _value(getattr(node, part.name))
-    return values
+    record: SyntaxTree = values
+    return record
 
 
 def _value(value: object) -> Any:

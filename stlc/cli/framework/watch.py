@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from stlc.cli.framework.output import PULSE, say
+from stlc.cli.framework.output import PULSE, say, show_diagnostics
+from stlc.diagnostics import StlcError
 
 PERIOD = 0.3
 
@@ -15,8 +16,8 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
     """Call `action` now, and after each change of a file, until Ctrl-C.
 
     Args:
-        files: to watch.
-        action: called each time; it reports its own errors.
+        files: paths of the watched files.
+        action: function to call; errors that it raises are printed.
         rounds: number of polls; None: without end.
     """
     paths = [Path(file) for file in files]
@@ -25,7 +26,10 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
         now = [_stamp(path) for path in paths]
         if now != before:
             before = now
-            action()
+            try:
+                action()
+            except StlcError as error:
+                show_diagnostics(error.diagnostics)
             say(f"watching {', '.join(map(str, paths))}; Ctrl-C stops")
         if rounds is not None:
             rounds -= 1
