@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from stlc.cli.check.text import in_unit
 from stlc.cli.framework.documents import CauseNodeRecord, Explanation, ViolationCause
-from stlc.cli.framework.output import Answer, emit, wants_color
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, wants_color
 from stlc.compile.ir.traverse import margin_unit
 from stlc.escape import visible
 
@@ -27,7 +27,11 @@ def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> A
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
-    result = judge(name, question, runs, talk=talk)
+    result = judge(name, question, runs)
+    if talk:
+        for line in result.remarks:
+            say(line)
+        show_diagnostics(result.warnings)
     causes = result.causes.values()
     text = "\n\n".join("\n".join(_lines(cause, result)) for cause in causes)
     nothing = f"{visible(result.trace.name)}: nothing is violated ({result.verdict.overall})"

@@ -2,82 +2,134 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.cli.check.outcome import Checked, Outcome, VerdictRow, overall
+from stlc.cli.check.outcome import Checked, Outcome, overall
+from stlc.cli.framework import documents
+from stlc.cli.framework.documents import record
 from stlc.escape import xml
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import Judgement
 from stlc.monitor.signals import Gap
+from stlc.provenance import sha256
 
 if TYPE_CHECKING:
     from stlc.cli.check.judge import Question
-    from stlc.cli.check.outcome import Checked
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.source import Source
 
 
-def document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Document of `--json`: the result of one trace, or one verdict and the list of results."""
+def document(outcomes: Sequence[Outcome]) -> documents.CheckResult:
+    """The record of `--json`: the result of one trace, or one verdict and the list of results."""
     entries = [outcome.entry for outcome in outcomes]
-    return entries[0] if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
+    only: Any = entries[0]
+    return only if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
 
 
-def entry_of(result: Checked, end: str) -> dict[str, Any]:
-    """The result of one trace as JSON values."""
+def result_record(result: Checked, end: str) -> documents.CheckedTrace:
+    """The record of a judged trace."""
     verdict = result.verdict
-    horizon = verdict.subject.horizon
-    return {
-        "trace": result.trace.name,
-        "spec": result.source.name,
-        "spec_sha256": hashlib.sha256(result.source.text.encode()).hexdigest(),
-        "dt": result.trace.dt,
-        "horizon": None if horizon is None else {"seconds": horizon * result.trace.dt, "steps": horizon},
-        "end": end,
-        "traces": verdict.traces,
-        "samples": result.trace.samples,
-        "unknown": {name: gap_entry(gap, verdict.subject.time) for name, gap in verdict.subject.gaps.items()},
-        "in_scope": verdict.in_scope,
-        "verdict": verdict.overall if verdict.in_scope else "out of scope",
-        "robustness": _least(verdict.requirements[0].counted(np.atleast_1d(verdict.robustness))),
-        "satisfied_traces": verdict.satisfied_traces,
-        "satisfied_share": verdict.share,
-        "requirements": [_requirement(judged, result) for judged in verdict],
+    return trace_record(
+        result.trace.name,
+        result.source,
+        result.trace.dt,
+        verdict.subject.horizon,
+        verdict.subject.gaps,
+        verdict.subject.time,
+        end=end,
+        traces=verdict.traces,
+        samples=result.trace.samples,
+        in_scope=verdict.in_scope,
+        verdict=verdict.overall if verdict.in_scope else "out of scope",
+        robustness=_least(verdict.requirements[0].counted(np.atleast_1d(verdict.robustness))),
+        satisfied_traces=verdict.satisfied_traces,
+        satisfied_share=verdict.share,
+        requirements=[_requirement(judged, result) for judged in verdict],
+    )
+
+
+def trace_record(
+    name: str,
+    source: Source,
+    dt: float,
+    horizon: int | None,
+    gaps: Mapping[str, Gap],
+    time: Callable[[int], float],
+    **found: object,
+) -> documents.CheckedTrace:
+    """The record of a trace.
+
+    Args:
+        name: name of the trace.
+        source: text of the specification.
+        dt: time step in seconds.
+        horizon: value of `T` in steps, if known.
+        gaps: signal -> its unknown samples.
+        time: time of a sample in seconds.
+        found: the other keys.
+    """
+    made: Any = {
+        "trace": name,
+        "spec": source.name,
+        "spec_sha256": sha256(source.text),
+        "dt": dt,
+        "horizon": None if horizon is None else {"seconds": horizon * dt, "steps": horizon},
+        "unknown": {
+            signal: {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
+            for signal, gap in gaps.items()
+        },
+        **found,
     }
+    return record(documents.CheckedTrace, None, **made)
 
 
-def gap_entry(gap: Gap, time: Callable[[int], float]) -> dict[str, Any]:
-    """Samples at which a signal is unknown."""
-    return {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
-
-
-def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
+def _requirement(judged: Judgement, result: Checked) -> documents.CheckedRequirement:
     low, high, least = (judged.counted(end) for end in (*judged.margins, judged.least))
     trace, sample = judged.worst
-    cause = result.causes.get(judged.name)
-    time = result.verdict.subject.time(sample)
-    return {
-        "name": judged.name,
-        "doc": judged.rule.doc,
-        "tags": sorted(judged.rule.tags),
-        "verdict": judged.overall,
-        "robustness": {
-            "min": _least(least),
-            "mean": _mean(least),
-            "low": _least(low),
-            "high": _least(high),
-            "unit": judged.unit or ("" if cause is None else cause.unit),
-            "argmin": {"trace": trace, "start": time, "time": time if cause is None else cause.time},
-        },
-        "starts": judged.instants,
-        "satisfied_share": judged.share,
-        "violated_traces": judged.statuses.count("violated"),
-        "cause": None if cause is None else cause_entry(cause),
+    return requirement_record(
+        judged.rule,
+        result.causes.get(judged.name),
+        {"min": _least(least), "mean": _mean(least), "low": _least(low), "high": _least(high)},
+        trace,
+        result.verdict.subject.time(sample),
+        verdict=judged.overall,
+        starts=judged.instants,
+        satisfied_share=judged.share,
+        violated_traces=judged.statuses.count("violated"),
+    )
+
+
+def requirement_record(
+    rule: CompiledRequirement,
+    cause: Cause | None,
+    margins: Mapping[str, float | None],
+    trace: int,
+    start: float,
+    **found: object,
+) -> documents.CheckedRequirement:
+    """The record of a requirement.
+
+    Args:
+        rule: the requirement.
+        cause: cause of its violation, if any.
+        margins: statistics of the robustness.
+        trace: trace of the least robustness.
+        start: its start in seconds.
+        found: verdict and counts.
+    """
+    robustness = {
+        **margins,
+        "unit": rule.unit or ("" if cause is None else cause.unit),
+        "argmin": {"trace": trace, "start": start, "time": start if cause is None else cause.time},
     }
+    told = None if cause is None else _cause(cause)
+    tags = sorted(rule.tags)
+    return record(documents.CheckedRequirement, rule, tags=tags, robustness=robustness, cause=told, **found)
 
 
 def _least(values: NDArray[np.float64]) -> float | None:
@@ -90,24 +142,17 @@ def _mean(values: NDArray[np.float64]) -> float | None:
         return float((values / values.size).sum()) if values.size else None
 
 
-def cause_entry(cause: Cause) -> dict[str, Any]:
-    """The cause of a violation as JSON values."""
+def _cause(cause: Cause) -> documents.CauseRecord:
     first = cause.readings[0] if cause.readings else None
-    return {
-        "signal": None if first is None else first.signal,
-        "value": None if first is None else first.value,
-        "predicate": cause.predicate,
-        "readings": [
-            {"signal": r.signal, "value": r.value, "unit": r.unit, "text": r.text} for r in cause.readings
-        ],
-        "trace": cause.trace,
-        "start": cause.start,
-        "sample": cause.sample,
-        "time": cause.time,
-        "span": {"line": cause.span.line, "column": cause.span.column},
-        "requirement": {"line": cause.place.span.line, "column": cause.place.span.column},
-        "because": cause.because,
-    }
+    return record(
+        documents.CauseRecord,
+        cause,
+        signal=None if first is None else first.signal,
+        value=None if first is None else first.value,
+        readings=[record(documents.ReadingRecord, reading) for reading in cause.readings],
+        span=record(documents.PlaceRecord, cause.span),
+        requirement=record(documents.PlaceRecord, cause.place.span),
+    )
 
 
 def junit(outcomes: Sequence[Outcome]) -> str:
@@ -135,26 +180,22 @@ def _suite(outcome: Outcome) -> Iterator[str]:
     for error in outcome.errors[:1]:
         yield f'    <testcase classname={_attribute(outcome.name)} name="trace">'
         detail = xml("\n".join(f"{e.code}: {e.message}" for e in outcome.errors))
-        told = f"type={_attribute(error.code)} message={_attribute(error.message)}"
-        yield f"      <error {told}>{detail}</error>"
+        kind, message = _attribute(error.code), _attribute(error.message)
+        yield f"      <error type={kind} message={message}>{detail}</error>"
         yield "    </testcase>"
     for row in outcome.rows:
-        yield from _case(outcome, row)
+        head = f"    <testcase classname={_attribute(outcome.name)} name={_attribute(row.name)}"
+        if row.status == "satisfied":
+            yield f"{head}/>"
+            continue
+        yield f"{head}>"
+        if row.status == "violated":
+            message = f"robustness {row.robustness}{', ' + row.where if row.where else ''}"
+            yield f'      <failure type="violated" message={_attribute(message)}>{xml(row.why)}</failure>'
+        else:
+            yield f"      <skipped message={_attribute(row.why or row.status)}/>"
+        yield "    </testcase>"
     yield "  </testsuite>"
-
-
-def _case(outcome: Outcome, row: VerdictRow) -> Iterator[str]:
-    head = f"    <testcase classname={_attribute(outcome.name)} name={_attribute(row.name)}"
-    if row.status == "satisfied":
-        yield f"{head}/>"
-        return
-    yield f"{head}>"
-    if row.status == "violated":
-        message = f"robustness {row.robustness}{', ' + row.where if row.where else ''}"
-        yield f'      <failure type="violated" message={_attribute(message)}>{xml(row.why)}</failure>'
-    else:
-        yield f"      <skipped message={_attribute(row.why or row.status)}/>"
-    yield "    </testcase>"
 
 
 def _attribute(text: str) -> str:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from stlc.cli.framework.output import ColorMode, say, show_diagnostics
+from stlc.cli.framework.output import ColorMode
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.escape import operand
 from stlc.files import find_spec, read_source
@@ -20,14 +20,12 @@ if TYPE_CHECKING:
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.instants import At
     from stlc.monitor.verdict import Monitor
-    from stlc.trace import Reading, Trace
+    from stlc.trace import Reading
     from stlc.trace.meta import Carried
-    from stlc.trace.recording import Recording
 
 End = Literal["open", "strict", "truncate"]
 
-_AT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
-_TIME = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]+)")
+_INSTANT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +33,18 @@ class Question:
     """Options that apply to every trace.
 
     Attributes:
-        spec: path of a specification; None takes the one in the trace.
-        system: of a system file.
-        names: specification's name of a signal -> its name in the trace.
-        require: names of the requirements; none means all.
-        at: `0`, `all`, a sample or a time; None leaves it to the requirements.
+        spec: path of a specification; None: the one stored in the trace.
+        system: name of a system file.
+        names: name of a signal in the specification -> its name in the trace.
+        require: names of the judged requirements; all if empty.
+        at: start of judging: a sample, a time, or `all`; None: as the requirements say.
         end: treatment of traces that are too short.
-        tolerance: a robustness of at least minus this is satisfied.
-        resample: time step of the grid for resampling, seconds.
+        tolerance: a requirement is satisfied if its robustness is at least minus this.
+        resample: time step of the grid for resampling, in seconds.
         overrides: constant -> its value, as text.
-        semantics: of the reported robustness.
+        semantics: semantics of the reported robustness.
         dt: seconds between samples that have no clock.
-        max_gap: the longest gap between samples, in seconds, in which signals are known.
+        max_gap: longest gap between samples, in seconds, in which signals are known.
     """
 
     spec: Path | None = None
@@ -68,11 +66,11 @@ class Work:
     """One file and its options.
 
     Attributes:
-        name: of the file as given.
+        name: name of the file as given.
         question: options of reading and judging.
         runs: folder of all runs.
-        out: file for its robustness signals.
-        chunk: samples per piece for chunked judging; 0: as a whole if it fits into memory.
+        out: output file of the robustness signals.
+        chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
         color: whether texts may be coloured.
         mode: colour mode of the program.
     """
@@ -87,7 +85,7 @@ class Work:
 
 
 def usage(message: str, *advice: str) -> UsageError:
-    """U101."""
+    """The error U101 with a message and advice."""
     return UsageError(Diagnostic("U101", message, help=advice))
 
 
@@ -104,91 +102,70 @@ def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
     return names
 
 
-def judge(name: str, question: Question, runs: Path, *, talk: bool) -> Checked:
-    """Load, judge and explain one trace; with `talk`, print which trace it is, and remarks.
-
-    Raises:
-        StlcError: the trace or the specification is invalid, or they do not fit.
-    """
-    result, said = judged(found(name, runs), question)
-    if talk:
-        for line in [*taken(name, runs), *said]:
-            say(line)
-        show_diagnostics(result.warnings)
-    return result
-
-
 def found(name: str, runs: Path) -> Path:
     """The file of a trace: as given, or in the newest run."""
     from stlc.files import find_trace
 
     path = find_trace(name, runs)
-    return path if path == Path(name) else _below(path.resolve())
+    if path == Path(name):
+        return path
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def taken(name: str, runs: Path) -> list[str]:
-    """Remark on a trace that was found in a run folder."""
-    path = found(name, runs)
-    return [] if path == Path(name) else [f"taking {path}, of the newest run"]
+def judge(name: str, question: Question, runs: Path) -> Checked:
+    """Load, judge and explain one trace.
 
-
-def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
-    """The result for one file, and remarks."""
+    Raises:
+        StlcError: the trace or the specification is invalid, or they do not fit.
+    """
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.report import explain_all
-    from stlc.trace import read_recording
+    from stlc.trace import read_recording, trace_of
 
+    path = found(name, runs)
     recording = read_recording(path)
     carried = recording.meta.carried
     source, note = specification(recording.name, question.spec, carried)
     monitor = monitor_of(source, question, carried)
-    trace = laid_out(recording, monitor, question)
+    trace = trace_of(recording, reading_options(monitor, question))
     del recording  # do not keep converted signals twice
     verdict = monitor.check(
         trace,
-        at=instant(question.at, trace),
+        at=instant_of(question.at, trace.name, trace.dt, trace.t0, trace.samples),
         end=question.end,
         tolerance=question.tolerance,
         require=question.require,
         semantics=question.semantics,
     )
-    return Checked(trace, source, verdict, explain_all(verdict), spoken(question)), [note] if note else []
+    remarks = (*_newest_remark(name, path), *([note] if note else ()))
+    return Checked(trace, source, verdict, explain_all(verdict), _options(question), remarks)
 
 
-def spoken(question: Question) -> tuple[str, ...]:
+def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
+    """Remark on a trace that was found in a run folder."""
+    return () if path == Path(name) else (f"taking {path}, of the newest run",)
+
+
+def _options(question: Question) -> tuple[str, ...]:
     """The command-line options that determine how a trace is read and judged."""
     words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
         words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
-    for option, seconds in (
-        ("--resample", question.resample),
-        ("--dt", question.dt),
-        ("--max-gap", question.max_gap),
-    ):
+    times = {"--resample": question.resample, "--dt": question.dt, "--max-gap": question.max_gap}
+    for option, seconds in times.items():
         words += [] if seconds is None else [option, f"{seconds:.10g}s"]
     return tuple(words)
 
 
-def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:
-    """The trace of a file, with renamed and resampled signals."""
-    from stlc.trace import trace_of
-
-    return trace_of(recording, laid_reading(monitor, question))
-
-
-def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
+def reading_options(monitor: Monitor | None, question: Question) -> Reading:
     """Reading options of files: names and grid; with a monitor also the types of signals."""
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
 
-    asked = Reading(question.names, question.resample, question.dt, question.max_gap)
-    return asked if monitor is None else reading_of(monitor.spec, asked)
-
-
-def _below(path: Path) -> Path:
-    """The path relative to the working folder if it lies below it."""
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    options = Reading(question.names, question.resample, question.dt, question.max_gap)
+    return options if monitor is None else reading_of(monitor.spec, options)
 
 
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
@@ -199,14 +176,14 @@ def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Sourc
         raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
     source = Source(carried.path or f"{carried.name or 'specification'} in {name}", carried.text)
     changed = ", ".join(f"{constant} = {text}" for constant, text in carried.overrides.items())
-    told = f"with {changed}, as it was recorded" if changed else ""
+    note = f"with {changed}, as it was recorded" if changed else ""
     if carried.path and Path(carried.path).is_file() and read_source(carried.path).text != source.text:
         since = (
             f"{carried.path} has changed since; judging by the text in {name} "
             f"(--spec {carried.path} takes the new one)"
         )
-        told = f"{since}; {told}" if told else since
-    return source, told
+        note = f"{since}; {note}" if note else since
+    return source, note
 
 
 def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
@@ -239,20 +216,22 @@ def _monitor(
 # ------------------------------------------------------------------------ instants
 
 
-def instant(text: str | None, trace: Trace) -> At:
-    """A sample of `trace`; "all" and None as they are. Raises UsageError (U101)."""
-    return instant_of(text, trace.name, trace.dt, trace.t0, trace.samples)
-
-
 def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
-    """The same for a trace that starts at `t0`; `samples` None: of unknown length.
+    """The sample that `--at` names in a trace; "all" and None are returned unchanged.
+
+    Args:
+        text: value of the option: a sample, a time, or "all".
+        name: name of the trace.
+        dt: time step in seconds; 0 if unknown.
+        t0: time of the first sample.
+        samples: number of samples; None if unknown.
 
     Raises:
         UsageError: U101, it is not an instant, or the trace has no sample there.
     """
     if text is None or text == "all":
         return "all" if text else None
-    match = _AT.fullmatch(text.strip())
+    match = _INSTANT.fullmatch(text.strip())
     help_ = "a sample (0, 46), a time (4.6s) or all"
     if match is None:
         raise usage(f"`--at {text}` is not an instant", help_)
@@ -285,8 +264,8 @@ def time_step(option: str, text: str | None) -> float | None:
 def _seconds(option: str, text: str, advice: str) -> float:
     from stlc.units import parse_unit
 
-    match = _TIME.fullmatch(text.strip())
-    if match is None:
+    match = _INSTANT.fullmatch(text.strip())
+    if match is None or not match["unit"]:
         raise usage(f"`{option} {text}` is not a time", advice)
     try:
         unit = parse_unit(match["unit"])

@@ -8,8 +8,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from stlc.cli.check.judge import Work, found, judged, taken
+from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
+from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.stopping import leaving
@@ -49,14 +50,14 @@ def safe_outcome(work: Work) -> Outcome:
     try:
         return outcome_of(work)
     except StlcError as error:
-        entry = {"trace": work.name, "verdict": "invalid"}
-        return Outcome(work.name, errors=error.diagnostics, exit_code=error.exit_code, entry=entry)
+        entry: InvalidTrace = {"trace": work.name, "verdict": "invalid"}
+        return Outcome(work.name, entry, errors=error.diagnostics, exit_code=error.exit_code)
 
 
 def outcome_of(work: Work) -> Outcome:
     """Judge one file. Raises StlcError if that fails."""
-    from stlc.cli.check.document import entry_of
-    from stlc.cli.check.text import describe_result, rows_of
+    from stlc.cli.check.document import result_record
+    from stlc.cli.check.text import result_text, rows_of
 
     COLOR.set(work.mode)
     begun = time.perf_counter()
@@ -65,23 +66,24 @@ def outcome_of(work: Work) -> Outcome:
         from stlc.cli.check.online import outcome_in_chunks
 
         return outcome_in_chunks(path, work)
-    result, said = judged(path, work.question)
+    result = judge(work.name, work.question, work.runs)
     if work.out is not None:
         from stlc.cli.check.document import write_robustness
 
         write_robustness(work.out, result, work.question)
+    rows = rows_of(result)
     return Outcome(
         name=str(path),
+        entry=result_record(result, work.question.end),
         status=result.verdict.overall if result.verdict.in_scope else "out of scope",
-        rows=rows_of(result),
-        text=describe_result(result, color=work.color),
-        entry=entry_of(result, work.question.end),
+        rows=rows,
+        text=result_text(result, rows, color=work.color),
         traces=result.verdict.in_scope,
         holds=result.verdict.share,
         fails=result.verdict.failed_share,
         seconds=time.perf_counter() - begun,
         warnings=result.warnings,
-        said=(*taken(work.name, work.runs), *said),
+        remarks=result.remarks,
     )
 
 

@@ -6,23 +6,21 @@ The lines of the standard input are a `.csv` with a header, or one JSON object e
 
 from __future__ import annotations
 
-import hashlib
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from stlc.cli.check.document import cause_entry, gap_entry
-from stlc.cli.check.judge import Question, Work, instant_of, laid_reading, monitor_of, specification, usage
+from stlc.cli.check.document import requirement_record, trace_record
+from stlc.cli.check.judge import Question, Work, instant_of, monitor_of, reading_options, specification, usage
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow
-from stlc.cli.check.text import in_unit, percent, signed
-from stlc.cli.framework.output import emit, table, wants_color
+from stlc.cli.check.text import in_unit, percent, robustness_text, signed, text_of
+from stlc.cli.framework.documents import CheckedRequirement
+from stlc.cli.framework.output import emit, wants_color
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
-from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import visible
 from stlc.files import find_spec, read_source
@@ -40,124 +38,97 @@ if TYPE_CHECKING:
     from stlc.trace.live import Sample, Uniform
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
-    """Description of a stream.
-
-    Attributes:
-        name: of the trace.
-        source: text of the specification.
-        dt: time step in seconds.
-        samples: their number.
-        color: print reasons in colours.
-    """
-
-    name: str
-    source: Source
-    dt: float
-    samples: int
-    color: bool = False
-
-
-def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], seconds: float) -> Outcome:
+def _outcome(
+    online: Online,
+    name: str,
+    source: Source,
+    dt: float,
+    *,
+    color: bool,
+    remarks: tuple[str, ...],
+    begun: float,
+) -> Outcome:
     """The outcome of a finished stream. Raises TraceError as `Online.finish`."""
     tallies = online.finish()
-    status = status_of(online, tallies)
+    found = {tally.status for tally in tallies.values()}
+    status: Status = "violated" if "violated" in found else "inconclusive"
+    status = "satisfied" if found == {"satisfied"} else status
+    if online.in_scope is False:
+        status = "out of scope"
     causes = {
-        name: cause
-        for name, tally in tallies.items()
-        if tally.status == "violated" and (cause := online.cause(name)) is not None
+        rule: cause
+        for rule, tally in tallies.items()
+        if tally.status == "violated" and (cause := online.cause(rule)) is not None
     }
-    rows = tuple(_row(name, tally, online, causes.get(name)) for name, tally in tallies.items())
-    counts = [tally.instants for tally in tallies.values()]
-    most = max(tallies.values(), key=lambda tally: tally.instants)
+    gaps = {
+        signal: gap_text(signal, gap, online.samples, (_moment(online, gap.first), _moment(online, gap.last)))
+        for signal, gap in online.gaps.items()
+    }
+    rows = tuple(_row(rule, tally, online, causes.get(rule), gaps) for rule, tally in tallies.items())
+    reasons = [
+        _violation(row.name, tallies[row.name], causes[row.name], color=color)
+        if row.name in causes
+        else f"{visible(row.name)} is inconclusive: {row.why}."
+        for row in rows
+        if row.name in causes or row.status == "inconclusive"
+    ]
+    title = f"{visible(source.name)} on {visible(name)}    1 trace x {online.samples} samples, dt {dt:g} s"
+    known = [tally.robustness for tally in tallies.values()]
+    share = min(tally.share for tally in tallies.values())
     return Outcome(
-        name=told.name,
+        name=name,
+        entry=trace_record(
+            name,
+            source,
+            dt,
+            online.compiled.grid.horizon,
+            online.gaps,
+            online.time,
+            end=online.how.end,
+            traces=1,
+            samples=online.samples,
+            in_scope=int(status != "out of scope"),
+            verdict=status,
+            robustness=math.nan if any(map(math.isnan, known)) else min(known),
+            satisfied_traces=int(status == "satisfied"),
+            satisfied_share=share,
+            requirements=[
+                _requirement(rule, tally, online, causes.get(rule)) for rule, tally in tallies.items()
+            ],
+        ),
         status=status,
         rows=rows,
-        text="\n".join([*_text(told, online, rows, tallies, causes), "", WORDS[status].lower()]),
-        entry=_entry(told, online, tallies, status)
-        | {"requirements": _requirements(online, tallies, causes)},
-        traces=0 if status == "out of scope" else 1,
-        holds=min(tally.share for tally in tallies.values()) if counts else 0.0,
-        fails=max(tally.fails / max(tally.instants, 1) for tally in tallies.values()) if most else 0.0,
-        seconds=seconds,
+        text=text_of(title, rows, gaps.values(), reasons, [WORDS[status].lower()]),
+        traces=int(status != "out of scope"),
+        holds=share,
+        fails=max(tally.fails / max(tally.instants, 1) for tally in tallies.values()),
+        seconds=time.perf_counter() - begun,
         warnings=online.compiled.warnings,
-        said=said,
+        remarks=remarks,
     )
 
 
-def status_of(online: Online, tallies: Mapping[str, Tally]) -> Status:
-    """Status over all requirements."""
-    if online.in_scope is False:
-        return "out of scope"
-    found = {tally.status for tally in tallies.values()}
-    return "violated" if "violated" in found else "satisfied" if found == {"satisfied"} else "inconclusive"
-
-
-def robustness_text(tally: Tally, unit: str) -> str:
-    """The least robustness, or its bounds."""
-    if tally.status == "inconclusive":
-        return in_unit(f"[{signed(tally.low)}, {signed(tally.high)}]", unit)
-    near = abs(tally.robustness) <= TOLERANCE
-    return "boundary" if near else in_unit(signed(tally.robustness), unit)
-
-
-def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> VerdictRow:
-    where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
-    unit = online.rule(name).unit or ("" if cause is None else cause.unit)
-    value = robustness_text(tally, unit)
+def _row(name: str, tally: Tally, online: Online, cause: Cause | None, gaps: Mapping[str, str]) -> VerdictRow:
+    rule = online.rule(name)
+    where = f"from {_moment(online, tally.worst)}" if tally.instants > 1 else ""
+    unit = rule.unit or ("" if cause is None else cause.unit)
+    value = robustness_text(tally.status, tally.low, tally.high, tally.robustness, unit)
+    share = "" if tally.instants == 1 else percent(tally.share)
+    why = ""
     if cause is not None:
-        start = online.time(tally.worst) if tally.instants > 1 else cause.time
-        where = beside(f"t = {cause.time:.10g} s", f"t = {start:.10g} s")
-        return VerdictRow(name, tally.status, value, where, cause.because)
-    if tally.status == "satisfied":
-        return VerdictRow(name, tally.status, value, where)
-    if tally.status == "violated":
+        at = f"t = {cause.time:.10g} s"
+        where, why = beside(at, _moment(online, tally.worst) if tally.instants > 1 else at), cause.because
+    elif tally.status == "violated":
         why = f"violated at {tally.fails:,} of {tally.instants:,} starts"
-    else:
-        read = columns(online.rule(name).formula)
-        gaps = [text for signal, text in _gap_texts(online).items() if signal in read]
-        why = ", ".join(gaps) or "the trace is too short to say"
-    return VerdictRow(name, tally.status, value, where, why)
-
-
-def _gap_texts(online: Online) -> dict[str, str]:
-    """Unknown samples, one line per signal."""
-    return {
-        name: gap_text(name, gap, online.samples, (_moment(online, gap.first), _moment(online, gap.last)))
-        for name, gap in online.gaps.items()
-    }
+    elif tally.status == "inconclusive":
+        needed = columns(rule.formula)
+        why = ", ".join(text for signal, text in gaps.items() if signal in needed)
+        why = why or "the trace is too short to say"
+    return VerdictRow(name, tally.status, value, share, where, why)
 
 
 def _moment(online: Online, sample: int) -> str:
     return f"t = {online.time(sample):.10g} s"
-
-
-def _text(
-    told: Told,
-    online: Online,
-    rows: tuple[VerdictRow, ...],
-    tallies: Mapping[str, Tally],
-    causes: Mapping[str, Cause],
-) -> Iterator[str]:
-    head = f"{visible(told.source.name)} on {visible(told.name)}"
-    yield f"{head}    1 trace x {told.samples} samples, dt {told.dt:g} s"
-    yield ""
-    columns = ("requirement", "verdict", "robustness", "starts", "where")
-    lines = [
-        (row.name, WORDS[row.status], row.robustness, _share(tallies[row.name]), row.where) for row in rows
-    ]
-    yield table(lines, header=columns)
-    for gap in _gap_texts(online).values():
-        yield f"  {gap}"
-    for row in rows:
-        if row.status == "inconclusive":
-            yield ""
-            yield f"{visible(row.name)} is inconclusive: {row.why}."
-    for name, cause in causes.items():
-        yield ""
-        yield _violation(name, tallies[name], cause, color=told.color)
 
 
 def _violation(name: str, tally: Tally, cause: Cause, *, color: bool) -> str:
@@ -166,58 +137,19 @@ def _violation(name: str, tally: Tally, cause: Cause, *, color: bool) -> str:
     return f"{visible(name)} is violated{count}.\n{place}".rstrip("\n")
 
 
-def _share(tally: Tally) -> str:
-    return "" if tally.instants == 1 else percent(tally.share)
-
-
-def _entry(told: Told, online: Online, tallies: Mapping[str, Tally], status: Status) -> dict[str, Any]:
-    horizon = online.compiled.grid.horizon
-    known = [tally.robustness for tally in tallies.values()]
-    return {
-        "trace": told.name,
-        "spec": told.source.name,
-        "spec_sha256": hashlib.sha256(told.source.text.encode()).hexdigest(),
-        "dt": told.dt,
-        "horizon": None if horizon is None else {"seconds": horizon * told.dt, "steps": horizon},
-        "end": online.how.end,
-        "traces": 1,
-        "samples": told.samples,
-        "unknown": {name: gap_entry(gap, online.time) for name, gap in online.gaps.items()},
-        "in_scope": int(online.in_scope is not False),
-        "verdict": status,
-        "robustness": math.nan if any(map(math.isnan, known)) else min(known),
-        "satisfied_traces": int(status == "satisfied"),
-        "satisfied_share": min(tally.share for tally in tallies.values()),
-    }
-
-
-def _requirements(
-    online: Online, tallies: Mapping[str, Tally], causes: Mapping[str, Cause]
-) -> list[dict[str, Any]]:
-    return [_requirement(name, tally, online, causes.get(name)) for name, tally in tallies.items()]
-
-
-def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -> dict[str, Any]:
-    rule = online.rule(name)
-    time = online.time(tally.worst)
-    return {
-        "name": name,
-        "doc": rule.doc,
-        "tags": sorted(rule.tags),
-        "verdict": tally.status,
-        "robustness": {
-            "min": tally.robustness,
-            "mean": tally.robustness,
-            "low": tally.low,
-            "high": tally.high,
-            "unit": rule.unit or ("" if cause is None else cause.unit),
-            "argmin": {"trace": 0, "start": time, "time": time if cause is None else cause.time},
-        },
-        "starts": tally.instants,
-        "satisfied_share": tally.share,
-        "violated_traces": int(tally.status == "violated"),
-        "cause": None if cause is None else cause_entry(cause),
-    }
+def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -> CheckedRequirement:
+    least = tally.robustness
+    return requirement_record(
+        online.rule(name),
+        cause,
+        {"min": least, "mean": least, "low": tally.low, "high": tally.high},
+        0,
+        online.time(tally.worst),
+        verdict=tally.status,
+        starts=tally.instants,
+        satisfied_share=tally.share,
+        violated_traces=int(tally.status == "violated"),
+    )
 
 
 NAME = "standard input"
@@ -240,7 +172,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
     begun = time.perf_counter()
     source = read_source(find_spec(question.spec))
     monitor = monitor_of(source, question)
-    reading = laid_reading(monitor, question)
+    reading = reading_options(monitor, question)
     lines = SampleStream(NAME, reading)
     raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
     uniform = on_grid(lines.moments(raw), reading, NAME)
@@ -255,9 +187,8 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
         if talk:
             for decision in decisions:
                 _tell(decision, online)
-    step = online.compiled.grid.dt
-    told = Told(NAME, source, float(step or 0), online.samples, wants_color(sys.stdout))
-    return outcome_of_tallies(online, told, (), time.perf_counter() - begun)
+    step, color = float(online.compiled.grid.dt or 0), wants_color(sys.stdout)
+    return _outcome(online, NAME, source, step, color=color, remarks=(), begun=begun)
 
 
 def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
@@ -309,8 +240,8 @@ def _tell(decision: Decision, online: Online) -> None:
     bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
     value = in_unit(bounds, online.rule(decision.requirement).unit)
     judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
-    now = online.time(decision.sample)
-    emit(f"t = {now:.10g} s  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
+    now = _moment(online, decision.sample)
+    emit(f"{now}  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
 
 
 CHUNK = 250_000
@@ -331,7 +262,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     _require_pieces(path, work)
     begun = time.perf_counter()
     given = None if question.spec is None else monitor_of(read_source(find_spec(question.spec)), question)
-    read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
+    read = pieces(path, work.chunk or CHUNK, reading_options(given, question))
     first = next(read)
     source, note = specification(str(path), question.spec, first.meta.carried)
     monitor = given or monitor_of(source, question, first.meta.carried)
@@ -341,8 +272,8 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     online.feed(first)
     for piece in read:
         online.feed(piece)
-    told = Told(str(path), source, first.dt, online.samples, work.color)
-    return outcome_of_tallies(online, told, (note,) if note else (), time.perf_counter() - begun)
+    remarks = (note,) if note else ()
+    return _outcome(online, str(path), source, first.dt, color=work.color, remarks=remarks, begun=begun)
 
 
 def _require_pieces(path: Path, work: Work) -> None:

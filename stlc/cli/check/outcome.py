@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from stlc.cli.framework.documents import CheckedTrace, InvalidTrace
 from stlc.diagnostics import Diagnostic
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.judgement import Verdict
 from stlc.source import Source
 from stlc.trace import Trace
 
@@ -32,20 +33,22 @@ EXIT_CODES: dict[Status, int] = {
 
 @dataclass(frozen=True, slots=True)
 class VerdictRow:
-    """One requirement on all traces of a file.
+    """Result of a requirement on all traces of a file, as texts.
 
     Attributes:
-        name: of the requirement.
-        status: its verdict.
-        robustness: the least one, as text.
-        where: trace and time of the least robustness, as text.
-        why: one line for a requirement that is not satisfied.
+        name: name of the requirement.
+        status: verdict.
+        robustness: least robustness.
+        share: share of the starts at which the requirement holds; "" if there is one start.
+        where: trace and time of the least robustness.
+        why: reason in one line, if the requirement is not satisfied.
     """
 
     name: str
     status: Status
-    robustness: str = ""
-    where: str = ""
+    robustness: str
+    share: str
+    where: str
     why: str = ""
 
 
@@ -54,32 +57,32 @@ class Outcome:
     """Result of one file, judged or not.
 
     Attributes:
-        name: of the file.
-        status: over all traces and requirements.
-        rows: one for each requirement.
-        text: printed form of everything.
-        entry: the same for a JSON document.
+        name: name of the file.
+        entry: record of the JSON document.
+        status: verdict over all traces and requirements.
+        rows: results of the requirements.
+        text: printed result.
         traces: number of traces in scope.
         holds: share of the starts at which all requirements hold.
-        fails: share of the starts at which one is violated.
+        fails: share of the starts at which one requirement is violated.
         seconds: run time.
-        warnings: of the compiler.
-        said: further remarks.
+        warnings: warnings of the compiler.
+        remarks: further messages for the user.
         errors: reasons for which the file could not be judged.
-        exit_code: that of the errors.
+        exit_code: exit code of the errors.
     """
 
     name: str
+    entry: CheckedTrace | InvalidTrace
     status: Status = "inconclusive"
     rows: tuple[VerdictRow, ...] = ()
     text: str = ""
-    entry: dict[str, Any] = field(default_factory=dict)
     traces: int = 0
     holds: float = 0.0
     fails: float = 0.0
     seconds: float = 0.0
     warnings: tuple[Diagnostic, ...] = ()
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     errors: tuple[Diagnostic, ...] = ()
     exit_code: int = 0
 
@@ -92,8 +95,13 @@ def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> i
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:
         return max(broken)
+    traces = sum(outcome.traces for outcome in outcomes)
+    if fail_under is not None and traces:
+        holds = sum(outcome.holds * outcome.traces for outcome in outcomes) / traces
+        fails = sum(outcome.fails * outcome.traces for outcome in outcomes) / traces
+        return SATISFIED if holds >= fail_under else VIOLATED if 1.0 - fails < fail_under else INCONCLUSIVE
     if fail_under is not None:
-        return _by_share(outcomes, fail_under)
+        return INCONCLUSIVE
     return EXIT_CODES.get(overall(outcomes), INCONCLUSIVE)
 
 
@@ -105,41 +113,27 @@ def overall(outcomes: Sequence[Outcome]) -> Status:
     return "satisfied" if found - {"out of scope"} == {"satisfied"} else "inconclusive"
 
 
-def _by_share(outcomes: Sequence[Outcome], least: float) -> int:
-    traces = sum(outcome.traces for outcome in outcomes)
-    if not traces:
-        return INCONCLUSIVE
-    holds = sum(outcome.holds * outcome.traces for outcome in outcomes) / traces
-    fails = sum(outcome.fails * outcome.traces for outcome in outcomes) / traces
-    if holds >= least:
-        return SATISFIED
-    return VIOLATED if 1.0 - fails < least else INCONCLUSIVE
-
-
 @dataclass(frozen=True, slots=True)
 class Checked:
     """A judged trace: its specification, verdict and causes.
 
     Attributes:
-        trace: as read, signals renamed.
+        trace: trace as read, signals renamed.
         source: text of the specification.
-        verdict: per requirement.
-        causes: violated requirement -> causes.
-        asked: the command-line options of reading and judging.
+        verdict: verdict per requirement.
+        causes: violated requirement -> cause.
+        options: command-line options of reading and judging.
+        remarks: messages for the user.
     """
 
     trace: Trace
     source: Source
     verdict: Verdict
     causes: Mapping[str, Cause]
-    asked: tuple[str, ...] = ()
+    options: tuple[str, ...]
+    remarks: tuple[str, ...]
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """Of the compiler."""
+        """Warnings of the compiler."""
         return self.verdict.subject.compiled.warnings
-
-    def needs(self, judged: Judgement) -> tuple[float, float]:
-        """Seconds of signal that the judged instants of a requirement need, and available seconds."""
-        last = judged.start + judged.instants - 1 + judged.rule.reach
-        return last * self.trace.dt, (self.trace.samples - 1) * self.trace.dt

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,69 +19,74 @@ from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import Judgement, Verdict, beside
 from stlc.monitor.signals import gap_text
 
+if TYPE_CHECKING:
+    from stlc.monitor.judgement import Status
 
-def describe_result(result: Checked, *, color: bool) -> str:
+
+def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> str:
     """The printed result of one trace."""
-    return "\n".join(_parts(result, color))
-
-
-def _parts(result: Checked, color: bool) -> Iterator[str]:
-    yield _title(result)
-    yield ""
-    yield _table(result)
-    yield from _gaps(result)
-    for judged in result.verdict:
+    trace, verdict = result.trace, result.verdict
+    title = (
+        f"{visible(result.source.name)} on {visible(trace.name)}    "
+        f"{trace.traces} trace{'s' if trace.traces != 1 else ''} x {trace.samples} samples, dt {trace.dt:g} s"
+    )
+    reasons = []
+    for judged in verdict:
         cause = result.causes.get(judged.name)
         if cause is not None:
-            yield ""
-            yield _violation(judged, cause, result, color).rstrip("\n")
-        elif judged.overall == "inconclusive" and result.verdict.in_scope:
-            yield ""
-            yield _inconclusive(judged, result)
-    silent = sum(judged.overall == "violated" for judged in result.verdict) - len(result.causes)
-    if silent > 0:
-        yield ""
-        yield f"{silent:,} more are violated; --require NAME says why."
-    yield ""
-    yield _summary(result.verdict)
-    folder = _run_of(result)
-    if folder is not None:
-        yield f"next: {shell(('stlc', 'report', folder))}"
+            reasons.append(_violation(judged, cause, result, color).rstrip("\n"))
+        elif judged.overall == "inconclusive" and verdict.in_scope:
+            reasons.append(_inconclusive(judged, result))
+    unexplained = sum(judged.overall == "violated" for judged in verdict) - len(result.causes)
+    if unexplained > 0:
+        reasons.append(f"{unexplained:,} more are violated; --require NAME says why.")
+    ending, folder = [_summary(verdict)], Path(trace.name).parent
+    if (folder / "run.json").is_file():
+        ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
+    gaps = _gap_texts(result).values()
+    return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
 
 
-def _title(result: Checked) -> str:
-    trace = result.trace
-    count = f"{trace.traces} trace{'s' if trace.traces != 1 else ''} x {trace.samples} samples"
-    return f"{visible(result.source.name)} on {visible(trace.name)}    {count}, dt {trace.dt:g} s"
+def text_of(
+    title: str,
+    rows: Iterable[VerdictRow],
+    gaps: Iterable[str],
+    reasons: Iterable[str],
+    ending: Iterable[str],
+    *,
+    several: bool = False,
+) -> str:
+    """Text of a result: table of requirements, unknown samples, reasons, and last lines.
+
+    Args:
+        title: first line.
+        rows: results of the requirements.
+        gaps: unknown samples, a line per signal.
+        reasons: paragraphs on requirements that are not satisfied.
+        ending: last lines.
+        several: whether the file has several traces.
+    """
+    least = "robustness (min over traces)" if several else "robustness"
+    cells = [(row.name, WORDS[row.status], row.robustness, row.share, row.where) for row in rows]
+    lines = [title, "", table(cells, header=("requirement", "verdict", least, "starts", "where"))]
+    lines += [f"  {text}" for text in gaps]
+    for reason in reasons:
+        lines += ["", reason]
+    return "\n".join([*lines, "", *ending])
 
 
-def _table(result: Checked) -> str:
-    several = result.verdict.traces > 1
-    head = (
-        "requirement",
-        "verdict",
-        f"robustness{' (min over traces)' if several else ''}",
-        "starts",
-        "where",
-    )
-    return table([_row(judged, result) for judged in result.verdict], header=head)
-
-
-def _row(judged: Judgement, result: Checked) -> tuple[str, ...]:
-    share = "" if judged.holds.size == 1 else percent(judged.share)
-    return (judged.name, WORDS[judged.overall], _robustness(judged, result), share, _where(judged, result))
-
-
-def _robustness(judged: Judgement, result: Checked) -> str:
-    cause = result.causes.get(judged.name)
-    unit = judged.unit or ("" if cause is None else cause.unit)
-    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
-    if not judged.counted(judged.holds).size:
-        return ""
-    if judged.overall == "inconclusive":
+def robustness_text(status: Status, low: float, high: float, least: float, unit: str) -> str:
+    """The least robustness with its unit; its bounds if the verdict is inconclusive."""
+    if status == "inconclusive":
         return in_unit(f"[{signed(low)}, {signed(high)}]", unit)
-    value = float(judged.counted(judged.least).min())
-    return "boundary" if abs(value) <= TOLERANCE else in_unit(signed(value), unit)
+    return "boundary" if abs(least) <= TOLERANCE else in_unit(signed(least), unit)
+
+
+def _robustness(judged: Judgement, cause: Cause | None) -> str:
+    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
+    least = judged.counted(judged.least)
+    unit = judged.unit or ("" if cause is None else cause.unit)
+    return robustness_text(judged.overall, low, high, float(least.min()), unit) if least.size else ""
 
 
 def in_unit(value: str, unit: str) -> str:
@@ -118,23 +124,15 @@ def _where(judged: Judgement, result: Checked) -> str:
 
 def rows_of(result: Checked) -> tuple[VerdictRow, ...]:
     """The rows of the table, with a reason for each unsatisfied requirement."""
-    return tuple(
-        VerdictRow(
-            judged.name,
-            judged.overall,
-            _robustness(judged, result),
-            _where(judged, result),
-            _why(judged, result),
-        )
-        for judged in result.verdict
-    )
-
-
-def _why(judged: Judgement, result: Checked) -> str:
-    cause = result.causes.get(judged.name)
-    if cause is not None:
-        return cause.because
-    return _inconclusive(judged, result) if judged.overall == "inconclusive" else ""
+    rows = []
+    for judged in result.verdict:
+        cause = result.causes.get(judged.name)
+        why = _inconclusive(judged, result) if judged.overall == "inconclusive" else ""
+        share = "" if judged.holds.size == 1 else percent(judged.share)
+        robustness, where = _robustness(judged, cause), _where(judged, result)
+        why = why if cause is None else cause.because
+        rows.append(VerdictRow(judged.name, judged.overall, robustness, share, where, why))
+    return tuple(rows)
 
 
 # ------------------------------------------------------------------------ reasons
@@ -142,29 +140,20 @@ def _why(judged: Judgement, result: Checked) -> str:
 
 def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) -> str:
     verdict = result.verdict
-    moment = verdict.subject.time(cause.start)
-    words = (*result.asked, operand(result.trace.name), "--require", judged.name, "--at", f"{moment:.10g}s")
-    replay = shell(("stlc", "check", *words))
-    advice = [("because", cause.because), ("replay", replay)]
-    return f"{_count(judged, verdict)}\n{render_place(cause.place, cause.labels, advice, color=color)}"
-
-
-def _count(judged: Judgement, verdict: Verdict) -> str:
+    start = f"{verdict.subject.time(cause.start):.10g}s"
+    words = (*result.options, operand(result.trace.name), "--require", judged.name, "--at", start)
+    advice = [("because", cause.because), ("replay", shell(("stlc", "check", *words)))]
     headline = f"{visible(judged.name)} is violated"
     if verdict.traces > 1:
         headline += f" in {judged.statuses.count('violated')} of {verdict.in_scope} traces"
     if judged.instants > 1:
         fails = judged.counted(judged.fails)
         headline += f", at {int(fails.sum()):,} of {fails.size:,} starts"
-    return f"{headline}."
-
-
-def _gaps(result: Checked) -> list[str]:
-    """Needed but unknown samples, one line per signal."""
-    return [f"  {text}" for text in _gap_texts(result).values()]
+    return f"{headline}.\n{render_place(cause.place, cause.labels, advice, color=color)}"
 
 
 def _gap_texts(result: Checked) -> dict[str, str]:
+    """Needed but unknown samples, one line per signal."""
     subject = result.verdict.subject
     samples = subject.signals.samples * subject.signals.batch
     moment = subject.moment
@@ -176,7 +165,8 @@ def _gap_texts(result: Checked) -> dict[str, str]:
 
 def _inconclusive(judged: Judgement, result: Checked) -> str:
     name = visible(judged.name)
-    needed, length = result.needs(judged)
+    last = judged.start + judged.instants - 1 + judged.rule.reach
+    needed, length = last * result.trace.dt, (result.trace.samples - 1) * result.trace.dt
     gaps = [text for signal, text in _gap_texts(result).items() if signal in columns(judged.rule.formula)]
     if gaps and needed <= length:
         return f"{name} is inconclusive: {', '.join(gaps)}."
@@ -189,23 +179,15 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
 
 
 def _summary(verdict: Verdict) -> str:
-    outside = verdict.traces - verdict.in_scope
-    if not verdict.in_scope:
+    traces, outside = verdict.in_scope, verdict.traces - verdict.in_scope
+    if not traces:
         return "out of scope: the assumptions do not hold"
-    if outside:
-        return _summary_of(verdict, verdict.in_scope) + f"; {outside} out of scope"
-    return _summary_of(verdict, verdict.traces)
-
-
-def _summary_of(verdict: Verdict, traces: int) -> str:
     count = max(judged.instants for judged in verdict) * traces
     starts = f"{percent(verdict.share)} of {count:,} starts"
-    if verdict.traces == 1:
-        return f"{verdict.overall}; all requirements hold at {starts}" if count > 1 else verdict.overall
-    return f"{verdict.satisfied_traces} of {traces} traces satisfy every requirement; {starts}"
-
-
-def _run_of(result: Checked) -> str | None:
-    """The run whose folder contains the trace, if any."""
-    folder = Path(result.trace.name).parent
-    return str(folder) if (folder / "run.json").is_file() else None
+    if verdict.traces > 1:
+        text = f"{verdict.satisfied_traces} of {traces} traces satisfy every requirement; {starts}"
+    elif count > 1:
+        text = f"{verdict.overall}; all requirements hold at {starts}"
+    else:
+        text = verdict.overall
+    return text + (f"; {outside} out of scope" if outside else "")

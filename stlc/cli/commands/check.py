@@ -5,22 +5,20 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import Question, Work, usage
-from stlc.cli.framework.options import FailUnderOption, JsonOption
-from stlc.cli.framework.output import COLOR, PULSE, QUIET, emit, emit_json, say, show_diagnostics, wants_color
+from stlc.cli.check.judge import Work, usage
+from stlc.cli.framework.documents import CheckResult
+from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
+from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
+from stlc.files import write_atomic
 
 if TYPE_CHECKING:
     from stlc.cli.check.outcome import Outcome
-
-_SPECS = (".stl", ".stlc")
-_STREAM = "-"
 
 
 @command(
@@ -42,7 +40,7 @@ def check(
     chunk: given.Chunk = 0,
     reading: given.Traces = given.TRACES,
     json: JsonOption = False,
-) -> None:
+) -> Answer[CheckResult]:
     """Judge recorded traces: verdicts, and the reasons of violations.
 
     A trace is searched as given, then in the newest run. It is judged by the specification stored in it, with
@@ -51,18 +49,25 @@ def check(
     in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with -q nothing is
     printed.
     """
+    from stlc.cli.check.document import document
+    from stlc.cli.check.document import junit as junit_xml
     from stlc.cli.check.many import all_outcomes, out_paths
     from stlc.cli.check.outcome import exit_code
 
     spec, traces = _split_files(files, reading.spec)
-    question = reading.question(
-        spec=spec, at=at, end=end, tolerance=_tolerance(tolerance), semantics=semantics
-    )
+    if not 0 <= tolerance < math.inf:
+        raise usage(f"`--tolerance {tolerance}` is not a number from 0 on")
+    question = reading.question(spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics)
     talk = not (QUIET.get() or json)
-    if _STREAM in traces:
+    if STDIN in traces:
+        from stlc.cli.check.online import outcome_of_stream
+
         if out is not None:
             raise usage("`--out` needs the whole trace, and the standard input is judged line by line")
-        outcomes = [_stream(traces, question, talk=talk)]
+        if len(traces) > 1:
+            raise usage("the standard input is judged alone", "stlc check SPEC -")
+        with PULSE.doing(""):  # waits for samples
+            outcomes = [outcome_of_stream(question, talk=talk)]
     else:
         color, paths = wants_color(sys.stdout), out_paths(out, traces)
         works = [
@@ -70,40 +75,25 @@ def check(
             for name, path in zip(traces, paths, strict=True)
         ]
         outcomes = list(all_outcomes(works, jobs))
-    code = exit_code(outcomes, fail_under)
     if junit is not None:
-        _write_junit(junit, outcomes)
-    if json:
-        _print_document(outcomes, code)
-    elif talk:
-        _print(outcomes)
-    raise typer.Exit(code)
-
-
-def _stream(traces: Sequence[str], question: Question, *, talk: bool) -> Outcome:
-    from stlc.cli.check.online import outcome_of_stream
-
-    if len(traces) > 1:
-        raise usage("the standard input is judged alone", "stlc check SPEC -")
-    with PULSE.doing(""):  # waits for samples
-        return outcome_of_stream(question, talk=talk)
-
-
-# -------------------------------------------------------------------------- results
+        write_atomic(junit, junit_xml(outcomes))
+    findings = dict.fromkeys(f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings))
+    show = partial(_print, outcomes) if talk else lambda: None
+    return Answer(document(outcomes), show, exit_code(outcomes, fail_under), findings)
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
     """Print remarks, unsatisfied results in full, and a table if there are several files."""
     from stlc.cli.check.many import summary
 
-    told = set()
+    shown = set()
     for outcome in outcomes:
-        for line in outcome.said:
+        for line in outcome.remarks:
             say(line)
         show_diagnostics(outcome.errors)
-        fresh = [warning for warning in outcome.warnings if warning not in told]
+        fresh = [warning for warning in outcome.warnings if warning not in shown]
         show_diagnostics(fresh)
-        told.update(fresh)
+        shown.update(fresh)
     if len(outcomes) == 1:
         emit(outcomes[0].text, styled=True)
         return
@@ -111,42 +101,12 @@ def _print(outcomes: Sequence[Outcome]) -> None:
     emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
 
 
-def _print_document(outcomes: Sequence[Outcome], code: int) -> None:
-    from stlc.cli.check.document import document
-
-    findings = [f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings)]
-    emit_json(
-        "check/1",
-        ok=code == 0,
-        exit_code=code,
-        diagnostics=dict.fromkeys(findings),
-        result=document(outcomes),
-    )
-
-
-def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
-    from stlc.cli.check.document import junit
-    from stlc.files import write_atomic
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, junit(outcomes))
-
-
-# ------------------------------------------------------------------------ arguments
-
-
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
     """The specification, if the first file is one, and the traces."""
-    specs = [name for name in files if Path(name).suffix in _SPECS]
+    specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
     traces = [name for name in files if name not in specs]
     if len(specs) > 1 or (specs and spec is not None):
         raise usage(f"more than one specification: {', '.join([*specs, *([str(spec)] if spec else [])])}")
     if not traces:
         raise usage("which trace?", "stlc check SPEC TRACE")
     return (Path(specs[0]) if specs else spec), traces
-
-
-def _tolerance(value: float) -> float:
-    if not 0 <= value < math.inf:
-        raise usage(f"`--tolerance {value}` is not a number from 0 on")
-    return value

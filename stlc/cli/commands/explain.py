@@ -13,7 +13,7 @@ import typer
 
 from stlc.cli.check import options as given
 from stlc.cli.framework import documents
-from stlc.cli.framework.options import JsonOption, parse_overrides
+from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, UsageError
@@ -68,7 +68,7 @@ def explain(
         return _page(_code(what.upper()))
     if what in _TOPICS:
         return _page(what)
-    if what == "-" or Path(what).suffix in (".stl", ".stlc"):
+    if what == STDIN or Path(what).suffix in SPEC_SUFFIXES:
         return _spec(what, reading.require or [])
     from stlc.cli.check.causes import explain_trace
 

@@ -47,8 +47,8 @@ def plot(
     selects one. With --places all paths are drawn over the regions of the requirements, such as `dock` in
     `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
-    from stlc.cli.check.judge import laid_out, monitor_of, specification
-    from stlc.trace import read_recording
+    from stlc.cli.check.judge import monitor_of, reading_options, specification
+    from stlc.trace import read_recording, trace_of
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
     from stlc.view.verdicts import margins_of, units_of
@@ -61,7 +61,7 @@ def plot(
     planned = recording.meta.planned  # margins over time are those of windows
     source, note = specification(recording.name, question.spec, planned)
     monitor = monitor_of(source, question, planned)
-    recorded = laid_out(recording, monitor, question)
+    recorded = trace_of(recording, reading_options(monitor, question))
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]
         picture = _map(monitor, _one(recorded, trace), reading.require or [])

@@ -80,7 +80,7 @@ def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
     return values
 
 
-SUFFIXES = (".stl", ".stlc")
+SPEC_SUFFIXES = (".stl", ".stlc")
 STDIN = "-"
 
 
@@ -100,7 +100,9 @@ def _below(name: str) -> Iterator[str]:
     if name == STDIN or not folder.is_dir():
         yield name
         return
-    found = sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES and _shown(path, folder))
+    found = sorted(
+        path for path in folder.rglob("*") if path.suffix in SPEC_SUFFIXES and _shown(path, folder)
+    )
     if not found:
         raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
     yield from map(str, found)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+from importlib import import_module
 from pathlib import Path
+from typing import get_args, get_origin, get_type_hints
 
 import pytest
 from helpers.documents import misfits
@@ -11,6 +14,8 @@ from jsonschema import Draft202012Validator
 
 from stlc.cli.commands.schema import load_schema, names
 from stlc.cli.framework.app import main
+from stlc.cli.framework.documents import RESULTS
+from stlc.cli.framework.output import Answer
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -24,6 +29,22 @@ def test_the_checker_finds_what_does_not_fit():
 @pytest.mark.parametrize("name", names())
 def test_a_schema_is_one(name):
     Draft202012Validator.check_schema(load_schema(name))
+
+
+@pytest.mark.parametrize("name", [*RESULTS.keys() - {"stlc"}])
+def test_commands_declare_the_records_that_they_print(name):
+    module = import_module(f"stlc.cli.commands.{name}")
+    declared = [
+        get_args(answer)[0]
+        for function in vars(module).values()
+        if inspect.isfunction(function)
+        and function.__module__ == module.__name__
+        and not function.__name__.startswith("_")
+        and get_origin(answer := get_type_hints(function).get("return")) is Answer
+    ]
+    assert {each for one in declared for each in get_args(one) or (one,)} == {
+        *(get_args(RESULTS[name]) or (RESULTS[name],))
+    }
 
 
 @pytest.fixture(autouse=True)
