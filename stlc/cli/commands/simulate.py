@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stlc.cli.framework.documents import ScenarioResult, Simulation
 from stlc.cli.framework.options import (
     FailUnderOption,
     JsonOption,
+    PicturesOption,
     RunArgument,
     RunsOption,
     SeedsOption,
     SetOption,
     parse_overrides,
 )
+from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.diagnostics import Diagnostic, RunError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.deployment.simulator import Setting
@@ -32,8 +35,6 @@ if TYPE_CHECKING:
     from stlc.controller.guard.margins import MarginRequest
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl
-
-Record: TypeAlias = "dict[str, Any]"
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
@@ -107,10 +108,10 @@ def simulate(
     windows: WindowsOption = False,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-    pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
+    pictures: PicturesOption = True,
     window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
     json: JsonOption = False,
-) -> None:
+) -> Answer[Simulation]:
     """Deploy a trained policy in the world of its system.
 
     The newest run by default. With --backup the paper's backup policy guards it, and the same seeds are
@@ -119,37 +120,51 @@ def simulate(
     (test: judge). Means over seeds have 95 % intervals (Student's t). Every system has the scenarios
     mismatch, disturb and noise, also with a percentage (mismatch-20); --scenario disturbed runs them all.
     """
-    chosen = _guard(backup, guard)
-    printed = _printed(json=json, margins=margins)
-    from stlc.cli.framework.output import emit_json, show_diagnostics
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
     from stlc.controller.deployment.simulator import Setting
+    from stlc.controller.guard.margins import parse_margins
     from stlc.controller.training.run import Run
     from stlc.trace import check_writable
 
+    chosen = _guard(backup, guard)
+    printed = _printed(json=json, margins=margins)
     if record is not None:
         check_writable(record)
     require_writable(margins)
-    opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
-    show_diagnostics(_longer(opened, steps or opened.task.system.decl.test.steps))
+    overrides = parse_overrides(set_)
+    opened = Run.open(run, root=runs, overrides=overrides)
+    decl = opened.task.system.decl
+    test = decl.test
+    show_diagnostics(_longer(opened, steps or test.steps))
     if window:
         _require_robots(opened)
-    test, which = opened.task.system.decl.test, parse_seeds(seeds)
     size = agents or test.agents, steps or test.steps
-    setting = _hurried(Setting(which, *size, test.replan, ceiling=ceiling), time_limit)
+    setting = Setting(parse_seeds(seeds), *size, test.replan, ceiling=ceiling)
+    if time_limit is not None:  # by default the paper's guard has none
+        limit = parse_limit(time_limit)
+        setting = replace(setting, limit=limit, paper_limit=limit)
+    requested = parse_margins(margin or ())
+    order = _Order(opened, chosen, setting, record, live, margins, overrides, requested)
     several = _several(opened, scenario)
-    order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
-    document = _all(order, several) if several else _driven(order, scenario)
-    code = 1 if fail_under is not None and _satisfied(document, chosen) < fail_under else 0
+    document = _all(order, several) if several else _deployed(order, scenario)
     if not json:  # before the pictures, so that they do not affect the measurements
-        _print(screen(document, windows=windows), printed)
+        for line in screen(document, windows=windows):
+            printed(line)
     drawn = _pictures(opened) if pictures else {}
-    if json:
-        emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
-    else:
-        _print(closing(document["trace"], drawn, record, _needed_system(opened)), printed)
-    _end(opened, window=window, code=code)
+
+    def show() -> None:
+        # external functions are not stored in traces: judging needs the system file
+        needed = f"{opened.dir.shown}/system.yaml" if decl.functions else None
+        for line in closing(document["trace"], drawn, record, needed):
+            printed(line)
+        if window:
+            _show_robots(opened)
+
+    made: Any = {**document, **drawn}
+    result: Simulation = made
+    missed = fail_under is not None and _satisfied(document, chosen) < fail_under
+    return Answer(result, show, int(missed))
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
@@ -164,13 +179,6 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     return (Diagnostic("W604", message, note=(note,)),)
 
 
-def _end(run: Run, *, window: bool, code: int) -> None:
-    if window:
-        _show_robots(run)
-    if code:
-        raise typer.Exit(code)
-
-
 @dataclass(frozen=True, slots=True)
 class _Order:
     """Options of a deployment."""
@@ -182,12 +190,11 @@ class _Order:
     live: bool
     margins: str | None
     overrides: Mapping[str, str]
-    asked: MarginRequest
+    requested: MarginRequest
 
 
-def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
-    """Deploy without and with the guard under a scenario; margins are written if its results are `kept`."""
-    from stlc.cli.framework.output import show_diagnostics
+def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
+    """Deploy without and with the guard under a scenario; robustness margins are written if `writes`."""
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.training.run import Run
@@ -197,24 +204,23 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
     if name is not None:
         run = Run.open(run.dir.path, overrides=order.overrides, scenario=name)
     rules = rules_of(run)
-    margin = order.asked.of(run.task, run.policy, order.guard, order.setting.replan)
-    setting = replace(order.setting, margin=margin)
+    margin = order.requested.of(run.task, run.policy, order.guard, order.setting.replan)
+    order = replace(order, setting=replace(order.setting, margin=margin))
     for mode in GUARDS[order.guard]:
         title = " · ".join((run.task.compiled.name, guard_words(mode).title, *([name] if name else [])))
-        last = kept and mode == order.guard
-        watching = Watching(title, order.live, order.margins if last else None)
+        guarded = mode == order.guard
+        watching = Watching(title, order.live, order.margins if writes and guarded else None)
         try:
-            found[mode] = _deploy(run, replace(order, setting=setting), mode, watching, rules)
+            found[mode] = _deploy(run, order, mode, watching, rules)
         except RunError as error:
-            if mode == order.guard:
+            if guarded:
                 raise
             show_diagnostics(error.diagnostics)  # only the comparison fails: the guarded run continues
-    return _save(run, replace(order, setting=setting), found, rules)
+    return _save(run, order, found, rules)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
     """Printer of readable output: to the standard output, unless margins are written there."""
-    from stlc.cli.framework.output import emit, say
     from stlc.cli.simulate.watch import STANDARD_OUTPUT
 
     if margins != STANDARD_OUTPUT:
@@ -238,57 +244,34 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
     return {name: find_scenario(decl, name) for name in DISTURBED} if scenario == USUAL else {}
 
 
-def _needed_system(run: Run) -> str | None:
-    """The system file if a trace needs it for judging: external functions are not stored in traces."""
-    return f"{run.dir.shown}/system.yaml" if run.task.system.decl.functions else None
+def _satisfied(document: Simulation, guard: Mode) -> float:
+    """The share of closed-loop runs that satisfy everything; the least one over all scenarios."""
+    guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
+    runs = [each[guard]["drives"] for each in guards]
+    return min(float(each["obeyed"] / each["count"]) for each in runs)
 
 
-def _satisfied(document: Record, guard: Mode) -> float:
-    """The share of drives that satisfy everything; the least one over all scenarios."""
-    each = [one["guards"][guard]["drives"] for one in (document, *document.get("scenarios", {}).values())]
-    return min(float(drives["obeyed"] / drives["count"]) for drives in each)
-
-
-def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
+def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
     """Deploy nominally and under scenarios; the trace is that of the nominal deployment."""
-    found = {
-        name: {
+    found: dict[str, ScenarioResult] = {}
+    for name, scenario in scenarios.items():
+        each = _deployed(order, name, writes=False)
+        expect: Any = scenario.expect
+        found[name] = {
             "doc": scenario.doc,
-            "expect": scenario.expect,
-            **{key: document[key] for key in ("judge", "guards")},
+            "expect": expect,
+            "judge": each["judge"],
+            "guards": each["guards"],
         }
-        for name, scenario in scenarios.items()
-        for document in [_driven(order, name, kept=False)]
-    }
-    document = {**_driven(order, None), "scenarios": found}
+    document: Simulation = {**_deployed(order, None), "scenarios": found}
     order.run.dir.write_json(SCENARIOS, document)
     return document
 
 
-def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
-    for line in lines:
-        printed(line)
-
-
-def _hurried(setting: Setting, given: str | None) -> Setting:
-    """The setting with the given time limit; the paper's guard has no default limit."""
-    if given is None:
-        return setting
-    limit = parse_limit(given)
-    return replace(setting, limit=limit, paper_limit=limit)
-
-
-def _asked(margins: list[str] | None) -> MarginRequest:
-    from stlc.controller.guard.margins import parse_margins
-
-    return parse_margins(margins or ())
-
-
 def _guard(backup: bool | None, guard: str | None) -> Mode:
     if guard not in (None, *GUARDS):
-        raise UsageError(
-            Diagnostic("U101", f"there is no guard `{guard}`", help=("--guard none, paper or full",))
-        )
+        advice = ("--guard none, paper or full",)
+        raise UsageError(Diagnostic("U101", f"there is no guard `{guard}`", help=advice))
     if backup is not None and guard is not None and backup != (guard == "paper"):
         option = "--backup" if backup else "--no-backup"
         raise UsageError(Diagnostic("U101", f"`{option}` and `--guard {guard}` contradict each other"))
@@ -300,7 +283,6 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
     """Run one watched deployment; results up to a failure or Ctrl-C are saved."""
-    from stlc.cli.framework.output import PULSE, say
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
 
@@ -314,8 +296,8 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
         raise (error.__cause__ or error) from None
 
 
-def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Record:
-    """Write trace, scene and figures into the run's folder; return the metrics."""
+def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
+    """Write trace, scene and record into the run's folder; return the record."""
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import RESULT, SCENE, save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
@@ -325,14 +307,15 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
     save_scene(run.dir.path / SCENE, last.recording.scene)
     beside = found["none"].recording if "none" in found and len(found) > 1 else None
     save_unguarded(run, beside, order.setting, rules)
-    world = run.task.system.decl.test.world
+    decl = run.task.system.decl
+    world, scenario = decl.test.world, decl.scenario
     facts = {
         "spec": run.task.compiled.name,
         "system": run.task.system.decl.name,
         "run": run.dir.name,
         "world": world.path.name if world is not None else None,
-        "scenario": _laid_over(run),
-        "starts": run.task.system.decl.test.starts,
+        "scenario": None if scenario is None else scenario.name,
+        "starts": decl.test.starts,
         "redrawn": last.recording.redrawn,
         "errors": errors_of(run.task.plain.truth),
         "judge": None if rules is None else {"spec": rules.name, "path": rules.path, "rules": rules.docs},
@@ -340,14 +323,10 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
         "trace": f"{run.dir.shown}/trace.npz",
         "overrides": dict(order.overrides),
     }
-    document = as_json(found, order.setting, facts)
+    made: Any = as_json(found, order.setting, facts)
+    document: Simulation = made
     run.dir.write_json(RESULT, document)
     return document
-
-
-def _laid_over(run: Run) -> str | None:
-    scenario = run.task.system.decl.scenario
-    return None if scenario is None else scenario.name
 
 
 # ------------------------------------------------------------------------- pictures
@@ -355,7 +334,6 @@ def _laid_over(run: Run) -> str | None:
 
 def _pictures(run: Run) -> dict[str, str]:
     """Draw the animation and the report if matplotlib is installed; return kind -> file."""
-    from stlc.cli.framework.output import PULSE, say
     from stlc.view import available
 
     if not available():
@@ -403,7 +381,6 @@ def _require_robots(run: Run) -> None:
 
 def _show_robots(run: Run) -> None:
     """Play the newest deployment in PyBullet's window."""
-    from stlc.cli.framework.output import PULSE
     from stlc.view import bullet
     from stlc.view.run_animation import recorded_scene
 

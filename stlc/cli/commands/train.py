@@ -8,25 +8,26 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
-from stlc.cli.framework.output import say, show_diagnostics
+from stlc.cli.framework.documents import TrainedRun, TrainedRuns
+from stlc.cli.framework.options import PicturesOption, RunsOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_clock, parse_count, parse_seconds, parse_seeds
 from stlc.cli.train.many import Many, train_many
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
 from stlc.registry import METHODS
+from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from stlc.cli.train.sitting import Sitting
+    from stlc.cli.train.session import Session
     from stlc.controller.problem.task import Task
     from stlc.controller.training.budget import StepSchedule
     from stlc.controller.training.config import TrainConfig
@@ -93,21 +94,6 @@ DrivesOption = Annotated[
 LogOption = Annotated[
     str | None, typer.Option(metavar="tensorboard", help="Keep the curves for TensorBoard too.")
 ]
-RunsOption = Annotated[Path, typer.Option(help="Folder of all runs.")]
-PicturesOption = Annotated[bool, typer.Option(help="Draw the curves and the report.")]
-
-
-@dataclass(frozen=True, slots=True)
-class Length:
-    """Length of a resumed run; by default its remaining steps or budget.
-
-    Attributes:
-        steps: a new total of steps.
-        more: additional seconds of training.
-    """
-
-    steps: int | None
-    more: float | None
 
 
 @command(
@@ -137,11 +123,10 @@ def train(
     held_out: HeldOutOption = None,
     drives: DrivesOption = None,
     log: LogOption = None,
-    runs: RunsOption = Path("runs"),
+    runs: RunsOption = RUNS,
     pictures: PicturesOption = True,
     set_: SetOption = None,
-    json: JsonOption = False,
-) -> None:
+) -> Answer[TrainedRun | TrainedRuns]:
     """Train a policy that satisfies a specification.
 
     The run's folder contains everything to reproduce it. Ctrl-C saves a checkpoint and stops.
@@ -150,24 +135,21 @@ def train(
     specs = tuple(dict.fromkeys(spec or ()))
     _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
     _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
-    logbook = _logbook(log)
+    logger = _logger(log)
     if resume is not None:
         _refuse_on_resume(
             {"SPEC": spec or None, "--system": system, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
-            | {
-                "--set": set_,
-                "--seeds": seeds,
-                "--held-out": held_out,
-                "--drives": drives,
-                "--cluster": cluster,
-            }
+            | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--drives": drives}
+            | {"--cluster": cluster}
         )
-        total = parse_count(steps, "--steps") if steps is not None else None
-        more = parse_seconds(budget) if budget is not None else None
-        length = Length(total, more)
-        _go_on(resume, runs=runs, length=length, device=device, logbook=logbook, pictures=pictures, json=json)
+        total = None if steps is None else parse_count(steps, "--steps")
+        more = None if budget is None else parse_seconds(budget)
+        with one_voice():
+            session = _resume(RunDir.open(resume, runs), total, more, device, logger)
+            return session.conclude(pictures=pictures)
     from stlc.controller.training.config import DRIVES, HELD_OUT, TrainConfig
+    from stlc.controller.training.launch import Launch
 
     config = TrainConfig(
         method=_method(method) if method is not None else None,
@@ -183,13 +165,14 @@ def train(
         clock=parse_clock(clock),
         drives=DRIVES if drives is None else drives,
     )
-    launch = _launch(runs, name, set_)
-    if len(specs) > 1 or seeds is not None or cluster is not None:
-        drawn = parse_seeds(seeds) if seeds is not None else (seed,)
-        _train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures), json=json)
-    with one_voice():
-        task = _task(specs, system, launch.overrides)
-        _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
+    launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
+    drawn = parse_seeds(seeds) if seeds is not None else (seed,)
+    if len(specs) < 2:  # errors of a single specification are reported once, before the first of several runs
+        with one_voice():
+            task = _task(specs, system, launch.overrides)
+            if seeds is None and cluster is None:
+                return _train(task, config, launch, logger).conclude(pictures=pictures)
+    return train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures))
 
 
 def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: str | None) -> None:
@@ -215,8 +198,8 @@ def _check_many(
         raise UsageError(Diagnostic("U101", "`--jobs` needs several runs", help=help_))
 
 
-def _logbook(name: str | None) -> Opener | None:
-    """The logger of `--log`. Raises MissingError (R301) if it is not installed."""
+def _logger(name: str | None) -> Opener | None:
+    """Opener of the logger of `--log`. Raises MissingError (R301) if it is not installed."""
     if name is None:
         return None
     if name != "tensorboard":
@@ -280,67 +263,35 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     return task
 
 
-def _launch(runs: Path, name: str | None, changes: Sequence[str] | None) -> Launch:
-    """The launch options: folder, name, and overrides of `--set`."""
-    from stlc.controller.training.launch import Launch
-
-    return Launch(root=runs, name=name, overrides=parse_overrides(changes), command=sys.argv[1:])
-
-
-def _go_on(
-    where: str,
-    *,
-    runs: Path,
-    length: Length,
-    device: str,
-    logbook: Opener | None,
-    pictures: bool,
-    json: bool,
-) -> NoReturn:
-    """Resume a run and conclude it."""
-    with one_voice():
-        sitting = _resume(where, runs=runs, length=length, device=device, logbook=logbook)
-        sitting.conclude(pictures=pictures, json=json)
-
-
-def _train_many(many: Many, *, json: bool) -> NoReturn:
-    """Train several runs; errors of a single specification are reported once, before the first run."""
-    if len(many.specs) < 2:
-        with one_voice():
-            _task(many.specs, many.system, many.launch.overrides)
-    train_many(many, json=json)
-
-
-def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | None) -> Sitting:
+def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | None) -> Session:
     """Train a new run."""
-    from stlc.cli.train.sitting import Sitting
+    from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
     from stlc.controller.training.loop import find_device, train
-    from stlc.rundir import RunDir
 
     with joined(config.device) as ranks:
         find_device(ranks.device(config.device))
         made = str(open_folder(task, config, launch).path) if ranks.first else ""
         folder = RunDir(Path(ranks.agree_text(made)))
-        with Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
-            sitting.outcome = train(task, config, folder, sitting.watch, ranks=ranks)
-    return sitting
+        with Session(folder, logger=logger, writes=ranks.first) as session:
+            session.outcome = train(task, config, folder, session.watch, ranks=ranks)
+    return session
 
 
-def _resume(where: str, *, runs: Path, length: Length, device: str, logbook: Opener | None) -> Sitting:
-    """Resume a run from its last checkpoint."""
-    from stlc.cli.train.sitting import Sitting
+def _resume(
+    folder: RunDir, steps: int | None, more: float | None, device: str, logger: Opener | None
+) -> Session:
+    """Resume a run from its last checkpoint: to a total of `steps`, for `more` seconds, or to its end."""
+    from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.loop import resume
-    from stlc.rundir import RunDir
 
-    folder = RunDir.open(where, runs)
-    with joined(device) as ranks, Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
-        sitting.outcome = resume(
-            folder, steps=length.steps, budget=length.more, device=device, watch=sitting.watch, ranks=ranks
+    with joined(device) as ranks, Session(folder, logger=logger, writes=ranks.first) as session:
+        session.outcome = resume(
+            folder, steps=steps, budget=more, device=device, watch=session.watch, ranks=ranks
         )
-    return sitting
+    return session
 
 
 def _refuse_on_resume(given: Mapping[str, object]) -> None:

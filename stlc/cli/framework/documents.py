@@ -420,13 +420,6 @@ class RemovedRuns(TypedDict):
     removed: list[str]
 
 
-class ScenarioResult(TypedDict):
-    doc: str
-    expect: Literal["nominal", "ood"]
-    guards: dict[str, Any]
-    judge: NotRequired[dict[str, Any] | None]
-
-
 class MetricValues(TypedDict):
     mean: Num
     low: Num
@@ -496,6 +489,13 @@ class JudgeSpec(TypedDict):
     spec: str
     path: str
     rules: dict[str, str]
+
+
+class ScenarioResult(TypedDict):
+    doc: str
+    expect: Literal["nominal", "ood"]
+    guards: dict[str, GuardedRuns]
+    judge: NotRequired[JudgeSpec | None]
 
 
 class LiveMargin(TypedDict):
@@ -624,12 +624,13 @@ class ClosedLoopRecord(TypedDict):
 
 
 class Training(TypedDict):
-    accuracy: NotRequired[Num]
-    interval: NotRequired[list[Num]]
+    accuracy: NotRequired[float]
+    interval: NotRequired[list[float]]
     held_out: NotRequired[int]
-    requirements: NotRequired[dict[str, Num]]
-    feasible: NotRequired[Num]
+    requirements: NotRequired[dict[str, float]]
+    feasible: NotRequired[float]
     searched: NotRequired[int]
+    judged_seconds: NotRequired[float]
     closed_loop: NotRequired[ClosedLoopRecord]
     verdict: NotRequired[TrainingVerdict]
     steps: NotRequired[int | None]
@@ -638,7 +639,7 @@ class Training(TypedDict):
 
 class TrainedRun(Training):
     run: str
-    seconds: Num
+    seconds: float
 
 
 class TrainedJob(Training):
@@ -647,7 +648,7 @@ class TrainedJob(Training):
     exit_code: int
     why: NotRequired[str]
     run: NotRequired[str]
-    seconds: NotRequired[Num]
+    seconds: NotRequired[float]
 
 
 class TrainedRuns(TypedDict):

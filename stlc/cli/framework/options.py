@@ -54,6 +54,7 @@ FailUnderOption = Annotated[
     ),
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
+PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),

@@ -11,7 +11,7 @@ from stlc.view.words import guard_words
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-Record: TypeAlias = "dict[str, Any]"
+Record: TypeAlias = "Mapping[str, Any]"
 
 MOST_LISTED = 12
 MOST_BROKEN = 6

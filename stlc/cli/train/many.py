@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from stlc.cli.framework.output import emit, emit_json, say, table
+from stlc.cli.framework.documents import TrainedJob, TrainedRuns
+from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
 
 if TYPE_CHECKING:
@@ -110,8 +109,8 @@ class Many:
         return Job(self.name(part), arguments, read, launch.root)
 
 
-def train_many(many: Many, *, json: bool) -> NoReturn:
-    """Train all runs, print a table or the JSON document, and raise `typer.Exit` with the exit code."""
+def train_many(many: Many) -> Answer[TrainedRuns]:
+    """Train all runs; the text is a table, the exit code the greatest of all runs."""
     found: dict[str, JobResult] = {}
     sent = "begins" if many.cluster is None else "is sent"
     try:
@@ -124,12 +123,8 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
         raise
     ordered = {part: found[many.name(part)] for part in many.parts}
     code = max((back.code if back.code >= 0 else ENDED) for back in ordered.values())
-    if json:
-        result = {"runs": [_entry(part, back) for part, back in ordered.items()]}
-        emit_json("train/1", ok=code == 0, exit_code=code, result=result)
-    else:
-        emit(_table(many, ordered))
-    raise typer.Exit(code)
+    jobs = [_record(part, back) for part, back in ordered.items()]
+    return Answer({"runs": jobs}, lambda: emit(_table(many, ordered)), code)
 
 
 def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
@@ -189,7 +184,9 @@ def _mean(backs: Sequence[JobResult]) -> list[tuple[str, ...]]:
     return [("mean", f"{mean['accuracy']:.4f}", spread, f"{feasible:.4f}", _share(mean))]
 
 
-def _entry(part: Part, back: JobResult) -> dict[str, Any]:
+def _record(part: Part, back: JobResult) -> TrainedJob:
     seed = {} if part.seed is None else {"seed": part.seed}
     why = {"why": back.why} if back.result.get("accuracy") is None else {}
-    return {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}
+    made: Any = {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}
+    job: TrainedJob = made
+    return job

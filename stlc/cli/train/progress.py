@@ -3,90 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from stlc.cli.framework.documents import TrainedRun
 from stlc.cli.framework.output import console as open_console
-
-if TYPE_CHECKING:
-    from stlc.view.learning import Learning
+from stlc.view.learning import driven_lines
 
 LINE_EVERY = 25.0  # seconds between lines without a terminal
 BLOCKS = "▁▂▃▄▅▆▇█"
 ASCII_BLOCKS = "_.-:=+*#"
 SPARK_WIDTH = 16
-
-
-@dataclass(frozen=True, slots=True)
-class RunInfo:
-    """Facts known before the first step.
-
-    Attributes:
-        spec: name of the specification.
-        system: file name of the system, e.g. `car.yaml`.
-        system_path: where that file was found.
-        run: name of the run's folder, e.g. `0001-quiet-heron`.
-        seed: of the run.
-        threads: of torch.
-        device: on which training runs.
-        steps: planned steps; None while a time budget is not yet converted into steps.
-    """
-
-    spec: str
-    system: str
-    system_path: str
-    run: str
-    seed: int
-    threads: int
-    device: str = "cpu"
-    steps: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """Content of the final screen.
-
-    Attributes:
-        accuracy: share of held-out starts whose plan satisfies the specification.
-        interval: 95 % interval of `accuracy`.
-        held_out: number of held-out starts.
-        requirements: share per requirement.
-        feasible: share of the held-out starts with a known satisfying plan, or None.
-        seconds: of training.
-        folder: of the run.
-        learning: the verdict on the training, with the next step.
-        driven: closed-loop results, a line each.
-        steps: of the optimiser.
-        searched: held-out starts that the policy solves or that were searched; 0 if unknown.
-        where: failure region of the worst requirement, in words, or "".
-        unsolved: remaining starts, in words, or "".
-        picture: path of a picture of the region, or "".
-        judged: seconds of an unbounded mission on which the policy was validated; None for a bounded one.
-        status: how the run ended: `finished`, `interrupted`, …
-    """
-
-    accuracy: float
-    interval: tuple[float, float]
-    held_out: int
-    requirements: Mapping[str, float] = field(default_factory=dict)
-    feasible: float | None = None
-    seconds: float = 0.0
-    folder: str = ""
-    learning: Learning | None = None
-    driven: Sequence[str] = ()
-    steps: int = 0
-    searched: int = 0
-    where: str = ""
-    unsolved: str = ""
-    picture: str = ""
-    judged: float | None = None
-    status: str = "finished"
 
 
 def sparkline(values: list[float], *, width: int = SPARK_WIDTH, blocks: str = BLOCKS) -> str:
@@ -135,16 +68,32 @@ class Progress:
         self._clock = clock
         self._every = every
         self._unicode = "utf" in (self.console.encoding or "").lower()
-        self._info: RunInfo | None = None
+        self._title, self._spec = "", ""
         self._row: dict[str, Any] = {}
         self._accuracies: list[float] = []
         self._row_at = 0.0
         self._line_at = 0.0
         self._live: Live | None = None
 
-    def start(self, info: RunInfo) -> None:
-        """Open the panel (or print the opening line)."""
-        self._info = info
+    def start(self, record: Mapping[str, Any], run: str) -> None:
+        """Open the panel, or print the first line.
+
+        Args:
+            record: content of `run.json`.
+            run: name of the run's folder.
+        """
+        threads, device = int(record.get("threads", 1)), record.get("device", "cpu")
+        path = str(record.get("system_path"))
+        self._spec = str(record.get("spec"))
+        parts = (
+            self._spec,
+            f"{Path(path).name} ({path})",
+            f"run {run}",
+            f"seed {record.get('seed', 0)}",
+            f"{threads} thread{'' if threads == 1 else 's'}" if device == "cpu" else str(device),
+        )
+        self._title = " · ".join(parts)
+        self._row["steps"] = record.get("steps")
         self._row_at = self._line_at = self._clock()
         if self.console.file.isatty() and not self.console.is_dumb_terminal:
             self._live = Live(
@@ -152,7 +101,7 @@ class Progress:
             )
             self._live.start()
         else:
-            self._print(self._title())
+            self._print(self._title)
 
     def chosen(self, engine: Mapping[str, Any]) -> None:
         """Show the configuration that the engine resolved."""
@@ -166,7 +115,7 @@ class Progress:
         if row.get("accuracy") is not None:
             self._accuracies.append(float(row["accuracy"]))
         self._row_at = self._clock()
-        if self._live is None and self._info and self._row_at - self._line_at >= self._every:
+        if self._live is None and self._title and self._row_at - self._line_at >= self._every:
             self._line_at = self._row_at
             self._print(self._line())
 
@@ -176,13 +125,16 @@ class Progress:
             live, self._live = self._live, None
             live.stop()
 
-    def finish(self, summary: Summary, *, to: Console | None = None) -> None:
+    def finish(self, lines: Iterable[str], *, to: Console | None = None) -> None:
         """Close the panel and print the final screen, to `to` if given."""
         self.stop()
-        console = to or self.console
-        lines = final_screen(summary, sparkline(self._accuracies, blocks=self._blocks))
         for line in lines:
-            console.print(_emphasised(self._plain(line)), soft_wrap=True)
+            (to or self.console).print(_emphasised(self._plain(line)), soft_wrap=True)
+
+    @property
+    def spark(self) -> str:
+        """The sparkline of the accuracy."""
+        return sparkline(self._accuracies, blocks=self._blocks)
 
     # ------------------------------------------------------------------ text
 
@@ -196,23 +148,8 @@ class Progress:
     def _print(self, text: str) -> None:
         self.console.print(Text(self._plain(text)), soft_wrap=True)
 
-    def _title(self) -> str:
-        info = self._info
-        assert info is not None
-        where = f"{info.threads} thread{'' if info.threads == 1 else 's'}"
-        if info.device != "cpu":
-            where = info.device
-        parts = (
-            info.spec,
-            f"{info.system} ({info.system_path})",
-            f"run {info.run}",
-            f"seed {info.seed}",
-            where,
-        )
-        return " · ".join(parts)
-
     def _steps(self) -> int | None:
-        steps = self._row.get("steps") or (self._info.steps if self._info else None)
+        steps = self._row.get("steps")
         return int(steps) if steps else None
 
     def _counter(self) -> str:
@@ -255,7 +192,7 @@ class Progress:
     def panel(self) -> Group:
         """The present panel."""
         width = self.console.width
-        lines = [*_spread(self._title(), f"{self._counter()}   {self._time_left()}".rstrip(), width)]
+        lines = [*_spread(self._title, f"{self._counter()}   {self._time_left()}".rstrip(), width)]
         lines.append(self._accuracy_line(width))
         cells = [f"{name}  {share:.3f}" for name, share in (self._row.get("requirements") or {}).items()]
         lines.extend(_packed(cells, width))
@@ -265,7 +202,7 @@ class Progress:
                 " failing starts in the last round"
             )
         texts = [Text(self._plain(line), no_wrap=True, overflow="ellipsis") for line in lines]
-        texts[0].stylize("bold", 0, len(self._info.spec) if self._info else 0)
+        texts[0].stylize("bold", 0, len(self._spec))
         return Group(*texts)
 
 
@@ -315,49 +252,53 @@ def native_text(by_torch: Mapping[str, str]) -> str:
     return " · ".join(lines)
 
 
-def _judged(summary: Summary) -> list[str]:
-    """The length of validation of an unbounded mission."""
-    if summary.judged is None:
-        return []
-    return [f"judged          on missions of {summary.judged:g} s; what is required has no end"]
+def final_screen(
+    result: TrainedRun,
+    spark: str = "",
+    *,
+    region: str = "",
+    unsolved: str = "",
+    picture: str = "",
+) -> list[str]:
+    """The final lines of a training run; with a verdict the last one is the next command.
 
-
-def final_screen(summary: Summary, spark: str = "") -> list[str]:
-    """The final lines of a training run; with a verdict the last one is the next command."""
-    low, high = summary.interval
-    lines = [f"{'' if i else 'closed loop':<15} {line}" for i, line in enumerate(summary.driven)]
-    lines += [
-        f"plan accuracy   {summary.accuracy:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
-        f" on {summary.held_out:,} held-out starts" + (f"   {spark}" if spark else "")
+    Args:
+        result: record of the finished training.
+        spark: sparkline of the accuracy.
+        region: failure region of the worst requirement, in words.
+        unsolved: starts for which no plan is known, in words.
+        picture: path of a picture of the region.
+    """
+    low, high = result["interval"]
+    rows = [("closed loop", line) for line in driven_lines(result)]
+    accuracy = f"{result['accuracy']:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
+    starts = f" on {result['held_out']:,} held-out starts" + (f"   {spark}" if spark else "")
+    rows.append(("plan accuracy", accuracy + starts))
+    if feasible := result.get("feasible"):
+        share, searched = percent(result["accuracy"] / feasible), result["searched"]
+        estimate = f" (an estimate: {searched:,} starts were searched or solved)"
+        partly = 0 < searched < result["held_out"]
+        rows.append(("known feasible", f"{feasible:.3f}   of which {share} are satisfied{estimate * partly}"))
+    if judged := result.get("judged_seconds"):
+        rows.append(("judged", f"on missions of {judged:g} s; what is required has no end"))
+    verdict, requirements = result.get("verdict"), result["requirements"]
+    if verdict is not None:
+        rows.append(("verdict", f"{verdict['level']}: {verdict['sentence']}"))
+    if requirements and min(requirements.values()) < 1.0:
+        worst = min(requirements, key=requirements.__getitem__)
+        rows += [("worst", f"{worst} {requirements[worst]:.3f}"), ("worst", region)]
+    rows += [("unsolved", unsolved), ("picture", picture)]
+    rows += [("what helps", advice) for advice in ([] if verdict is None else verdict["advice"])]
+    steps = f", {result['steps']:,} steps" if result.get("steps") else ""
+    took = f"{result['seconds']:.0f} s of training and verdict{steps}   {result['run']}"
+    rows.append(("finished", took))
+    rows = [(label, text) for label, text in rows if text]
+    labels = ["", *(label for label, _ in rows)]
+    lines = [
+        f"{'' if label == above else label:<15} {text}"
+        for above, (label, text) in zip(labels, rows, strict=False)
     ]
-    if summary.feasible:
-        share = percent(summary.accuracy / summary.feasible)
-        estimate = ""
-        if 0 < summary.searched < summary.held_out:
-            estimate = f" (an estimate: {summary.searched:,} starts were searched or solved)"
-        lines.append(f"known feasible  {summary.feasible:.3f}   of which {share} are satisfied{estimate}")
-    lines += _judged(summary)
-    learning = summary.learning
-    if learning is not None:
-        lines.append(f"verdict         {learning.level}: {learning.sentence}")
-    if summary.requirements and min(summary.requirements.values()) < 1.0:
-        worst = min(summary.requirements, key=summary.requirements.__getitem__)
-        lines.append(f"worst           {worst} {summary.requirements[worst]:.3f}")
-        if summary.where:
-            lines.append(f"                {summary.where}")
-    if summary.unsolved:
-        lines.append(f"unsolved        {summary.unsolved}")
-    if summary.picture:
-        lines.append(f"picture         {summary.picture}")
-    for i, advice in enumerate(() if learning is None else learning.advice):
-        lines.append(f"{'' if i else 'what helps':<15} {advice}")
-    took = f"{summary.seconds:.0f} s of training and verdict" + (
-        f", {summary.steps:,} steps" if summary.steps else ""
-    )
-    lines.append(f"{summary.status:<15} {took}" + (f"   {summary.folder}" if summary.folder else ""))
-    if learning is not None:
-        lines += ["", f"Next:  {learning.command}"]
-    return lines
+    return lines if verdict is None else [*lines, "", f"Next:  {verdict['next']}"]
 
 
 def _emphasised(line: str) -> Text:

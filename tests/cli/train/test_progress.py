@@ -2,7 +2,6 @@
 
 import io
 import re
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -12,17 +11,15 @@ from rich.console import Console
 from stlc.cli.train.progress import (
     BLOCKS,
     Progress,
-    RunInfo,
-    Summary,
     clock_text,
     engine_text,
     final_screen,
     native_text,
     sparkline,
 )
-from stlc.view.learning import Learning
 
-INFO = RunInfo("traffic", "car.yaml", "examples/car.yaml", "0001-quiet-heron", 0, 2)
+RECORD = {"spec": "traffic", "system_path": "examples/car.yaml", "seed": 0, "threads": 2}
+INFO = (RECORD, "0001-quiet-heron")
 ROW = {
     "step": 3120,
     "steps": 5900,
@@ -36,18 +33,26 @@ ROW = {
     "failing": 55,
     "s_per_step": 0.0112,
 }
-SUMMARY = Summary(
-    accuracy=0.957,
-    interval=(0.951, 0.962),
-    held_out=5000,
-    requirements={"no_collision": 0.996, "stop_sign": 0.971},
-    feasible=0.969,
-    seconds=61.2,
-    folder="runs/traffic/0001-quiet-heron",
-    where="fails in 63 % of the starts with sign = stop",
-    learning=Learning("trained", 0.988, "it is good", (), "stlc simulate --backup"),
-    steps=5900,
-)
+VERDICT = {
+    "level": "trained",
+    "share_of_feasible": 0.988,
+    "sentence": "it is good",
+    "advice": [],
+    "next": "stlc simulate --backup",
+}
+RESULT = {
+    "run": "runs/traffic/0001-quiet-heron",
+    "seconds": 61.2,
+    "accuracy": 0.957,
+    "interval": [0.951, 0.962],
+    "held_out": 5000,
+    "requirements": {"no_collision": 0.996, "stop_sign": 0.971},
+    "feasible": 0.969,
+    "searched": 5000,
+    "steps": 5900,
+    "verdict": VERDICT,
+}
+REGION = "fails in 63 % of the starts with sign = stop"
 
 
 class Terminal(io.StringIO):
@@ -81,7 +86,7 @@ def panel_of(progress, width=130):
 
 def test_the_panel_has_the_layout_that_was_designed():
     progress, _, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     for accuracy in (0.5, 0.7, 0.9, 0.95, 0.957):
         progress.update({**ROW, "accuracy": accuracy})
     title, accuracy, requirements, search = panel_of(progress)
@@ -98,7 +103,7 @@ def test_the_panel_has_the_layout_that_was_designed():
 @pytest.mark.parametrize("width", [20, 40, 60, 80, 100, 200])
 def test_the_panel_never_exceeds_the_terminal(width):
     progress, _, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     progress.update(ROW)
     lines = panel_of(progress, width)
     assert max(map(len, lines)) <= width
@@ -107,7 +112,7 @@ def test_the_panel_never_exceeds_the_terminal(width):
 
 def test_the_panel_before_the_first_row_says_what_happens():
     progress, _, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     text = "\n".join(panel_of(progress))
     assert "measuring the speed of a step" in text
     assert "left" not in text
@@ -115,7 +120,7 @@ def test_the_panel_before_the_first_row_says_what_happens():
 
 def test_a_bare_step_keeps_what_was_known():
     progress, _, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     progress.update(ROW)
     progress.update({"step": 3500, "accuracy": None})
     text = "\n".join(panel_of(progress))
@@ -126,7 +131,7 @@ def test_a_bare_step_keeps_what_was_known():
 
 def test_time_left_runs_between_rows():
     progress, _, clock = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     progress.update(ROW)
     clock.now += 11
     assert "00:20 left" in panel_of(progress)[0]
@@ -136,7 +141,7 @@ def test_time_left_runs_between_rows():
 
 def test_a_pipe_gets_a_line_every_30_seconds():
     progress, stream, clock = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     for _ in range(61):
         progress.update(ROW)
         clock.now += 1.0
@@ -152,26 +157,26 @@ def test_a_pipe_gets_a_line_every_30_seconds():
 def test_a_terminal_is_redrawn_in_place_and_left_clean():
     stream = Terminal()
     progress = Progress(Console(file=stream, width=100, force_terminal=True))
-    progress.start(INFO)
+    progress.start(*INFO)
     progress.update(ROW)
     progress.stop()
     progress.stop()
     text = stream.getvalue()
     assert "step 3,120 / 5,900" in text
     assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1
-    progress.finish(SUMMARY)
+    progress.finish(final_screen(RESULT, progress.spark))
     assert "Next:  stlc simulate --backup" in stream.getvalue()
 
 
 def test_no_colour_without_a_terminal_even_at_the_end():
     progress, stream, _ = piped()
-    progress.start(INFO)
-    progress.finish(SUMMARY)
+    progress.start(*INFO)
+    progress.finish(final_screen(RESULT, progress.spark))
     assert "\x1b" not in stream.getvalue()
 
 
 def test_the_closing_screen_says_all_that_matters():
-    lines = final_screen(SUMMARY)
+    lines = final_screen(RESULT, region=REGION)
     assert lines == [
         "plan accuracy   0.957   95 % interval [0.951, 0.962] on 5,000 held-out starts",
         "known feasible  0.969   of which 98.8 % are satisfied",
@@ -182,19 +187,25 @@ def test_the_closing_screen_says_all_that_matters():
         "",
         "Next:  stlc simulate --backup",
     ]
-    poor = Learning("undertrained", 0.03, "it is poor", ("more time", "luck"), "stlc train --resume 7")
-    lines = final_screen(replace(SUMMARY, learning=poor))
+    poor = {
+        "level": "undertrained",
+        "share_of_feasible": 0.03,
+        "sentence": "it is poor",
+        "advice": ["more time", "luck"],
+        "next": "stlc train --resume 7",
+    }
+    lines = final_screen({**RESULT, "verdict": poor})
     assert lines[2] == "verdict         undertrained: it is poor"
     assert lines[-5:-3] == ["what helps      more time", "                luck"]
     assert lines[-1] == "Next:  stlc train --resume 7"
-    assert any("missions of 120 s" in line for line in final_screen(replace(SUMMARY, judged=120.0)))
+    assert any("missions of 120 s" in line for line in final_screen({**RESULT, "judged_seconds": 120.0}))
 
 
 def test_the_closing_screen_can_go_elsewhere():
     progress, stream, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     elsewhere = io.StringIO()
-    progress.finish(SUMMARY, to=Console(file=elsewhere, width=200))
+    progress.finish(final_screen(RESULT), to=Console(file=elsewhere, width=200))
     assert "Next:" in elsewhere.getvalue()
     assert "Next:" not in stream.getvalue()
 
@@ -202,10 +213,10 @@ def test_the_closing_screen_can_go_elsewhere():
 def test_a_terminal_without_unicode_gets_ascii():
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     progress = Progress(Console(file=stream, width=120), clock=Clock())
-    progress.start(INFO)
+    progress.start(*INFO)
     progress.update(ROW)
     progress.update({**ROW, "accuracy": 0.5})
-    progress.finish(SUMMARY)
+    progress.finish(final_screen(RESULT, progress.spark))
     stream.flush()
     text = stream.buffer.getvalue().decode("ascii")
     assert "traffic | car.yaml" in text
@@ -214,8 +225,8 @@ def test_a_terminal_without_unicode_gets_ascii():
 
 def test_hostile_names_are_shown_as_they_are():
     progress, stream, _ = piped()
-    progress.start(RunInfo("[red]a[/]", "b[link=x]", "p", "r", 0, 1))
-    assert stream.getvalue() == "[red]a[/] · b[link=x] (p) · run r · seed 0 · 1 thread\n"
+    progress.start({"spec": "[red]a[/]", "system_path": "p/b[link=x]"}, "r")
+    assert stream.getvalue() == "[red]a[/] · b[link=x] (p/b[link=x]) · run r · seed 0 · 1 thread\n"
 
 
 @given(st.lists(st.floats(0, 1), min_size=1), st.integers(1, 40))
@@ -242,7 +253,7 @@ def test_clock(seconds, text):
 
 def test_what_the_engine_chose_is_said():
     progress, stream, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     chosen = {"method": "guided", "hidden": [64, 64], "plans": 4, "batch": 256, "hard": 128, "lr": 1e-3}
     progress.chosen({**chosen, "margin": 0.0512, "samples": 0})
     assert stream.getvalue().splitlines()[1] == (
@@ -255,7 +266,7 @@ def test_what_the_engine_chose_is_said():
 
 def test_which_parts_run_as_c_is_said():
     progress, stream, _ = piped()
-    progress.start(INFO)
+    progress.start(*INFO)
     chosen = {"method": "guided", "hidden": [8], "plans": 1, "batch": 9, "hard": 0, "lr": 1.0, "margin": 0.1}
     progress.chosen({**chosen, "by_torch": {"verdicts": "", "search": "", "gradient": ""}})
     assert stream.getvalue().splitlines()[2] == "  computed by     verdicts, search, gradient: C"
@@ -264,7 +275,7 @@ def test_which_parts_run_as_c_is_said():
 
 
 def test_the_closing_screen_says_what_remains_and_where_it_is_drawn():
-    lines = final_screen(replace(SUMMARY, unsolved="7 of 9 starts", picture="runs/a/failures.png"))
+    lines = final_screen(RESULT, unsolved="7 of 9 starts", picture="runs/a/failures.png")
     assert "unsolved        7 of 9 starts" in lines
     assert "picture         runs/a/failures.png" in lines
-    assert not any(line.startswith(("unsolved", "picture")) for line in final_screen(SUMMARY))
+    assert not any(line.startswith(("unsolved", "picture")) for line in final_screen(RESULT))

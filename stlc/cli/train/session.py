@@ -1,0 +1,211 @@
+"""Terminal interface of a training: the panel, Ctrl-C, pictures, the final screen."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import typer
+
+from stlc.cli.framework.documents import TrainedRun, verdict_record
+from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
+from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
+from stlc.cli.train.progress import Progress, final_screen
+from stlc.controller.training.final_evaluation import TrainingOutcome
+from stlc.controller.training.loop import Watch
+from stlc.diagnostics import StlcError
+from stlc.rundir import LATEST, RUNS
+from stlc.stopping import age, leaving
+from stlc.view.learning import Commands, learning_of_run, recommended
+
+if TYPE_CHECKING:
+    from types import FrameType, TracebackType
+
+    from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
+    from stlc.rundir import RunDir
+
+BESIDE = 10.0
+"""Seconds of a command beyond its budget."""
+AFTER = 1.2
+"""Seconds for pictures and process exit, besides those before the training."""
+FAILURES = "failures.png"
+"""File name of the picture of failing starts."""
+
+
+@dataclass(slots=True)
+class Session:
+    """Progress display of a training as a context manager; Ctrl-C or SIGTERM saves and stops.
+
+    During training steps the first signal requests the stop and a second one stops at once; at other times
+    the first one does.
+
+    Attributes:
+        folder: folder of the run.
+        outcome: result of the training, once finished.
+        progress: the panel.
+        logger: opener of an additional logger, if any.
+        writes: whether this process writes the run's folder; the first of several ranks does.
+    """
+
+    folder: RunDir
+    outcome: TrainingOutcome | None = None
+    progress: Progress = field(default_factory=Progress)
+    logger: Opener | None = None
+    writes: bool = True
+    _log: TensorBoardLogger | None = None
+    _signals: list[int] = field(default_factory=list)
+    _deferring: bool = False
+    _seconds_before: float = 0.0
+    _forced: ExitStack = field(default_factory=ExitStack)
+    _handlers: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def watch(self) -> Watch:
+        """The callbacks of the training."""
+        stop = lambda: bool(self._signals)  # noqa: E731
+        return Watch(self._resolved, self._row, stop, self._steps, self._late)
+
+    def _late(self, budget: float) -> float:
+        """Expected delay in seconds at the end on a slow machine, estimated from the time of imports."""
+        return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
+
+    @contextmanager
+    def _steps(self) -> Iterator[None]:
+        self._deferring = True
+        try:
+            yield
+        finally:
+            self._deferring = False
+
+    def _resolved(self, engine: dict[str, Any]) -> None:
+        self.progress.chosen(engine)
+        if self._log is not None:
+            self._log.started(engine)
+
+    def _row(self, row: dict[str, Any]) -> None:
+        self.progress.update(row)
+        if self._log is not None:
+            self._log.row(row)
+
+    def __enter__(self) -> Self:
+        self._seconds_before = age()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._handlers[number] = signal.signal(number, self._interrupt)
+        if self.writes:
+            self._forced.enter_context(leaving(self._ended))
+            self._forced.enter_context(PULSE.doing("training and evaluation"))
+            self._log = None if self.logger is None else self.logger(self.folder.path)
+            self.progress.start(self.folder.record(), self.folder.name)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+        if self._log is not None:
+            self._log.close()
+        if error is not None and self.writes:
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                self._ended()
+            else:
+                with suppress(StlcError):
+                    self.folder.finish("failed")
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._forced.close()
+
+    def _ended(self, _code: int = INTERRUPTED) -> None:
+        """Record a killed run as interrupted; its last checkpoint remains."""
+        with suppress(StlcError):
+            self.folder.finish("interrupted")
+        self._say_interrupted()
+
+    def _say_interrupted(self) -> None:
+        ranks = 1 if self.outcome is None else self.outcome.ranks
+        say(f"interrupted, saved: {self.folder.shown}")
+        say(f"go on with: {_commands(self.folder, ranks).train_on}")
+
+    def _interrupt(self, number: int, _frame: FrameType | None) -> None:
+        at_once = bool(self._signals) or not self._deferring
+        self._signals.append(number)
+        if at_once:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
+
+    def conclude(self, *, pictures: bool) -> Answer[TrainedRun]:
+        """Draw pictures; return the record and the final screen of the finished training.
+
+        Raises:
+            typer.Exit: this process does not write the run's folder.
+        """
+        outcome, folder = self.outcome, self.folder
+        assert outcome is not None
+        interrupted = TERMINATED if signal.SIGTERM in self._signals else INTERRUPTED
+        if not self.writes:
+            raise typer.Exit(interrupted if outcome.interrupted else 0)
+        result: TrainedRun = {"run": folder.shown, "seconds": outcome.seconds}
+        if outcome.score is None:
+            self._say_interrupted()
+            return Answer(result, lambda: None, interrupted)
+        if pictures:
+            draw_report(folder)
+        summary: Any = outcome.score.summary()
+        result |= summary
+        if outcome.simulated is not None:
+            closed_loop: Any = outcome.simulated.summary()
+            result["closed_loop"] = closed_loop
+        learning = learning_of_run(folder, _commands(folder, outcome.ranks))
+        if learning is not None:
+            result["verdict"] = verdict_record(learning)
+        record = folder.record()
+        result |= {"steps": record.get("steps"), "schedule": record.get("schedule")}
+        reasons = () if outcome.why is None else (outcome.why,)
+
+        def show() -> None:
+            self.progress.finish(_screen(outcome, result, self.progress.spark, pictures), to=console())
+            show_diagnostics(reasons)
+
+        return Answer(result, show, 0 if outcome.score.feasible > 0.0 else 1, reasons)
+
+
+def _commands(folder: RunDir, ranks: int = 1) -> Commands:
+    """The commands of the final screen; the newest run needs no name, others below `runs` no path."""
+    newest = (RUNS / LATEST).resolve() == folder.path.resolve()
+    usual = folder.path.resolve().parent.parent == RUNS.resolve()
+    start = "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
+    guard = recommended(folder.record())
+    return Commands.of(folder.name if usual else folder.shown, newest=newest, start=start, guard=guard)
+
+
+def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: bool) -> list[str]:
+    """The final screen, with the failure region of the held-out starts."""
+    from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
+
+    folder = outcome.run.dir
+    held = load_held_out(folder.path / "eval" / "held_out.npz")
+    weakness = None if held is None else find_weakness(held)
+    if held is None or weakness is None:
+        return final_screen(result, spark)
+    drawn = pictures and (folder.path / FAILURES).is_file()
+    return final_screen(
+        result,
+        spark,
+        region=weakness_text(weakness, held, outcome.run.task.system.signature),
+        unsolved=unsolved_text(held),
+        picture=f"{folder.shown}/{FAILURES}" if drawn else "",
+    )
+
+
+def draw_report(folder: RunDir) -> None:
+    """Draw the report, or print how to install matplotlib if it is missing."""
+    from stlc.view import available
+
+    if not available():
+        say("no pictures: pip install 'stlc[plot]'")
+        return
+    from stlc.view.report import write_report
+
+    with PULSE.doing("drawing the report"):
+        write_report(folder)
