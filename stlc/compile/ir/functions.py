@@ -4,8 +4,8 @@ An entry gives arity, units, implementations for numbers, arrays and C, derivati
 added here is available in the resolver, the array back ends, the C code with its gradients, interval
 arithmetic and the editors.
 
-The names are those of `stlc.compile.ir.nodes.Op`. `dot cross dist deg rad sdist ind` never become an `Op`:
-the front end rewrites them.
+The names are those of `stlc.compile.ir.nodes.Op`, except those of functions that the front end rewrites
+(`REWRITTEN`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Function:
     """One entry of the table.
 
     Attributes:
-        name: of the `ir.Op`.
+        name: name of the function in an `ir.Op`.
         least: smallest number of arguments.
         most: largest number of arguments; None for any.
         rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
@@ -157,51 +157,65 @@ def _powers(args: Sequence[Bounds]) -> Bounds:
 # --------------------------------------------------------------------------------- the table
 
 
-def _flat(_result: str, *args: str) -> list[str]:
-    """Derivative of a step function: 0 where it exists."""
-    return ["0.0"] * len(args)
+def _function(
+    name: str,
+    doc: str,
+    rule: UnitRule,
+    fold: Callable[..., Any],
+    c: str,
+    slopes: Sequence[str],
+    bounds: RangeRule | Bounds | None = None,
+    **rest: Any,
+) -> Function:
+    """Return the entry of a function with one argument per slope.
 
-
-def _operator(name: str, symbol: str, arity: int, rule: UnitRule, **rest: Any) -> Function:
-    return Function(name, arity, arity, rule, "operator", exact=True, symbol=symbol, **rest)
-
-
-def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """Return the entry of an integer-valued step function."""
+    Args:
+        name: as for `Function`.
+        doc: as for `Function`.
+        rule: as for `Function`.
+        fold: as for `Function`.
+        c: C expression of the arguments `{0}`, `{1}`, ….
+        slopes: C expression of the derivative by each argument, of the arguments and the result `{r}`.
+        bounds: range; None: monotone in each argument.
+        **rest: other attributes of the entry.
+    """
     return Function(
         name,
-        1,
-        1,
+        len(slopes),
+        len(slopes),
         rule,
         doc=doc,
         fold=fold,
-        numpy=kernel,
-        torch=name,
         c=c.format,
-        slopes=_flat,
-        bounds=_corners(fold),
-        exact=True,
-        whole=True,
-        integral=True,
+        slopes=lambda r, *args: [slope.format(*args, r=r) for slope in slopes],
+        bounds=bounds or _corners(fold),
+        **rest,
     )
+
+
+def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
+    """Return the entry of an operator; one without kernels is a method of the tape."""
+    flags = {"kind": "operator", "exact": True, "whole": True, **flags}
+    if "numpy" not in flags:
+        flags["array"] = lambda tape, *xs: getattr(tape, name)(*xs)
+    return _function(name, "", rule, *rest, symbol=symbol, **flags)
+
+
+def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
+    """Return the entry of an integer-valued step function; its slope is 0 where it exists."""
+    flags: dict[str, Any] = {"numpy": kernel, "torch": name, "exact": True, "whole": True, "integral": True}
+    return _function(name, doc, rule, fold, c, ("0.0",), **flags)
 
 
 def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
     """Return the entry of a smooth scalar function; `slope`: derivative in C, of `{0}` and result `{r}`."""
-    fold = getattr(math, name)
-    return Function(
-        name,
-        1,
-        1,
-        "plain",
-        doc=doc,
-        fold=fold,
-        numpy=kernel or name,
-        torch=name,
-        c=f"{name}({{0}})".format,
-        slopes=lambda r, x: [slope.format(x, r=r)],
-        bounds=bounds or _corners(fold),
-    )
+    fold, c = getattr(math, name), f"{name}({{0}})"
+    return _function(name, doc, "plain", fold, c, (slope,), bounds, numpy=kernel or name, torch=name)
+
+
+def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
+    """Return the entry of a linear function of one or more arguments."""
+    return Function(name, 1, None, "same", doc=doc, fold=fold, bounds=bounds, linear=True, **rest)
 
 
 def _sampler(
@@ -211,153 +225,90 @@ def _sampler(
 
 
 _OPERATORS = (
-    _operator(
-        "add",
-        "+",
-        2,
-        "same",
-        fold=operator.add,
-        array=lambda tape, *xs: tape.add(*xs),
-        c="({0} + {1})".format,
-        slopes=lambda _r, _a, _b: ["1.0", "1.0"],
-        bounds=_corners(operator.add),
-        whole=True,
-        linear=True,
-    ),
-    _operator(
-        "sub",
-        "-",
-        2,
-        "same",
-        fold=operator.sub,
-        array=lambda tape, *xs: tape.sub(*xs),
-        c="({0} - {1})".format,
-        slopes=lambda _r, _a, _b: ["1.0", "(-1.0)"],
-        bounds=_corners(operator.sub),
-        whole=True,
-        linear=True,
-    ),
-    _operator(
-        "mul",
-        "*",
-        2,
-        "mul",
-        fold=operator.mul,
-        array=lambda tape, *xs: tape.mul(*xs),
-        c="({0} * {1})".format,
-        slopes=lambda _r, a, b: [b, a],
-        bounds=_corners(operator.mul),
-        whole=True,
-    ),
+    _operator("add", "+", "same", operator.add, "({0} + {1})", ("1.0", "1.0"), linear=True),
+    _operator("sub", "-", "same", operator.sub, "({0} - {1})", ("1.0", "(-1.0)"), linear=True),
+    _operator("mul", "*", "mul", operator.mul, "({0} * {1})", ("{1}", "{0}")),
     _operator(
         "div",
         "/",
-        2,
         "div",
-        fold=operator.truediv,
-        array=lambda tape, *xs: tape.div(*xs),
-        c="({0} / {1})".format,
-        slopes=lambda r, _a, b: [f"(1.0 / {b})", f"(-{r} / {b})"],
-        bounds=_quotient,
+        operator.truediv,
+        "({0} / {1})",
+        ("(1.0 / {1})", "(-{r} / {1})"),
+        _quotient,
+        whole=False,
     ),
     _operator(
         "mod",
         "%",
-        2,
         "same",
-        fold=operator.mod,
+        operator.mod,
+        "floored_mod({0}, {1})",
+        ("1.0", "(-floor({0} / {1}))"),
+        _modulo,
         numpy="mod",
         torch="remainder",
-        c="floored_mod({0}, {1})".format,
-        slopes=lambda _r, a, b: ["1.0", f"(-floor({a} / {b}))"],
-        bounds=_modulo,
-        whole=True,
     ),
     _operator(
         "pow",
         "^",
-        2,
         "pow",
-        fold=_pow,
-        array=lambda tape, *xs: tape.pow(*xs),
-        c="pow({0}, {1})".format,
-        slopes=lambda r, a, b: [f"({b} * pow({a}, {b} - 1.0))", f"({a} > 0.0 ? {r} * log({a}) : 0.0)"],
-        bounds=_powers,
+        _pow,
+        "pow({0}, {1})",
+        ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
+        _powers,
+        whole=False,
     ),
-    _operator(
-        "neg",
-        "-",
-        1,
-        "same",
-        fold=operator.neg,
-        array=lambda tape, x: tape.neg(x),
-        c="(-{0})".format,
-        slopes=lambda _r, _x: ["(-1.0)"],
-        bounds=_corners(operator.neg),
-        whole=True,
-        linear=True,
-    ),
+    _operator("neg", "-", "same", operator.neg, "(-{0})", ("(-1.0)",), linear=True),
     _operator(
         "square",
         "^",
-        1,
         "square",
-        fold=lambda x: x * x,
+        lambda x: x * x,
+        "({0} * {0})",
+        ("(2.0 * {0})",),
+        _squared,
         numpy="square",
         torch="square",
-        c="({0} * {0})".format,
-        slopes=lambda _r, x: [f"(2.0 * {x})"],
-        bounds=_squared,
-        whole=True,
     ),
 )
 
 _FUNCTIONS = (
-    Function(
+    _function(
         "abs",
-        1,
-        1,
+        "`abs(x)`: without its sign.",
         "same",
-        doc="`abs(x)`: without its sign.",
-        fold=abs,
+        abs,
+        "fabs({0})",
+        ("(double)(({0} > 0.0) - ({0} < 0.0))",),
+        _even,
         numpy="abs",
         torch="abs",
-        c="fabs({0})".format,
-        slopes=lambda _r, x: [f"(double)(({x} > 0.0) - ({x} < 0.0))"],
-        bounds=_even,
         exact=True,
         whole=True,
         linear=True,
     ),
-    Function(
+    _variadic(
         "min",
-        1,
-        None,
-        "same",
-        doc="`min(a, b, …)`: the least.",
-        fold=lambda *xs: min(xs),
+        "`min(a, b, …)`: the least.",
+        lambda *xs: min(xs),
+        _corners(lambda *xs: min(xs)),
         array=lambda tape, *xs: reduce(tape.least, xs),
         c="LEAST({0}, {1})".format,
         slopes=SHARED,
-        bounds=_corners(lambda *xs: min(xs)),
         exact=True,
         whole=True,
-        linear=True,
     ),
-    Function(
+    _variadic(
         "max",
-        1,
-        None,
-        "same",
-        doc="`max(a, b, …)`: the greatest.",
-        fold=lambda *xs: max(xs),
+        "`max(a, b, …)`: the greatest.",
+        lambda *xs: max(xs),
+        _corners(lambda *xs: max(xs)),
         array=lambda tape, *xs: reduce(tape.greatest, xs),
         c="MOST({0}, {1})".format,
         slopes=SHARED,
-        bounds=_corners(lambda *xs: max(xs)),
         exact=True,
         whole=True,
-        linear=True,
     ),
     Function(
         "clip",
@@ -373,17 +324,14 @@ _FUNCTIONS = (
         exact=True,
         whole=True,
     ),
-    Function(
+    _function(
         "relu",
-        1,
-        1,
+        "`relu(x)`: x where it is positive, else 0.",
         "same",
-        doc="`relu(x)`: x where it is positive, else 0.",
-        fold=lambda x: max(x, 0),
+        lambda x: max(x, 0),
+        "MAX({0}, 0.0)",
+        ("(double)({0} >= 0.0)",),
         array=lambda tape, x: tape.greatest(x, 0.0),
-        c="MAX({0}, 0.0)".format,
-        slopes=lambda _r, x: [f"(double)({x} >= 0.0)"],
-        bounds=_corners(lambda x: max(x, 0)),
         exact=True,
         whole=True,
         linear=True,
@@ -392,17 +340,14 @@ _FUNCTIONS = (
     _step("ceil", "`ceil(x)`: the next whole number above.", math.ceil, "ceil", "ceil({0})", "same"),
     _step("round", "`round(x)`: the nearest whole number.", round, "rint", "rint({0})", "same"),
     _step("sign", "`sign(x)`: -1, 0 or 1.", _sign, "sign", "(double)(({0} > 0.0) - ({0} < 0.0))", "sign"),
-    Function(
+    _function(
         "sqrt",
-        1,
-        1,
+        "`sqrt(x)`: the square root; of a unit too.",
         "sqrt",
-        doc="`sqrt(x)`: the square root; of a unit too.",
-        fold=math.sqrt,
+        math.sqrt,
+        "sqrt({0})",
+        ("({r} > 0.0 ? 0.5 / {r} : 0.0)",),
         numpy="sqrt",
-        c="sqrt({0})".format,
-        slopes=lambda r, _x: [f"({r} > 0.0 ? 0.5 / {r} : 0.0)"],
-        bounds=_corners(math.sqrt),
     ),
     _smooth("exp", "`exp(x)` of a plain number.", "{r}", None),
     _smooth("log", "`log(x)`: the natural logarithm of a plain number.", "(1.0 / {0})", None),
@@ -412,58 +357,44 @@ _FUNCTIONS = (
     _smooth("asin", "`asin(x)`: an angle.", "(1.0 / sqrt(1.0 - {0} * {0}))", None, "arcsin"),
     _smooth("acos", "`acos(x)`: an angle.", "(-1.0 / sqrt(1.0 - {0} * {0}))", None, "arccos"),
     _smooth("atan", "`atan(x)`: an angle.", "(1.0 / (1.0 + {0} * {0}))", None, "arctan"),
-    Function(
+    _function(
         "atan2",
-        2,
-        2,
+        "`atan2(y, x)`: the angle of the vector [x, y].",
         "ratio",
-        doc="`atan2(y, x)`: the angle of the vector [x, y].",
-        fold=math.atan2,
+        math.atan2,
+        "atan2({0}, {1})",
+        ("({1} / ({0} * {0} + {1} * {1}))", "(-{0} / ({0} * {0} + {1} * {1}))"),
+        (-math.pi, math.pi),
         numpy="arctan2",
-        c="atan2({0}, {1})".format,
-        slopes=lambda _r, y, x: [f"({x} / ({y} * {y} + {x} * {x}))", f"(-{y} / ({y} * {y} + {x} * {x}))"],
-        bounds=(-math.pi, math.pi),
     ),
-    Function(
+    _variadic(
         "norm",
-        1,
-        None,
-        "same",
-        doc="`norm(v)`: the Euclidean length.",
-        fold=_norm,
+        "`norm(v)`: the Euclidean length.",
+        _norm,
+        _lengths(lambda sides: math.hypot(*sides)),
         array=lambda tape, *xs: tape.norm(*xs),
         c=lambda *xs: "sqrt(" + " + ".join(f"{x} * {x}" for x in xs) + ")",
         slopes=lambda r, *xs: [f"({r} > 0.0 ? {x} / {r} : 0.0)" for x in xs],
-        bounds=_lengths(lambda sides: math.hypot(*sides)),
-        linear=True,
     ),
-    Function(
+    _variadic(
         "norm1",
-        1,
-        None,
-        "same",
-        doc="`norm1(v)`: the sum of the absolute values.",
-        fold=lambda *xs: sum(abs(x) for x in xs),
+        "`norm1(v)`: the sum of the absolute values.",
+        lambda *xs: sum(map(abs, xs)),
+        _lengths(math.fsum),
         array=lambda tape, *xs: reduce(tape.add, [tape.call("abs", x) for x in xs]),
         of_each=("abs", "add"),
-        bounds=_lengths(math.fsum),
         exact=True,
         whole=True,
-        linear=True,
     ),
-    Function(
+    _variadic(
         "norminf",
-        1,
-        None,
-        "same",
-        doc="`norminf(v)`: the greatest absolute value.",
-        fold=lambda *xs: max(abs(x) for x in xs),
+        "`norminf(v)`: the greatest absolute value.",
+        lambda *xs: max(map(abs, xs)),
+        _lengths(max),
         array=lambda tape, *xs: reduce(tape.greatest, [tape.call("abs", x) for x in xs]),
         of_each=("abs", "max"),
-        bounds=_lengths(max),
         exact=True,
         whole=True,
-        linear=True,
     ),
 )
 
@@ -495,32 +426,20 @@ REWRITTEN: Mapping[str, tuple[int, int | None]] = MappingProxyType(
 """Functions rewritten to arithmetic -> least and largest number of arguments."""
 
 REGIONS: tuple[str, ...] = (
-    "circle",
-    "ball",
-    "box",
-    "polygon",
-    "halfspace",
-    "union",
-    "intersect",
-    "complement",
-    "dilate",
+    *("circle", "ball", "box", "polygon", "halfspace"),
+    *("union", "intersect", "complement", "dilate"),
 )
 """Functions that construct regions."""
 
 OPERATORS: Mapping[str, str] = MappingProxyType(
-    {"+": "add", "-": "sub", "*": "mul", "/": "div", "%": "mod", "^": "pow"}
+    {function.symbol: function.name for function in _OPERATORS if function.least == 2}
 )
 """The written sign of binary arithmetic -> name of the function."""
 
 STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
     {
-        "next": (1, 1),
-        "prev": (1, 1),
-        "rise": (1, 1),
-        "fall": (1, 1),
-        "shift": (2, 2),
-        "delta": (1, 1),
-        "sweep": (1, 1),
+        **dict.fromkeys(("next", "prev", "rise", "fall"), (1, 1)),
+        **{"shift": (2, 2), "delta": (1, 1), "sweep": (1, 1)},
     }
 )
 """Functions of other samples -> least and largest number of arguments."""
