@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Bounds
 
 _DEVIATIONS = 3.0
-_CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
-    {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
-)
-"""Operations of a draw and a constant, such as unit conversions."""
+"""Standard deviations around the mean that hold nearly all draws."""
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
-    """Range that holds nearly all draws of a sampler with constant arguments; None where unknown."""
+    """Return the range that holds nearly all draws of a sampler, or None where it is unknown.
+
+    The arguments must be constant; a constant may be added or multiplied, as by unit conversions.
+    """
     match num:
         case ir.Const(value):
             return value, value
@@ -39,11 +37,7 @@ def usual_range(num: ir.Num) -> tuple[float, float] | None:
                 return None
             return min(low for low, _ in found), max(high for _, high in found)
         case ir.Op("add" | "sub" | "mul" | "div" as op, (inner, ir.Const(amount))) if amount:
-            ends = usual_range(inner)
-            if ends is None:
-                return None
-            moved = [_CHANGES[op](end, amount) for end in ends]
-            return min(moved), max(moved)
+            return _op(op, [usual_range(inner), (amount, amount)])
         case _:
             return None
 

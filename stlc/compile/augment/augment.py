@@ -22,10 +22,10 @@ from stlc.compile.augment.past import Past
 from stlc.compile.augment.timers import Timer, TimerTable, tolerant
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, report, to_window
+from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import condition, normal
 from stlc.compile.ir.traverse import absolute, at_hand, is_state, looks_back
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
 
@@ -61,12 +61,12 @@ def augment(
     if not absolute(formula):
         return Augmented(past.rewrite(normal(formula)), always, None)
     if grid.horizon is None:
-        report(sink, _without_horizon(formula.span))
+        tell(sink, _without_horizon(formula.span))
         return Augmented(always, always, None)
     try:
         flat = in_past_form(hoist_absolute(normal(formula), sink), grid, table, sink)
     except TooFarError as problem:
-        report(sink, _looks_ahead(problem.span, str(problem)))
+        tell(sink, _looks_ahead(problem.span, str(problem)))
         return Augmented(always, always, None)
     plain = past.rewrite(flat)
     goal = _Goals(grid, table, sink, requirement.name).of(plain)
@@ -100,7 +100,7 @@ class _Goals:
                 window = to_window(interval, self.grid, self.sink, outward=op == "release")
                 return self._leaf(node, op, window, (left, right))
             case _:
-                report(self.sink, _looks_ahead(node.span))
+                tell(self.sink, _looks_ahead(node.span))
                 return self.of(typed.Truth(node.span, True))
 
     def _leaf(
@@ -112,10 +112,10 @@ class _Goals:
     ) -> Goal:
         for body in operands:
             if not is_state(body, augmented=True):
-                report(self.sink, _looks_ahead(body.span))
+                tell(self.sink, _looks_ahead(body.span))
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):
-            report(self.sink, _without_deadline(node.span))
+            tell(self.sink, _without_deadline(node.span))
         left, right = (condition(at_hand(body), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.table.clock(last_step(formula) + (self.grid.horizon or 0) + 1)

@@ -22,8 +22,13 @@ _ZERO = ir.Const(0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class _Draw:
-    """Violation of a goal, and the steps left until its deadline."""
+class _Guidance:
+    """Guidance towards a goal.
+
+    Attributes:
+        gap: violation of the goal.
+        left: steps until its deadline; `_DONE` or `_LOST`.
+    """
 
     gap: ir.Num
     left: ir.Num
@@ -31,34 +36,34 @@ class _Draw:
 
 def guidance_cost(goals: Sequence[Goal]) -> ir.Num | None:
     """Return the violation of the goal with the earliest deadline, at one sample; None without such goals."""
-    draws = [draw for goal in goals if (draw := _draw(goal)) is not None]
-    if not draws:
+    costs = [cost for goal in goals if (cost := _guidance(goal)) is not None]
+    if not costs:
         return None
-    return _first_due(draws).gap
+    return _first_due(costs).gap
 
 
-def _draw(goal: Goal) -> _Draw | None:
+def _guidance(goal: Goal) -> _Guidance | None:
     match goal:
         case GoalLeaf():
             return _leaf(goal)
         case GoalBranch(op, items):
-            draws = [draw for item in items if (draw := _draw(item)) is not None]
-            if not draws:
+            costs = [cost for item in items if (cost := _guidance(item)) is not None]
+            if not costs:
                 return None
             if op == "and":
-                whole = _first_due(draws)
-                most = reduce(lambda a, b: ir.Op("max", (a, b)), [draw.left for draw in draws])
-                return _Draw(whole.gap, _where(_is_lost(most), ir.Const(_LOST), whole.left))
-            return reduce(_nearer, draws)
+                whole = _first_due(costs)
+                most = reduce(lambda a, b: ir.Op("max", (a, b)), [cost.left for cost in costs])
+                return _Guidance(whole.gap, ir.Where(_is_lost(most), ir.Const(_LOST), whole.left))
+            return reduce(_nearer, costs)
         case _:
             assert_never(goal)
 
 
-def _leaf(leaf: GoalLeaf) -> _Draw | None:
-    """Guidance of `eventually` and `until` while pending, and of `always` before its window begins."""
+def _leaf(leaf: GoalLeaf) -> _Guidance | None:
+    """Return the guidance of a pending `eventually` or `until`, or of `always` before its window begins."""
     formula, window = leaf.formula, leaf.formula.window
-    if formula.op == "always" and window.hi is None and (rounds := _rounds(leaf)):
-        return rounds
+    if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
+        return recurring
     promise = formula.op in ("eventually", "until")
     due = window.hi if promise else window.lo
     if due is None or due == 0 or isinstance(formula.margin, ir.Truth):
@@ -71,19 +76,19 @@ def _leaf(leaf: GoalLeaf) -> _Draw | None:
     waiting = open_ if promise else ir.BoolOp("and", (open_, at_least(left, ir.Const(1.0))))
     lost = at_least(ir.Const(-0.5), leaf.status)
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    over = _where(lost, ir.Const(_LOST), ir.Const(_DONE))
-    return _Draw(_where(waiting, gap, _ZERO), _where(waiting, left, over))
+    over = ir.Where(lost, ir.Const(_LOST), ir.Const(_DONE))
+    return _Guidance(ir.Where(waiting, gap, _ZERO), ir.Where(waiting, left, over))
 
 
-def _rounds(leaf: GoalLeaf) -> _Draw | None:
+def _recurring(leaf: GoalLeaf) -> _Guidance | None:
     """Guidance of a recurring goal, `always@[a, end] once[0, c] p`: p is due c after it last held."""
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
-    draws = [draw for part in parts if (draw := _round(part, leaf)) is not None]
-    return _first_due(draws) if draws else None
+    costs = [cost for part in parts if (cost := _recurring_part(part, leaf)) is not None]
+    return _first_due(costs) if costs else None
 
 
-def _round(part: ir.Formula, leaf: GoalLeaf) -> _Draw | None:
+def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
     """Guidance of one recurring part, `p or c - since >= 0`."""
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
@@ -97,19 +102,19 @@ def _round(part: ir.Formula, leaf: GoalLeaf) -> _Draw | None:
     left = ir.Op("max", (begins, tests[0]))
     lost = at_least(ir.Const(-0.5), leaf.status)
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    return _Draw(_where(lost, _ZERO, gap), _where(lost, ir.Const(_LOST), left))
+    return _Guidance(ir.Where(lost, _ZERO, gap), ir.Where(lost, ir.Const(_LOST), left))
 
 
-def _first_due(draws: Sequence[_Draw]) -> _Draw:
+def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
     """Guidance of a conjunction: the summed violations of the goals with the earliest deadline."""
-    if len(draws) == 1:
-        return draws[0]
-    first = reduce(lambda a, b: ir.Op("min", (a, b)), [draw.left for draw in draws])
-    gaps = [_where(at_least(first, draw.left), draw.gap, _ZERO) for draw in draws]
-    return _Draw(reduce(lambda a, b: ir.Op("add", (a, b)), gaps), first)
+    if len(costs) == 1:
+        return costs[0]
+    first = reduce(lambda a, b: ir.Op("min", (a, b)), [cost.left for cost in costs])
+    gaps: list[ir.Num] = [ir.Where(at_least(first, cost.left), cost.gap, _ZERO) for cost in costs]
+    return _Guidance(reduce(lambda a, b: ir.Op("add", (a, b)), gaps), first)
 
 
-def _nearer(one: _Draw, other: _Draw) -> _Draw:
+def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
     """Guidance of a disjunction: the goal that is met, else the less violated one that can still be met."""
     first = ir.BoolOp(
         "or",
@@ -118,7 +123,7 @@ def _nearer(one: _Draw, other: _Draw) -> _Draw:
             ir.BoolOp("and", (_not_lost(one.left), at_least(other.gap, one.gap))),
         ),
     )
-    return _Draw(_where(first, one.gap, other.gap), _where(first, one.left, other.left))
+    return _Guidance(ir.Where(first, one.gap, other.gap), ir.Where(first, one.left, other.left))
 
 
 def _is_lost(left: ir.Num) -> ir.Formula:
@@ -127,10 +132,6 @@ def _is_lost(left: ir.Num) -> ir.Formula:
 
 def _not_lost(left: ir.Num) -> ir.Formula:
     return at_least(ir.Const(0.5 * (_DONE + _LOST)), left)
-
-
-def _where(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-    return ir.Where(condition, yes, no)
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:

@@ -10,10 +10,8 @@ from dataclasses import replace
 from typing import Literal
 
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import report
 from stlc.compile.ir.traverse import absolute, from_now, map_children, nodes, on_clock, operands
-from stlc.diagnostics import Diagnostic
-from stlc.source import Span
+from stlc.diagnostics import Diagnostic, tell
 
 
 def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
@@ -66,19 +64,17 @@ def _constant(formula: typed.Formula) -> bool:
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Report E307 for the first absolute interval below `outer`."""
+    """Report E307 for the first absolute interval below `outer`; return `true` in its place."""
     inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
-    report(sink, _nested(inner.span, outer.span))
-    return typed.Truth(outer.span, True)
-
-
-def _nested(span: Span, outer: Span) -> Diagnostic:
-    return Diagnostic(
+    finding = Diagnostic(
         "E307",
         "an absolute interval under another temporal operator",
-        span,
+        inner.span,
         help=("its truth does not depend on now: move it out of the operator around it",),
-    ).with_note(f"the operator around it starts at line {outer.line}, column {outer.column}")
+    )
+    place = f"line {outer.span.line}, column {outer.span.column}"
+    tell(sink, finding.with_note(f"the operator around it starts at {place}"))
+    return typed.Truth(outer.span, True)
 
 
 def from_first_sample(formula: typed.Formula) -> typed.Formula:

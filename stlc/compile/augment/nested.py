@@ -4,18 +4,18 @@
 stated at the instant at which it is decided, so it needs only memory of the past: one timer per window. Where
 parts are decided at different instants, the earlier ones are delayed in a register.
 
-An obligation that must begin by b is violated as soon as p fails after b; `left until@ right` detects that
-at once, not only when its last instant has passed. (Past for future: Maler, Nickovic and Pnueli 2005.)
+In that formula `always[0, c] p` must begin by b, so it is violated as soon as p fails after b. The rewritten
+formula is a `left until@ right` whose left side detects that at once, not only at b + c. The method is that
+of Maler, Nickovic and Pnueli, "Real time temporal logic: past, present, future" (2005).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
 from stlc.compile.augment.mission import typed_inside
-from stlc.compile.augment.past import REGISTER
+from stlc.compile.augment.past import REGISTER, in_steps
 from stlc.compile.augment.timers import TimerTable, time_test
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -25,8 +25,8 @@ from stlc.compile.ir.traverse import nodes, operands
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
-_MOST_TURNS = 32
-"""Maximum length in samples of an `until` below other operators, which is expanded."""
+_LONGEST = 32
+"""Maximum length in samples of an `until` below other operators, which is expanded sample by sample."""
 
 _Wide: TypeAlias = Literal["always", "eventually", "once", "historically"]
 Formulas: TypeAlias = tuple[typed.Formula, ...]
@@ -46,6 +46,7 @@ def looks_ahead(formula: typed.Formula) -> bool:
 
 
 def _forwards(node: typed.Formula) -> bool:
+    """True for a future operator."""
     match node:
         case typed.Temporal(_, op):
             return op in ("always", "eventually")
@@ -98,9 +99,9 @@ def in_past_form(
 
 
 def _on_grid(
-    formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, denied: bool = False
+    formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, negated: bool = False
 ) -> typed.Formula:
-    """The formula with bounds in whole samples, rounded according to the operator as written."""
+    """Return a formula with bounds in whole samples, rounded according to the operator as written."""
     match formula:
         case typed.Logic(_, _, items):
             return replace(formula, items=tuple(_on_grid(item, grid, sink) for item in items))
@@ -109,31 +110,25 @@ def _on_grid(
         case typed.Not(_, typed.Shift(span, 1, body)):
             return _next(span, _on_grid(normal(body, -1), grid, sink))
         case typed.Not(_, body):
-            return replace(formula, body=_on_grid(body, grid, sink, denied=True))
+            return replace(formula, body=_on_grid(body, grid, sink, negated=True))
         case typed.Temporal(_, op, interval, body):
             window = to_window(interval, grid, sink, outward=op in ("always", "historically"))
-            return replace(formula, interval=_steps(window, formula.span), body=_on_grid(body, grid, sink))
+            return replace(formula, interval=in_steps(window, formula.span), body=_on_grid(body, grid, sink))
         case typed.Until(_, op, interval, left, right):
-            window = to_window(interval, grid, sink, outward=op == "release" or denied)
+            window = to_window(interval, grid, sink, outward=op == "release" or negated)
             left, right = (_on_grid(part, grid, sink) for part in (left, right))
-            return replace(formula, interval=_steps(window, formula.span), left=left, right=right)
+            return replace(formula, interval=in_steps(window, formula.span), left=left, right=right)
         case _:
             return formula
 
 
 def _next(span: Span, body: typed.Formula) -> typed.Formula:
-    """Window of `next(p)`; a mission always has a next sample."""
-    return typed.Temporal(span, "always", _steps(ir.Window(1, 1), span), body)
-
-
-def _steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
-    hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
-    lo = typed.Time(steps=Fraction(window.lo), span=span)
-    return typed.Interval(lo, hi, clock=clock, span=span)
+    """Return `next(p)` as a window; a mission always has a next sample."""
+    return typed.Temporal(span, "always", in_steps(ir.Window(1, 1), span), body)
 
 
 def _window(node: typed.Temporal | typed.Until) -> ir.Window:
-    """The window of an operator whose bounds are whole samples."""
+    """Return the window of an operator whose bounds are whole samples."""
     lo, hi = node.interval.lo, node.interval.hi
     return ir.Window(int(lo.steps), None if hi is None else int(hi.steps))
 
@@ -143,7 +138,7 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 
 
 def _ahead(formula: typed.Formula) -> int:
-    """Lookahead of a formula in samples. Raises TooFarError where it is unbounded."""
+    """Return the lookahead of a formula in samples. Raises TooFarError where it is unbounded."""
     if isinstance(formula, _OPAQUE):
         return 0
     inner = max(map(_ahead, operands(formula)), default=0)
@@ -155,6 +150,7 @@ _OPAQUE = (typed.Shift, typed.Edge, typed.Freeze, typed.Recalled)
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:
+    """Return the end of a window in samples. Raises TooFarError where it has none."""
     hi = _window(node).hi
     if hi is None:
         raise TooFarError(node.span, "a window to the end of the trace")
@@ -171,14 +167,14 @@ class _Writer:
     Args:
         table: receives the mission clock.
         span: of the absolute operator.
-        soon: whether to add a state that detects a violation at once.
+        soon: whether to detect a violation at once, by the left side of an `until`.
     """
 
     def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
-        self._ledger, self._span, self._soon = table, span, soon
+        self._table, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
-        """At some sample of `window` all of `when` (past formulas) hold, and from that sample on `what`."""
+        """Return: at one sample of `window`, on the mission clock, `what` and all of `when` hold."""
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))
         match what:
@@ -189,10 +185,11 @@ class _Writer:
             case typed.Temporal(_, "eventually", _, body):
                 inner = _window(what)
                 later = _sum(window, inner.lo, inner.hi)
-                return self.met(later, (self._once(inner, self._begun(window, when)),) if when else (), body)
+                known = (self._past("once", inner, self._begun(window, when)),) if when else ()
+                return self.met(later, known, body)
             case typed.Temporal(_, "always", _, body):
                 _end(what)
-                return self._kept(window, when, _window(what), body)
+                return self._lasting(window, when, _window(what), body)
             case typed.Until(_, "until", _, left, right):
                 return self._reached(window, when, _window(what), left, right)
             case typed.Until(_, "release", _, left, right):
@@ -201,13 +198,13 @@ class _Writer:
                 raise TooFarError(what.span, "not something that the past can tell")
 
     def until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """`left until@ right`, stated at the instant at which both operands are decided."""
+        """Return `left until@[window] right`, stated at the instant at which both operands are decided."""
         late = max(_ahead(left), _ahead(right))
         known = self._or(self._until_step(late - 1), self.delayed(left, late))
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
 
     def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
-        """Conjunction at a sample of `window`: items decided at once, and items with lookahead."""
+        """Return `met` of a conjunction."""
         later = [item for item in items if looks_ahead(item)]
         known = (*when, *(item for item in items if not looks_ahead(item)))
         if len(later) == 1:
@@ -216,8 +213,10 @@ class _Writer:
         late = _ahead(whole)
         return self._on_clock("eventually", _sum(window, late, late), self.delayed(whole, late))
 
-    def _kept(self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula) -> typed.Formula:
-        """`always[l, u] body` from a sample of `window` on."""
+    def _lasting(
+        self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula
+    ) -> typed.Formula:
+        """Return `met` of `always[what] body`."""
         lo, hi = what.lo, what.hi or 0
         late = _ahead(body)
         body = self.delayed(body, late)
@@ -240,7 +239,7 @@ class _Writer:
     def _reached(
         self, window: ir.Window, when: Formulas, inner: ir.Window, left: typed.Formula, right: typed.Formula
     ) -> typed.Formula:
-        """`left until[l, u] right` from a sample of `window` on."""
+        """Return `met` of `left until[inner] right`."""
         late = max(_ahead(left), _ahead(right))
         left, right = self.delayed(left, late), self.delayed(right, late)
         begun = self._ago(self._begun(window, when), late) if when else None
@@ -258,21 +257,21 @@ class _Writer:
         return self._on_clock_until(there, self._or(latest, pending), met)
 
     def _freed(self, node: typed.Until, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """`left release[l, u] right`: right throughout, left before the window, or right until left in it."""
+        """Rewrite `left release[l, u] right`: right throughout, left before, or right until left inside."""
         window, span = _window(node), node.span
         hi = _end(node)
         always = typed.Temporal(span, "always", node.interval, right)
-        before = typed.Temporal(span, "eventually", _steps(ir.Window(0, window.lo), span), left)
+        before = typed.Temporal(span, "eventually", in_steps(ir.Window(0, window.lo), span), left)
         inside = typed.Until(
-            span, "until", _steps(ir.Window(0, hi - window.lo), span), self._or(left, right), left
+            span, "until", in_steps(ir.Window(0, hi - window.lo), span), self._or(left, right), left
         )
-        at = _steps(ir.Window(window.lo, window.lo), span)
+        at = in_steps(ir.Window(window.lo, window.lo), span)
         return self._or(always, before, typed.Temporal(span, "eventually", at, inside))
 
-    # ---------------------------------------------------------------- later, by a fixed time
+    # ------------------------------------------------------------------ formulas delayed in time
 
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
-        """Truth of a formula `steps` samples ago, when it is decided."""
+        """Return a past formula with the truth that a formula had `steps` samples ago, when it is decided."""
         if not looks_ahead(formula):
             return self._ago(formula, steps)
         match formula:
@@ -291,11 +290,11 @@ class _Writer:
     def _written_out(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
     ) -> typed.Formula:
-        """`left until[l, u] right`, or `release`, expanded sample by sample."""
+        """Return `until` or `release` as `steps` samples ago, expanded sample by sample."""
         window, end, strong = _window(node), _end(node), node.op == "until"
-        if end > _MOST_TURNS:
+        if end > _LONGEST:
             raise TooFarError(
-                node.span, f"an `{node.op}` of more than {_MOST_TURNS} samples below other operators"
+                node.span, f"an `{node.op}` of more than {_LONGEST} samples below other operators"
             )
         one, two = (self._and, self._or) if strong else (self._or, self._and)
         whole = one(self.delayed(left, steps - end), self.delayed(right, steps - end))
@@ -305,7 +304,7 @@ class _Writer:
             whole = one(self.delayed(left, ago), met)
         return whole
 
-    # ------------------------------------------------------------------------ small words
+    # --------------------------------------------------------------- constructors of nodes
 
     def _and(self, *items: typed.Formula) -> typed.Formula:
         return items[0] if len(items) == 1 else typed.Logic(self._span, "and", items)
@@ -315,42 +314,39 @@ class _Writer:
         return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
 
     def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
-        """All of `when`, while the mission clock is in `window`."""
+        """Return: all of `when` hold, and the mission clock is in `window`."""
         if window == ir.Window(0, None):
             return self._and(*when)
-        clock = self._ledger.clock((window.lo if window.hi is None else window.hi) + 1)
+        clock = self._table.clock((window.lo if window.hi is None else window.hi) + 1)
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
         """True if the mission clock is at most `step`; always true for None."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
-        return time_test(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)
+        return time_test(ir.Const(float(step)), self._table.clock(step + 1), self._span)
 
     def _on_clock(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
-        return typed.Temporal(self._span, op, _steps(window, self._span, "start"), body)
+        return typed.Temporal(self._span, op, in_steps(window, self._span, "start"), body)
 
     def _on_clock_until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
         if isinstance(left, typed.Logic) and any(isinstance(item, typed.Truth) for item in left.items):
             return self._on_clock("eventually", window, right)
-        return typed.Until(self._span, "until", _steps(window, self._span, "start"), left, right)
+        return typed.Until(self._span, "until", in_steps(window, self._span, "start"), left, right)
 
     def _past(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
         if window == ir.Window(0, 0):
             return body
         self._require_memory(window.lo)
-        return typed.Temporal(self._span, op, _steps(window, self._span), body)
-
-    def _once(self, window: ir.Window, body: typed.Formula) -> typed.Formula:
-        return self._past("once", window, body)
+        return typed.Temporal(self._span, op, in_steps(window, self._span), body)
 
     def _ago(self, body: typed.Formula, steps: int) -> typed.Formula:
-        return self._once(ir.Window(steps, steps), body)
+        return self._past("once", ir.Window(steps, steps), body)
 
     def _since(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
         if window.hi is not None:
             self._require_memory(window.lo)
-        return typed.Until(self._span, "since", _steps(window, self._span), left, right)
+        return typed.Until(self._span, "since", in_steps(window, self._span), left, right)
 
     def _require_memory(self, steps: int) -> None:
         if steps > REGISTER:

@@ -3,9 +3,9 @@
 A timer counts up to the previous sample: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
 `p or since_p <= c`. Windows of the past are cut at the start of the mission.
 
-This decides truth at one instant, without a gradient. Along a plan the formula is evaluated on the plan's own
-samples, and the timer at the plan's first sample covers only those before it: after k steps
-`c - held - k` steps are missing.
+A timer decides truth at one instant, without a gradient. Along a plan the operator is evaluated on the plan's
+samples, and the timer's value at the first sample stands for the samples before the plan: k steps into the
+plan, `historically[0, c] p` lacks `c - held - k` steps.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from stlc.compile.augment.timers import (
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, report, to_window
+from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import Sign, condition, flip, negate, normal
 from stlc.compile.ir.traverse import at_hand, is_state, looks_back
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
 REGISTER = 64
@@ -57,13 +57,13 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test as a disjunct: robustness +inf or -inf."""
+        """Return the test for use in a disjunction, with robustness +inf or -inf."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test as a conjunct: where it fails, the missing steps are its robustness."""
+        """Return the test for use in a conjunction: where it fails, the missing steps are its robustness."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
         )
@@ -83,7 +83,7 @@ class _Test:
 @final
 @dataclass(frozen=True, slots=True)
 class Past:
-    """Rewriter of past operators for one requirement.
+    """Rewriter of a requirement's past operators.
 
     Attributes:
         grid: time step and horizon.
@@ -131,12 +131,12 @@ class Past:
         window = to_window(node.interval, self.grid, self.sink, outward=not once)
         if window.lo:
             recent = ir.Window(0, None if window.hi is None else window.hi - window.lo)
-            inner = self._window(replace(node, interval=_back(recent, node.span)))
+            inner = self._window(replace(node, interval=in_steps(recent, node.span)))
             return self._delayed(node, inner, window.lo, before=not once)
         if window.hi == 0:
             return body
         memory = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
-        inside = replace(node, interval=_back(window, node.span), body=body)
+        inside = replace(node, interval=in_steps(window, node.span), body=body)
         op: _Op = "or" if once else "and"
         return typed.Recalled(
             node.span,
@@ -145,7 +145,7 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """True if `body` held at one of the previous `most` samples (None: all)."""
+        """Return: `body` held at one of the previous `most` samples (None: all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
@@ -157,12 +157,12 @@ class Past:
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """True if `body` held at each of the previous `most` samples (None: all)."""
+        """Return: `body` held at each of the previous `most` samples (None: all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
-            kept = self.table.add(draft, lambda own: choose(condition, own, _ZERO))
-            return _Test(kept, _ONE, node.span).lacks()
+            latch = self.table.add(draft, lambda own: choose(condition, own, _ZERO))
+            return _Test(latch, _ONE, node.span).lacks()
         about = f"steps for which {_short(node.body)} has held, up to {most}"
         draft = self._draft("timer", "held", float(most), float(most), about)
         held = self.table.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
@@ -171,7 +171,7 @@ class Past:
     # ------------------------------------------------------------------------------ since
 
     def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
-        """`p since[0, c] q`: p now, and q now or at most c ago with p holding ever since; or its dual."""
+        """Rewrite `p since[0, c] q`, or its negation: p now, and q now or at most c ago with p ever since."""
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
         if left is None or right is None:
@@ -189,7 +189,7 @@ class Past:
         )
         met = typed.Logic(node.span, ops[1], (right, recent.now))
         whole = typed.Temporal(
-            node.span, "historically" if positive else "once", _back(ir.Window(0, None), node.span), left
+            node.span, "historically" if positive else "once", in_steps(ir.Window(0, None), node.span), left
         )
         before = typed.Logic(node.span, ops[0], (whole, recent.along))
         return typed.Recalled(
@@ -203,13 +203,13 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """True if q held at a previous sample and p from it on until the previous sample; or its negation."""
+        """Return: q held at an earlier sample, and p from there to the previous sample; or its negation."""
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
-            begun = self.table.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
-            test = _Test(begun, _ONE, node.span) if positive else _Test(_ZERO, begun, node.span)
+            latch = self.table.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
+            test = _Test(latch, _ONE, node.span) if positive else _Test(_ZERO, latch, node.span)
             return test.decides()
         far = ir.Const(most + 1.0)
         draft = self._draft("timer", "since", far.value, far.value, f"steps since {about}, up to {most}")
@@ -223,7 +223,7 @@ class Past:
     # ------------------------------------------------------------------------- rise, fall
 
     def _edge(self, node: typed.Edge, *, positive: bool) -> typed.Formula:
-        """`rise`: now and not before; false at the first sample."""
+        """Rewrite `rise` (true now and not before; false at the first sample), `fall`, or a negation."""
         now: Sign = 1 if (node.op == "rise") is positive else -1
         body, before = self._body(normal(node.body, now)), self._body(normal(node.body, flip(now)))
         if body is None or before is None:
@@ -231,7 +231,7 @@ class Past:
         op: _Op = "and" if positive else "or"
         return typed.Logic(node.span, op, (body, self._delayed(node, before, 1, before=not positive)))
 
-    # --------------------------------------------------------------------- some time ago
+    # --------------------------------------------------------------- windows that end earlier
 
     def _delayed(
         self,
@@ -241,7 +241,7 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Truth of `body` `steps` samples ago, kept in a register; `before` is its value before the start."""
+        """Return the truth of `body` `steps` samples ago, from a register that starts with `before`."""
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
@@ -254,8 +254,8 @@ class Past:
             about = f"whether {known} held {ago} samples before"
             draft = self._draft("latch", "before", initial, 1.0, about)
             latch = self.table.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
-        begun = time_test(ir.Signal(ir.ELAPSED), ir.Const(float(steps)), node.span)
-        first = typed.Logic(node.span, "or", (begun, timer_test(latch, _ONE, node.span)))
+        late = time_test(ir.Signal(ir.ELAPSED), ir.Const(float(steps)), node.span)
+        first = typed.Logic(node.span, "or", (late, timer_test(latch, _ONE, node.span)))
         inside = typed.Shift(node.span, -steps, body, outside=True)
         return typed.Recalled(
             node.span,
@@ -264,14 +264,14 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """`p since[a, b] q`: p throughout [0, a], and `p since[0, b - a] q` a ago; or its dual."""
+        """Rewrite `p since[a, b] q` or its negation: p in [0, a], and `p since[0, b - a] q` a ago."""
         lo, hi = window.lo, window.hi or 0
-        recent = replace(node, interval=_back(ir.Window(0, hi - lo), node.span))
+        recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
         ago = self._delayed(node, self._since(recent, positive=positive), lo, before=not positive)
         held = typed.Temporal(
             node.span,
             "historically" if positive else "once",
-            _back(ir.Window(0, lo), node.span),
+            in_steps(ir.Window(0, lo), node.span),
             normal(node.left, 1 if positive else -1),
         )
         return typed.Logic(node.span, "and" if positive else "or", (self._window(held), ago))
@@ -279,7 +279,7 @@ class Past:
     def _lasting(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
-        """`p since[a, end] q` by a timer of the earliest q since which p has held; or its dual."""
+        """Rewrite `p since[a, end] q` or its negation by a timer of the first q since which p has held."""
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
         from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
@@ -294,7 +294,7 @@ class Past:
         span, bound = node.span, ir.Const(float(least))
         first, elapsed = ir.at_first(age), ir.Signal(ir.ELAPSED)
         after = ir.Op("add", (first, elapsed))
-        whole = _back(ir.Window(0, None), span)
+        whole = in_steps(ir.Window(0, None), span)
         inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
         if not positive:
             none = typed.Logic(
@@ -352,12 +352,12 @@ class Past:
                 "`stlc check` can judge this one on recorded traces",
             ),
         )
-        report(self.sink, finding)
+        tell(self.sink, finding)
         return typed.Truth(span, True)
 
 
 def _counted(own: ir.Num, most: int) -> ir.Num:
-    """Saturating increment."""
+    """Return `own + 1`, saturating at `most`."""
     return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
 
 
@@ -367,18 +367,18 @@ def _short(formula: typed.Formula) -> str:
     return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
 
 
-def _back(window: ir.Window, span: Span) -> typed.Interval:
-    """Window of a past operator as an interval."""
+def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
+    """Return a window as an interval in steps."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
-    return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, span=span)
+    return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, clock=clock, span=span)
 
 
 def _since_inside(
     node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
 ) -> typed.Formula:
-    """`since` over the plan's samples, or its dual, whose operands are negated."""
-    interval = _back(window, node.span)
+    """Return `left since[window] right` over the plan's samples, or its dual."""
+    interval = in_steps(window, node.span)
     if positive:
         return replace(node, interval=interval, left=left, right=right)
-    denied_ = tuple(typed.Not(part.span, part) for part in (left, right))
-    return typed.Not(node.span, replace(node, interval=interval, left=denied_[0], right=denied_[1]))
+    left, right = (typed.Not(part.span, part) for part in (left, right))
+    return typed.Not(node.span, replace(node, interval=interval, left=left, right=right))

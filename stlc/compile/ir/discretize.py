@@ -46,6 +46,7 @@ def lacks(grid: Grid, formula: typed.Formula) -> bool:
 
 
 def _times(formula: typed.Formula) -> Iterator[typed.Time]:
+    """Yield the bounds and delays in a formula."""
     for node in nodes(formula):
         if isinstance(node, (typed.Temporal, typed.Until)):
             yield from (end for end in (node.interval.lo, node.interval.hi) if end is not None)
@@ -65,7 +66,7 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
         interval: in seconds, steps and horizons.
         grid: time step and horizon.
         sink: receives E005, E301, E302, E305, E311 and W304; after an error the window is a placeholder.
-        outward: round bounds off the grid outwards.
+        outward: round bounds between two samples outwards.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
     if lo is None:
@@ -73,16 +74,18 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
     hi = None if interval.hi is None else in_steps(interval.hi, grid, sink, interval.span)
     if hi is None and interval.hi is not None:
         return _EMPTY
-    if _reversed(interval, lo, hi, sink) or _endless(interval, lo, hi, sink):
+    invalid = _invalid(interval, lo, hi)
+    if invalid is not None:
+        tell(sink, invalid)
         return _EMPTY
     first = _first(lo, outward=outward, excluded=interval.lo_open)
     _note_rounding(interval.lo, lo, first, grid, sink)
     if hi is None or interval.hi is None:
         return ir.Window(first, None)
-    last = _last(hi, outward=outward, excluded=interval.hi_open)
+    last = -_first(-hi, outward=outward, excluded=interval.hi_open)
     _note_rounding(interval.hi, hi, last, grid, sink)
     if last < first:
-        report(sink, _without_sample(interval, grid))
+        tell(sink, _without_sample(interval, grid))
         return _EMPTY
     return ir.Window(first, last)
 
@@ -90,53 +93,37 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
 def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
     """Return a bound in steps, or None (and E311) where the grid lacks the step or horizon."""
     if time.horizons and grid.horizon is None:
-        report(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
+        tell(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
         return None
     if time.seconds and grid.dt is None:
-        report(sink, _needs_grid("seconds become samples with the step `dt` of a system", time.span or span))
+        tell(sink, _needs_grid("seconds become samples with the step `dt` of a system", time.span or span))
         return None
     seconds = time.seconds / grid.dt if grid.dt is not None else Fraction(0)
     return seconds + time.steps + time.horizons * (grid.horizon or 0)
 
 
 def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
+    """Return the first sample of an interval that starts at `lo`."""
     if lo.denominator != 1:
         return math.floor(lo) if outward else math.ceil(lo)
     return int(lo) + 1 if excluded else int(lo)
 
 
-def _last(hi: Fraction, *, outward: bool, excluded: bool) -> int:
-    if hi.denominator != 1:
-        return math.ceil(hi) if outward else math.floor(hi)
-    return int(hi) - 1 if excluded else int(hi)
-
-
-def report(sink: list[Diagnostic], finding: Diagnostic) -> None:
-    """Append a finding unless present: a formula and its negation may both be lowered."""
-    tell(sink, finding)
-
-
-def _reversed(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
+def _invalid(interval: typed.Interval, lo: Fraction, hi: Fraction | None) -> Diagnostic | None:
+    """Return E302, E301 or E005 for an interval before now, reversed, or too long."""
     if lo < 0:
-        text = "an interval starts before now"
-        report(
-            sink, Diagnostic("E302", text, interval.lo.span or interval.span, label=f"{nearest(lo):g} steps")
-        )
-        return True
+        text, span = "an interval starts before now", interval.lo.span or interval.span
+        return Diagnostic("E302", text, span, label=f"{nearest(lo):g} steps")
     if hi is not None and hi < lo:
-        text = "the interval ends before it starts"
         label = f"from {nearest(lo):g} to {nearest(hi):g} steps"
-        report(sink, Diagnostic("E301", text, interval.span, label=label))
-        return True
-    return False
-
-
-def _endless(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
-    if max(lo, hi or 0) <= MAX_STEPS:
-        return False
-    text = f"an interval of more than {MAX_STEPS:,} steps"
-    report(sink, Diagnostic("E005", text, interval.span, help=("`inf` means to the end of the trace",)))
-    return True
+        return Diagnostic("E301", "the interval ends before it starts", interval.span, label=label)
+    if max(lo, hi or 0) > MAX_STEPS:
+        text, help_ = (
+            f"an interval of more than {MAX_STEPS:,} steps",
+            ("`inf` means to the end of the trace",),
+        )
+        return Diagnostic("E005", text, interval.span, help=help_)
+    return None
 
 
 def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, sink: list[Diagnostic]) -> None:
@@ -213,7 +200,7 @@ def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
         return 1
     finding = delay_fault(steps, delay.span, grid)
     if finding is not None:
-        report(sink, finding)
+        tell(sink, finding)
         return 1
     return int(steps)
 

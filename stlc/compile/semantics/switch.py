@@ -7,7 +7,7 @@ smooth approximation; `StraightThrough` is exact forward, with a smooth gradient
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, final
+from typing import ClassVar, Protocol, final
 
 from stlc.compile.backends.array.namespace import Array, Ops
 
@@ -15,13 +15,12 @@ from stlc.compile.backends.array.namespace import Array, Ops
 class Switch(Protocol):
     """Evaluation of conditions in a program.
 
-    With `exact` only the truth of a condition matters, not its margin: it is evaluated with comparisons and
-    masks, and each predicate keeps its own strictness.
+    Attributes:
+        exact: only the truth of a condition matters, not its margin: it is evaluated with comparisons and
+            masks, and each predicate keeps its own strictness.
     """
 
-    @property
-    def exact(self) -> bool:
-        """True if only truth matters."""
+    exact: ClassVar[bool]
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:
         """Return the indicator of a condition with margin `rho`, in [0, 1].
@@ -37,7 +36,7 @@ class Switch(Protocol):
         """Adjust the indicator `weight` of a condition of mixed strictness; `truth` is its mask."""
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """`yes` where the indicator `weight` is 1, `no` where it is 0."""
+        """Return a blend of two values: `yes` where the indicator `weight` is 1, `no` where it is 0."""
 
 
 @final
@@ -45,21 +44,18 @@ class Switch(Protocol):
 class Hard:
     """Exact switching: 0 or 1, without gradient and without tolerance."""
 
-    @property
-    def exact(self) -> bool:
-        """Only truth matters."""
-        return True
+    exact: ClassVar[bool] = True
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """1 where the condition holds, else 0."""
         return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """The mask as a number."""
+        """Return the mask as a number."""
         return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """The value of the branch that is taken, bit for bit."""
+        """Return the value of the taken branch, bit for bit."""
         return ops.where(ops.gt(weight, 0.5), yes, no)
 
 
@@ -68,12 +64,8 @@ class Hard:
 class Tanh:
     """The paper's Eq. 6: `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)`, and a blend of branches."""
 
+    exact: ClassVar[bool] = False
     sharpness: float = 500.0
-
-    @property
-    def exact(self) -> bool:
-        """Margins matter."""
-        return False
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """`(1 + tanh(w rho)) / 2` with the indicator's own sharpness where it has one."""
@@ -81,7 +73,7 @@ class Tanh:
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """The smooth weight unchanged: at the boundary it is 1/2 for either strictness."""
+        """Return `weight` unchanged: at the boundary it is 1/2 for strict and non-strict inequalities."""
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -97,19 +89,15 @@ class StraightThrough:
     A choice has the value and gradient of the taken branch, plus the gradient of the condition.
     """
 
+    exact: ClassVar[bool] = False
     slope: float = 10.0
-
-    @property
-    def exact(self) -> bool:
-        """Margins matter, for the gradient."""
-        return False
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """0 or 1, with a gradient."""
         return ops.straight_through(rho, strict, self.slope)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """The mask as 0 or 1, with the gradient of `weight`."""
+        """Return the mask as 0 or 1, with the gradient of `weight`."""
         return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
