@@ -72,7 +72,7 @@ def test_the_page_has_an_example_of_each_extension():
     assert len(CHECKS) == 11
     assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 10
     operator = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
-    assert len(operator) == 8  # six of the operator, one line each of a format and of a function
+    assert len(operator) == 3  # an operator, a trace format and a function
 
 
 @pytest.mark.parametrize("name", [name for name, _ in CHECKS])

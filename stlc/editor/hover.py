@@ -19,12 +19,11 @@ from stlc.grammar import ast
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.grammar.show.printer import show
 from stlc.grammar.traverse import descendants
-from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS, UNARY_TEMPORAL
 from stlc.signature import Column
 from stlc.source import Span
 
 _ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
-_PAST = ("once", "historically", "since")
 
 
 def hover(document: Document, offset: int) -> tuple[Span, str] | None:
@@ -222,7 +221,7 @@ def _within(node: ast.Temporal | ast.Until, offset: int) -> bool:
 def _about_temporal(document: Document, node: ast.Temporal | ast.Until) -> str:
     found = None if node.interval is None else document.meaning.interval(node.interval.span)
     if node.interval is None:
-        time = "up to now" if node.op in _PAST else "from now to the end of the trace"
+        time = "up to now" if OPERATORS[node.op].past else "from now to the end of the trace"
     else:
         time = "" if found is None else _time(node.op, *found, document.grid)
     return "\n\n".join(filter(None, (TEMPORAL[node.op], time)))
@@ -232,7 +231,7 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
     if window is None:
         return ""
     samples = f"samples {window.lo}..{'end' if window.hi is None else window.hi}"
-    if op in _PAST:
+    if OPERATORS[op].past:
         samples += " back"
     if interval.clock == "start":
         samples += " of the mission"

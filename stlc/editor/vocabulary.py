@@ -6,19 +6,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from stlc.compile.ir.functions import FUNCTIONS as TABLE
+from stlc.grammar.words import OPERATORS
 
-TEMPORAL: Mapping[str, str] = MappingProxyType(
-    {
-        "always": "`always[a, b] p`: p holds at every sample from a to b ahead.",
-        "eventually": "`eventually[a, b] p`: p holds at some sample from a to b ahead.",
-        "until": "`p until[a, b] q`: q holds at some sample from a to b ahead, and p from now to it.",
-        "release": "`p release[a, b] q`: q holds from a to b ahead, except once p has held.",
-        "unless": "`p unless[a, b] q`: p holds from now to b ahead, or `p until[a, b] q`.",
-        "once": "`once[a, b] p`: p held at some sample from a to b ago.",
-        "historically": "`historically[a, b] p`: p held at every sample from a to b ago.",
-        "since": "`p since[a, b] q`: q held at some sample from a to b ago, and p from there up to now.",
-    }
-)
+TEMPORAL: Mapping[str, str] = MappingProxyType({name: word.meaning for name, word in OPERATORS.items()})
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {

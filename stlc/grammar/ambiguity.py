@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 
 from stlc.grammar import ast
 from stlc.grammar.scan import Lexeme, lexemes
-from stlc.grammar.traverse import descendants
+from stlc.grammar.traverse import children, descendants
 from stlc.source import Span
 
 AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]
@@ -100,18 +100,14 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
     """Yield a temporal operator that ends a left operand: in other tools it extends beyond the connective."""
-    part: ast.Expr = node.left
-    governed: ast.Expr | None = None
+    part: ast.Node = node.left
+    governed: ast.Node | None = None
     while not words.closed(part, left=True):
-        match part:
-            case ast.Logic(right=right) | ast.Until(right=right):
-                part, governed = right, None
-            case ast.Temporal():
-                yield Ambiguity((governed or part).span, "scope", node.op)
-                return
-            case ast.Not(operand=body) | ast.Quantifier(body=body) | ast.Freeze(body=body):
-                part, governed = body, governed or part
-            case ast.IfThenElse(no=body):
-                part, governed = body, governed or part
-            case _:
-                return
+        if isinstance(part, ast.Temporal):
+            yield Ambiguity((governed or part).span, "scope", node.op)
+            return
+        *_, last = (None, *children(part))
+        if last is None or last.span.end < part.span.end:
+            return
+        governed = None if isinstance(part, ast.Logic | ast.Until) else governed or part
+        part = last

@@ -172,15 +172,11 @@ class Interval(Node):
     clock: Literal["now", "start"] = "now"
 
 
-UnaryTemporal: TypeAlias = Literal["always", "eventually", "once", "historically"]
-BinaryTemporal: TypeAlias = Literal["until", "release", "unless", "since"]
-
-
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
-    """`op[interval] body`; `interval` None: omitted, to the end of the trace."""
+    """`op[interval] body`; without an interval, to the end of the trace."""
 
-    op: UnaryTemporal
+    op: str
     interval: Interval | None
     body: Expr
     alias: str = field(default="", compare=False)
@@ -190,7 +186,7 @@ class Temporal(Node):
 class Until(Node):
     """`left op[interval] right`."""
 
-    op: BinaryTemporal
+    op: str
     interval: Interval | None
     left: Expr
     right: Expr

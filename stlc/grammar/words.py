@@ -4,30 +4,101 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from stlc.units import SYMBOLS
 
-UNARY_TEMPORAL = MappingProxyType(
-    {
-        "always": "always",
-        "globally": "always",
-        "alw": "always",
-        "G": "always",
-        "eventually": "eventually",
-        "finally": "eventually",
-        "ev": "eventually",
-        "F": "eventually",
-        "once": "once",
-        "historically": "historically",
-        "hist": "historically",
-    }
+
+@dataclass(frozen=True, slots=True)
+class TemporalOperator:
+    """Temporal operator: everything that the parser, printers, messages and editor know about it.
+
+    Attributes:
+        name: preferred spelling.
+        meaning: one sentence, for hover and completion.
+        english: phrase with the operands `{p}` and `{q}` and the window `{when}`; `{q}` makes it binary.
+        aliases: other spellings.
+        past: the window lies in the past.
+        mirror: operator of the other direction in time, for help.
+        expansion: equivalent formula of `p` and `q` without windows: each of its operators takes the window.
+    """
+
+    name: str
+    meaning: str
+    english: str
+    aliases: tuple[str, ...] = ()
+    past: bool = False
+    mirror: str = ""
+    expansion: str = ""
+
+
+TEMPORAL = (
+    TemporalOperator(
+        "always",
+        "`always[a, b] p`: p holds at every sample from a to b ahead.",
+        "at all times {when}: {p}",
+        aliases=("globally", "alw", "G"),
+        mirror="historically",
+    ),
+    TemporalOperator(
+        "eventually",
+        "`eventually[a, b] p`: p holds at some sample from a to b ahead.",
+        "at some time {when}: {p}",
+        aliases=("finally", "ev", "F"),
+        mirror="once",
+    ),
+    TemporalOperator(
+        "once",
+        "`once[a, b] p`: p held at some sample from a to b ago.",
+        "at some time {when}: {p}",
+        past=True,
+    ),
+    TemporalOperator(
+        "historically",
+        "`historically[a, b] p`: p held at every sample from a to b ago.",
+        "at all times {when}: {p}",
+        aliases=("hist",),
+        past=True,
+    ),
+    TemporalOperator(
+        "until",
+        "`p until[a, b] q`: q holds at some sample from a to b ahead, and p from now to it.",
+        "{p}, until {q}, which happens at some time {when}",
+        aliases=("U",),
+        mirror="since",
+    ),
+    TemporalOperator(
+        "release",
+        "`p release[a, b] q`: q holds from a to b ahead, except once p has held.",
+        "{q} at all times {when}, up to and with the time when {p}",
+    ),
+    TemporalOperator(
+        "unless",
+        "`p unless[a, b] q`: p holds from now to b ahead, or `p until[a, b] q`.",
+        "{p}, until {q}; that need not happen {when}",
+    ),
+    TemporalOperator(
+        "since",
+        "`p since[a, b] q`: q held at some sample from a to b ago, and p from there up to now.",
+        "{q} at some time {when}, and from then on {p}",
+        past=True,
+    ),
 )
+
+OPERATORS = MappingProxyType({operator.name: operator for operator in TEMPORAL})
+"""Name -> temporal operator."""
+
+
+def _spellings(*, binary: bool) -> MappingProxyType[str, str]:
+    found = (operator for operator in TEMPORAL if ("{q}" in operator.english) is binary)
+    return MappingProxyType({word: each.name for each in found for word in (each.name, *each.aliases)})
+
+
+UNARY_TEMPORAL = _spellings(binary=False)
 """Spelling of a temporal operator with one operand -> its name."""
 
-BINARY_TEMPORAL = MappingProxyType(
-    {"until": "until", "U": "until", "release": "release", "unless": "unless", "since": "since"}
-)
+BINARY_TEMPORAL = _spellings(binary=True)
 """Spelling of a temporal operator with two operands -> its name."""
 
 DECLARATIONS = ("require", "assume", "def", "const", "param", "signal", "region", "enum", "extern", "import")

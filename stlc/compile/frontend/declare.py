@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from stlc.compile.frontend.arithmetic import in_unit, on_scale, rebased
 from stlc.compile.frontend.coerce import Expectation, as_number
@@ -338,11 +339,12 @@ def declare(
     Args:
         spec: as parsed.
         interface: of the system, or None.
-        overrides: constant -> replacing value.
+        overrides: constant or parameter -> replacing value.
         scope: receives findings; its names are not read.
     """
-    found = Declared()
     _check_twice(spec, scope)
+    builder = _EntryBuilder(interface, overrides, scope)
+    found = builder.found
     for item in spec.items:
         if isinstance(item, ast.Enum):
             refuse_tags(item.tags, "an enum", scope)
@@ -354,7 +356,7 @@ def declare(
         if item.name in found.entries:
             continue
         try:
-            found.entries[item.name] = _entry(item, found, interface, overrides, scope)
+            found.entries[item.name] = _ENTRIES[type(item)](builder, item)
         except Failed:
             found.broken.add(item.name)
             found.entries[item.name] = Definition(
@@ -415,50 +417,65 @@ def _declare_enum(item: ast.Enum, found: Declared, scope: Scope) -> None:
             found.entries[name] = replace(known, about=about, span=item.name_span)
 
 
-def _entry(
-    item: ast.Item,
-    found: Declared,
-    interface: Interface | None,
-    overrides: Mapping[str, ast.Expr],
-    scope: Scope,
-) -> Entry:
-    about = f"{_keyword(item)}, declared at line {item.name_span.line}"
-    match item:
-        case ast.Param() if item.name in overrides:
-            check_type(item.type, found.enums, scope)
-            unit = declared_unit(item.unit, item, scope) if item.unit else None
-            return Definition(
-                item.name, overrides[item.name], (), unit, "constant", f"{about}, set", item.name_span
-            )
-        case ast.Signal() | ast.Param():
-            return _column_entry(item, found, interface, scope)
-        case ast.Const():
-            check_type(item.type, found.enums, scope)
-            unit = declared_unit(item.unit, item, scope) if item.unit else None
-            body = overrides.get(item.name, item.value)
-            return Definition(item.name, body, (), unit, "constant", about, item.name_span)
-        case ast.Region():
-            return Definition(item.name, item.value, sort="region", about=about, span=item.name_span)
-        case ast.Def():
-            return _macro(item, about, found, scope)
-        case ast.Extern():
-            return external(item, interface, about, scope)
-        case _:
-            raise AssertionError("enums and requirements are no values")
+@dataclass(frozen=True, slots=True)
+class _EntryBuilder:
+    """Builder of name-table entries of one file, a method for each class of declarations."""
+
+    interface: Interface | None
+    overrides: Mapping[str, ast.Expr]
+    scope: Scope
+    found: Declared = field(default_factory=Declared)
+
+    def column(self, item: ast.Signal | ast.Param) -> Known:
+        columns = columns_of(item, self.found.enums, self.interface, self.scope)
+        unit = declared_unit(item.unit, item, self.scope)
+        self.found.columns.append((item, columns, unit))
+        role = f"{item.role} " if isinstance(item, ast.Signal) and item.role else ""
+        about = role + _about(item)
+        if self.interface is not None and columns[0].name in self.interface.signature:
+            about += f"; also a state of {self.interface.where}"
+        (entry,) = column_entries(columns, about=about, span=item.name_span).values()
+        return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry
+
+    def parameter(self, item: ast.Param) -> Entry:
+        if item.name not in self.overrides:
+            return self.column(item)
+        entry = self.constant(item, self.overrides[item.name])
+        return replace(entry, about=f"{entry.about}, set")
+
+    def constant(self, item: ast.Const | ast.Param, body: ast.Expr) -> Definition:
+        check_type(item.type, self.found.enums, self.scope)
+        unit = declared_unit(item.unit, item, self.scope) if item.unit else None
+        return Definition(item.name, body, (), unit, "constant", _about(item), item.name_span)
+
+    def region(self, item: ast.Region) -> Definition:
+        return Definition(item.name, item.value, sort="region", about=_about(item), span=item.name_span)
+
+    def macro(self, item: ast.Def) -> Definition:
+        for written in (item.type, *(formal.type for formal in item.formals)):
+            check_type(written, self.found.enums, self.scope)
+        names = tuple(formal.name for formal in item.formals)
+        if len(set(names)) < len(names):
+            message = f"two arguments of `{item.name}` have one name"
+            self.scope.fail(Diagnostic("E102", message, item.name_span))
+        sized = item.type is not None and item.type.size is not None
+        sort: Sort = "any" if item.type is None or sized else _SORTS.get(item.type.name, "any")
+        return Definition(item.name, item.value, names, None, sort, _about(item), item.name_span)
 
 
-def _column_entry(
-    item: ast.Signal | ast.Param, found: Declared, interface: Interface | None, scope: Scope
-) -> Known:
-    columns = columns_of(item, found.enums, interface, scope)
-    unit = declared_unit(item.unit, item, scope)
-    found.columns.append((item, columns, unit))
-    role = f"{item.role} signal" if isinstance(item, ast.Signal) and item.role else _keyword(item)
-    about = f"{role}, declared at line {item.name_span.line}"
-    if interface is not None and columns[0].name in interface.signature:
-        about += f"; also a state of {interface.where}"
-    (entry,) = column_entries(columns, about=about, span=item.name_span).values()
-    return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry
+_ENTRIES: Mapping[type, Callable[[_EntryBuilder, Any], Entry]] = {
+    ast.Signal: _EntryBuilder.column,
+    ast.Param: _EntryBuilder.parameter,
+    ast.Const: lambda builder, item: builder.constant(item, builder.overrides.get(item.name, item.value)),
+    ast.Region: _EntryBuilder.region,
+    ast.Def: _EntryBuilder.macro,
+    ast.Extern: lambda builder, item: external(item, builder.interface, _about(item), builder.scope),
+}
+"""Class of declarations -> its entry in the name table."""
+
+
+def _about(item: ast.Item) -> str:
+    return f"{_keyword(item)}, declared at line {item.name_span.line}"
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
@@ -466,15 +483,3 @@ def _read_in(value: Value, unit: Unit) -> Value:
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value
-
-
-def _macro(item: ast.Def, about: str, found: Declared, scope: Scope) -> Definition:
-    check_type(item.type, found.enums, scope)
-    for formal in item.formals:
-        check_type(formal.type, found.enums, scope)
-    names = tuple(formal.name for formal in item.formals)
-    if len(set(names)) < len(names):
-        scope.fail(Diagnostic("E102", f"two arguments of `{item.name}` have one name", item.name_span))
-    sized = item.type is not None and item.type.size is not None
-    sort: Sort = "any" if item.type is None or sized else _SORTS.get(item.type.name, "any")
-    return Definition(item.name, item.value, names, None, sort, about, item.name_span)

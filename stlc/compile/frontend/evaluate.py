@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from stlc.compile.frontend import comparisons
 from stlc.compile.frontend import intervals as moments
@@ -36,13 +36,16 @@ from stlc.compile.frontend.values import (
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.functions import OPERATORS
+from stlc.compile.ir.functions import OPERATORS as ARITHMETIC
 from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.traverse import children, descendants
+from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
 from stlc.registry import closest
 from stlc.signature import Kind
-from stlc.source import Span
+from stlc.source import Source, Span
 from stlc.units import nearest, parse_unit
 
 
@@ -229,7 +232,7 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
             sides.append(as_number(value, side, Expectation(who, f"the {which} side"), scope))
     place = comparisons.sign_span(expr.op, expr.left.span, expr.right.span)
     _refuse_products(expr, sides, place, scope)
-    return broadcast(OPERATORS[expr.op], sides, place if expr.op in "+-%" else expr.span, scope)
+    return broadcast(ARITHMETIC[expr.op], sides, place if expr.op in "+-%" else expr.span, scope)
 
 
 def _refuse_products(
@@ -307,26 +310,11 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
     try:
         _refuse_excess(expr.span, scope)
         value = _value(expr, scope)
-        if _is_written_twice(expr, value):
+        if type(expr) in _REPEATS and _REPEATS[type(expr)](expr, value):
             _charge(Cost(meter.nodes - before), expr.span, scope)
         return at(value, expr.span)
     finally:
         meter.leave()
-
-
-def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
-    """True if an expansion duplicates operands: `a <-> b` is `a -> b` and `b -> a`."""
-    match expr:
-        case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
-            return True
-        case ast.IfThenElse():
-            return is_formula(value)
-        case ast.Compare():
-            return isinstance(value, typed.Logic)
-        case ast.Call():
-            return isinstance(value, typed.Edge)
-        case _:
-            return False
 
 
 def _value(expr: ast.Expr, scope: Scope) -> Value:
@@ -568,9 +556,41 @@ def _timed(
         window = moments.interval(expr.interval, bounds, expr.op, place, body, scope)
     finally:
         inner = formulas(operands, scope)
-    if isinstance(expr, ast.Temporal):
-        return typed.Temporal(expr.span, expr.op, window, inner[0])
-    return typed.Until(expr.span, expr.op, window, inner[0], inner[1])
+    return _timed_node(_expansion(expr.op), dict(zip("pq", inner, strict=False)), window, expr.span)
+
+
+@cache
+def _expansion(op: str) -> ast.Expr:
+    """Return the formula of `p` and `q` that defines a temporal operator, without windows."""
+    plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
+    return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))
+
+
+@cache
+def _repeats_operand(op: str) -> bool:
+    """True if the meaning of a temporal operator has an operand twice; `unless` is expanded later."""
+    names = [node.name for node in descendants(_expansion(op)) if isinstance(node, ast.Name)]
+    return op == "unless" or len(names) > len(set(names))
+
+
+def _timed_node(
+    pattern: ast.Node, operands: Mapping[str, typed.Formula], window: typed.Interval, span: Span
+) -> typed.Formula:
+    """Return an expansion with its operands, and with the window for each of its temporal operators."""
+    if isinstance(pattern, ast.Name):
+        return operands[pattern.name]
+    inner = [_timed_node(part, operands, window, span) for part in children(pattern)]
+    match pattern:
+        case ast.Temporal(op=op):
+            return typed.Temporal(span, cast("typed.UnaryTemporal", op), window, *inner)
+        case ast.Until(op=op):
+            return typed.Until(span, cast("typed.BinaryTemporal", op), window, *inner)
+        case ast.Logic(op=op):
+            return typed.Logic(span, op, tuple(inner))
+        case ast.Not():
+            return typed.Not(span, *inner)
+        case _:
+            raise AssertionError("an expansion consists of connectives and temporal operators")
 
 
 def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
@@ -657,3 +677,15 @@ _HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxy
         ast.Freeze: _freeze,
     }
 )
+
+_REPEATS: Mapping[type[ast.Node], Callable[[Any, Value], bool]] = MappingProxyType(
+    {
+        ast.Logic: lambda expr, _: expr.op in ("<->", "xor"),
+        ast.Temporal: lambda expr, _: _repeats_operand(expr.op),
+        ast.Until: lambda expr, _: _repeats_operand(expr.op),
+        ast.IfThenElse: lambda _, value: is_formula(value),
+        ast.Compare: lambda _, value: isinstance(value, typed.Logic),
+        ast.Call: lambda _, value: isinstance(value, typed.Edge),
+    }
+)
+"""Class of expressions -> whether their expansion has operands twice: `a <-> b` is `a -> b` and `b -> a`."""

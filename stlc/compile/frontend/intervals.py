@@ -11,12 +11,11 @@ from stlc.compile.frontend.values import Number, Operand, TimeExpr, Value, noun
 from stlc.compile.ir import typed
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar import ast
+from stlc.grammar.words import OPERATORS, UNARY_TEMPORAL
 from stlc.source import Span
 from stlc.units import SYMBOLS, parse_unit
 
 _SECOND = SYMBOLS["s"]
-_PAST = ("once", "historically", "since")
-_MIRROR = {"always": "historically", "eventually": "once"}
 
 
 def time_word(name: str, span: Span) -> TimeExpr:
@@ -210,15 +209,15 @@ def _reversed(node: ast.Interval) -> Diagnostic:
 def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], body: ast.Expr) -> Diagnostic:
     low, high = ends
     bound = node.lo if _sign(low) < 0 else node.hi
-    if name in _PAST:
+    if OPERATORS[name].past:
         help_ = (f"bounds of `{name}` count backwards already: write them without the sign",)
         return Diagnostic(
             "E302", "a bound of a past operator is a length of time, never negative", bound.span, help=help_
         )
-    mirror = _MIRROR.get(name, "since" if name == "until" else "")
+    mirror = OPERATORS[name].mirror
     plain = all(not end.end and _sign(end) <= 0 for end in ends)
     hints: tuple[str, ...] = ()
-    if mirror and plain and name != "until":
+    if mirror and plain and name in UNARY_TEMPORAL:
         near, far = _shown(high, node.hi), _shown(low, node.lo)
         hints = (f"{mirror}[{near}, {far}] {body.span.text}   looks back",)
     elif mirror:

@@ -104,11 +104,15 @@ class Logic(Node):
     items: tuple[Formula, ...]
 
 
+UnaryTemporal: TypeAlias = Literal["always", "eventually", "once", "historically"]
+BinaryTemporal: TypeAlias = Literal["until", "release", "unless", "since"]
+
+
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
     """Temporal operator with one operand."""
 
-    op: ast.UnaryTemporal
+    op: UnaryTemporal
     interval: Interval
     body: Formula
 
@@ -117,7 +121,7 @@ class Temporal(Node):
 class Until(Node):
     """Temporal operator with two operands."""
 
-    op: ast.BinaryTemporal
+    op: BinaryTemporal
     interval: Interval
     left: Formula
     right: Formula

@@ -12,7 +12,7 @@ from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.parse.builder import near_unit
 from stlc.grammar.scan import Lexeme, brackets, closes
-from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, ROLES, UNARY_TEMPORAL
+from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
 from stlc.units import CELSIUS, means_celsius
@@ -87,7 +87,7 @@ def misspelt_operator(failure: ParseFailure) -> Diagnostic | None:
 
 
 _OPERATORS = (
-    *("always", "eventually", "once", "historically", "until", "release", "unless", "since"),
+    *OPERATORS,
     *("and", "or", "xor", "not", "implies", "forall", "exists", "freeze", "then", "else"),
 )
 _NEAR_BY, _LEAST_LETTERS = 4, 3

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from stlc.grammar.scan import Bracket, Lexeme, brackets, lexemes
+from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Source, Span
 
 
@@ -152,5 +153,5 @@ _OPENERS = ("(", "[", "{")
 _CLOSERS = (")", "]", "}")
 _LOOSE = frozenset(
     {"and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "<->", "<=>", "iff"}
-    | {":", "=", ",", ";", "then", "else", "if", "until", "U", "release", "unless", "since"}
+    | {":", "=", ",", ";", "then", "else", "if", *BINARY_TEMPORAL}
 )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import assert_never
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
 
 from stlc.grammar import ast
 from stlc.grammar.show.printer import show_expr, show_set
 from stlc.grammar.traverse import descendants
+from stlc.grammar.words import OPERATORS
 
 _EDGES = {"rise": "{} becomes true", "fall": "{} becomes false"}
 _OPENINGS = frozenset({"at", "if", "for", "let", "it", "either", "nothing"})
@@ -78,23 +81,7 @@ def _is_formula(expr: ast.Expr) -> bool:
 
 def say(expr: ast.Expr) -> str:
     """Return an expression in words."""
-    match expr:
-        case ast.Temporal() | ast.Until():
-            return _temporal(expr)
-        case ast.Logic() | ast.Not():
-            return _logic(expr)
-        case ast.Compare() | ast.Member():
-            return _atom(expr)
-        case ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
-            return _binder(expr)
-        case ast.Call(func=ast.Name(name=name), args=(ast.Arg(value=body),)) if name in _EDGES:
-            return _EDGES[name].format(show_expr(body))
-        case ast.Bool(value=value):
-            return "nothing is demanded" if value else "nothing can satisfy this"
-        case ast.Name(name=name):
-            return f"{name} holds"
-        case _:
-            return show_expr(expr)
+    return _SAID.get(type(expr), show_expr)(expr)
 
 
 def _inner(expr: ast.Expr) -> str:
@@ -102,32 +89,22 @@ def _inner(expr: ast.Expr) -> str:
     return f"({say(expr)})" if isinstance(expr, ast.Logic | ast.Until) else say(expr)
 
 
-# ------------------------------------------------------------------------------ time
+def _call(expr: ast.Call) -> str:
+    match expr:
+        case ast.Call(func=ast.Name(name=name), args=(ast.Arg(value=body),)) if name in _EDGES:
+            return _EDGES[name].format(show_expr(body))
+        case _:
+            return show_expr(expr)
 
-_ALWAYS = {"always": "at all times", "historically": "at all times"}
-_SOMETIMES = {"eventually": "at some time", "once": "at some time"}
+
+# ------------------------------------------------------------------------------ time
 
 
 def _temporal(expr: ast.Temporal | ast.Until) -> str:
-    when = _when(expr.interval, past=expr.op in ("once", "historically", "since"))
-    match expr:
-        case ast.Temporal(op=op, body=body):
-            return f"{({**_ALWAYS, **_SOMETIMES})[op]} {when}: {_inner(body)}"
-        case ast.Until(op=op, left=left, right=right):
-            one, other = _inner(left), _inner(right)
-            match op:
-                case "until":
-                    return f"{one}, until {other}, which happens at some time {when}"
-                case "unless":
-                    return f"{one}, until {other}; that need not happen {when}"
-                case "release":
-                    return f"{other} at all times {when}, up to and with the time when {one}"
-                case "since":
-                    return f"{other} at some time {when}, and from then on {one}"
-                case _:
-                    assert_never(op)
-        case _:
-            assert_never(expr)
+    operator = OPERATORS[expr.op]
+    operands = (expr.body,) if isinstance(expr, ast.Temporal) else (expr.left, expr.right)
+    said = dict(zip("pq", map(_inner, operands), strict=False))
+    return operator.english.format(when=_when(expr.interval, past=operator.past), **said)
 
 
 def _when(interval: ast.Interval | None, *, past: bool) -> str:
@@ -153,25 +130,15 @@ def _ends(interval: ast.Interval) -> list[str]:
 # ----------------------------------------------------------------------------- logic
 
 
-def _logic(expr: ast.Logic | ast.Not) -> str:
-    match expr:
-        case ast.Not(operand=operand):
-            return f"it is not so that {_inner(operand)}"
-        case ast.Logic(op=op, left=left, right=right):
-            if op == "->":
-                return f"if {say(left)}, then {say(right)}"
-            one, other = _side(left, op), _side(right, op)
-            match op:
-                case "and" | "or":
-                    return f"{one}, {op} {other}" if "," in one or ":" in one else f"{one} {op} {other}"
-                case "xor":
-                    return f"either {one} or {other}, not both"
-                case "<->":
-                    return f"{one} exactly when {other}"
-                case _:
-                    assert_never(op)
-        case _:
-            assert_never(expr)
+def _logic(expr: ast.Logic) -> str:
+    if expr.op == "->":
+        return f"if {say(expr.left)}, then {say(expr.right)}"
+    one, other = _side(expr.left, expr.op), _side(expr.right, expr.op)
+    if expr.op == "xor":
+        return f"either {one} or {other}, not both"
+    if expr.op == "<->":
+        return f"{one} exactly when {other}"
+    return f"{one}, {expr.op} {other}" if "," in one or ":" in one else f"{one} {expr.op} {other}"
 
 
 def _side(expr: ast.Expr, op: str) -> str:
@@ -179,39 +146,57 @@ def _side(expr: ast.Expr, op: str) -> str:
     return say(expr) if isinstance(expr, ast.Logic) and expr.op == op else _inner(expr)
 
 
-def _atom(expr: ast.Compare | ast.Member) -> str:
+def _compare(expr: ast.Compare) -> str:
     match expr:
         case ast.Compare(operands=(left, right), ops=(op,)) if op in _EQUAL:
             return f"{show_expr(left)} {_EQUAL[op]} {show_expr(right)}"
-        case ast.Compare():
+        case _:
             return show_expr(expr)
-        case ast.Member(item=item, region=region, negated=negated):
-            verb = "is not" if negated else "is"
-            match region:
-                case ast.SetLiteral():
-                    place = f"one of {show_set(region)}"
-                case ast.Vector(items=(low, high)):
-                    place = f"between {show_expr(low)} and {show_expr(high)}"
-                case _:
-                    place = f"in {show_expr(region)}"
-            return f"{show_expr(item)} {verb} {place}"
-        case _:
-            assert_never(expr)
 
 
-def _binder(expr: ast.Quantifier | ast.Freeze | ast.IfThenElse) -> str:
-    match expr:
-        case ast.Quantifier(kind=kind, var=var, domain=domain, body=body):
-            every = "every" if kind == "forall" else "some"
-            if isinstance(domain, ast.SetLiteral):
-                values = show_set(domain)
-            else:
-                values = f"{show_expr(domain[0])} to {show_expr(domain[1])}"
-            return f"for {every} {var} in {values}: {_inner(body)}"
-        case ast.Freeze(bindings=bindings, body=body):
-            names = ", ".join(f"{name} be {show_expr(value)} as it is now" for name, value in bindings)
-            return f"let {names}: {_inner(body)}"
-        case ast.IfThenElse(cond=cond, yes=yes, no=no):
-            return f"if {say(cond)}, then {_inner(yes)}, otherwise {_inner(no)}"
+def _member(expr: ast.Member) -> str:
+    match expr.region:
+        case ast.SetLiteral():
+            place = f"one of {show_set(expr.region)}"
+        case ast.Vector(items=(low, high)):
+            place = f"between {show_expr(low)} and {show_expr(high)}"
         case _:
-            assert_never(expr)
+            place = f"in {show_expr(expr.region)}"
+    return f"{show_expr(expr.item)} {'is not' if expr.negated else 'is'} {place}"
+
+
+# --------------------------------------------------------------------------- binders
+
+
+def _quantifier(expr: ast.Quantifier) -> str:
+    every = "every" if expr.kind == "forall" else "some"
+    if isinstance(expr.domain, ast.SetLiteral):
+        values = show_set(expr.domain)
+    else:
+        values = " to ".join(map(show_expr, expr.domain))
+    return f"for {every} {expr.var} in {values}: {_inner(expr.body)}"
+
+
+def _freeze(expr: ast.Freeze) -> str:
+    names = ", ".join(f"{name} be {show_expr(value)} as it is now" for name, value in expr.bindings)
+    return f"let {names}: {_inner(expr.body)}"
+
+
+_SAID: Mapping[type, Callable[[Any], str]] = MappingProxyType(
+    {
+        **dict.fromkeys((ast.Temporal, ast.Until), _temporal),
+        ast.Logic: _logic,
+        ast.Not: lambda expr: f"it is not so that {_inner(expr.operand)}",
+        ast.Compare: _compare,
+        ast.Member: _member,
+        ast.Quantifier: _quantifier,
+        ast.Freeze: _freeze,
+        ast.IfThenElse: lambda expr: (
+            f"if {say(expr.cond)}, then {_inner(expr.yes)}, otherwise {_inner(expr.no)}"
+        ),
+        ast.Call: _call,
+        ast.Bool: lambda expr: "nothing is demanded" if expr.value else "nothing can satisfy this",
+        ast.Name: lambda expr: f"{expr.name} holds",
+    }
+)
+"""Class of expressions -> its text in words; other expressions are shown as written."""
