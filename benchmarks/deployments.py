@@ -17,9 +17,8 @@ from benchmarks.options import Output, ResultsOption, TrainedOption
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
 from benchmarks.table import Table, listed, publish
 from benchmarks.training import Place, benchmark_order
-from stlc.cli.framework.options import SeedsOption
+from stlc.cli.framework.options import SeedsOption, parse_limit, parse_seeds
 from stlc.cli.framework.output import say
-from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed

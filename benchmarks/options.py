@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SeedsOption
-from stlc.cli.framework.ranges import parse_clock, parse_seconds, parse_seeds
+from stlc.cli.framework.options import JsonOption, SeedsOption, parse_clock, parse_seconds, parse_seeds
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
 

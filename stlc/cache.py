@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from stlc.diagnostics import Diagnostic, notice
+from stlc.diagnostics import Diagnostic, notice, os_reason
 from stlc.stopping import undoing
 
 MOST_BYTES = 256_000_000
@@ -199,7 +199,7 @@ def private(path: Path) -> Cache:
             return Cache(path, path)
         return Cache(path, _looked_at(path))
     except OSError as error:
-        raise Unusable(f"cannot be used: {(error.strerror or type(error).__name__).lower()}") from error
+        raise Unusable(f"cannot be used: {os_reason(error)}") from error
     except ValueError as error:  # a zero byte in the name
         raise Unusable("cannot be used: it is no name of a folder") from error
 

@@ -127,6 +127,11 @@ class UsageError(StlcError):
     exit_code = 2
 
 
+def usage(message: str, *advice: str) -> UsageError:
+    """The error U101, a wrong command line, with a message and advice."""
+    return UsageError(Diagnostic("U101", message, help=advice))
+
+
 class MissingError(StlcError):
     """The environment lacks something: a package, a compiler, room on the disk."""
 
@@ -139,6 +144,11 @@ class Notice(UserWarning):
     def __init__(self, finding: Diagnostic) -> None:
         super().__init__(": ".join((finding.code, "; ".join((finding.message, *finding.help)))))
         self.finding = finding
+
+
+def os_reason(error: OSError) -> str:
+    """The reason of a system error in lower case, such as `permission denied`."""
+    return (error.strerror or type(error).__name__).lower()
 
 
 def notice(finding: Diagnostic) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError
+from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, os_reason
 from stlc.registry import closest
 from stlc.source import Source
 from stlc.stopping import leaving
@@ -44,7 +44,7 @@ def read_source(path: Path | str) -> Source:
     except FileNotFoundError:
         raise UsageError(_missing(path)) from None
     except OSError as error:
-        raise UsageError(Diagnostic("U102", f"cannot read `{name}`: {_reason(error)}")) from None
+        raise UsageError(Diagnostic("U102", f"cannot read `{name}`: {os_reason(error)}")) from None
     except ValueError:  # a zero byte in the name
         raise UsageError(Diagnostic("U102", f"no file can be called {name!r}")) from None
     return _decode(name, data)
@@ -60,10 +60,6 @@ def _siblings(folder: Path) -> list[str]:
     with suppress(OSError):
         return sorted(entry.name for entry in folder.iterdir() if entry.is_file())
     return []
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or type(error).__name__).lower()
 
 
 def _decode(name: str, data: bytes) -> Source:
@@ -138,15 +134,16 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     target = path.resolve()
     if target.exists() and not target.is_file() and not target.is_dir():
-        with _reported(path):
+        with reported(f"write `{path}`"):
             yield target
         return
     temporary = target.with_name(f".{target.stem}.{os.urandom(4).hex()}{target.suffix}")
     try:
-        with _reported(path), leaving(lambda _code: temporary.unlink(missing_ok=True)):
+        with reported(f"write `{path}`"), leaving(lambda _code: temporary.unlink(missing_ok=True)):
             target.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-            _flush(temporary)
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
             temporary.replace(target)
     finally:
         with suppress(OSError):
@@ -154,16 +151,12 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 @contextmanager
-def _reported(path: Path) -> Iterator[None]:
+def reported(action: str) -> Iterator[None]:
+    """Turn a system error within the block into R201: "cannot " and the action, such as "write `a.json`"."""
     try:
         yield
     except OSError as error:
-        raise MissingError(Diagnostic("R201", f"cannot write `{path}`: {_reason(error)}")) from error
-
-
-def _flush(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
+        raise MissingError(Diagnostic("R201", f"cannot {action}: {os_reason(error)}")) from error
 
 
 # ----------------------------------------------------------------------- finding

@@ -37,6 +37,12 @@ def closest(name: str, candidates: Iterable[str]) -> str | None:
     return best if best is not None and _ratio(folded, best.casefold()) >= _SIMILAR else None
 
 
+def did_you_mean(name: str, candidates: Iterable[str], *otherwise: str) -> tuple[str, ...]:
+    """Advice that names the candidate nearest to a misspelt `name`, else `otherwise`."""
+    near = closest(name, candidates)
+    return otherwise if near is None else (f"did you mean `{near}`?",)
+
+
 def _ratio(left: str, right: str) -> float:
     return SequenceMatcher(None, left, right).ratio()
 

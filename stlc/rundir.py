@@ -19,11 +19,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from stlc.diagnostics import Diagnostic, MissingError, RunError, UsageError
+from stlc.diagnostics import Diagnostic, RunError, UsageError, usage
 from stlc.escape import file_part, shell
-from stlc.files import write_atomic
+from stlc.files import reported, write_atomic
 from stlc.jsontext import dumps
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 
 Status = Literal["running", "finished", "interrupted", "failed"]
 
@@ -69,14 +69,11 @@ class RunDir:
         """
         words = _checked(words) if words is not None else draw_words()
         home = root / _slug(spec_name)
-        try:
+        with reported(f"make a run below `{root}`"):
             home.mkdir(parents=True, exist_ok=True)
             path = _reserve(home, words)
             _point(home / LATEST, path.name)
             _point(root / LATEST, f"{home.name}/{path.name}")
-        except OSError as error:
-            reason = (error.strerror or type(error).__name__).lower()
-            raise MissingError(Diagnostic("R201", f"cannot make a run below `{root}`: {reason}")) from error
         return cls(path)
 
     @classmethod
@@ -91,13 +88,8 @@ class RunDir:
             return cls(linked.resolve())
         runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
         if not runs:
-            raise UsageError(
-                Diagnostic(
-                    "R101",
-                    f"there is no run in `{root}`",
-                    help=("train one: stlc train specs/traffic.stl --system car.yaml",),
-                )
-            )
+            help_ = ("train one: stlc train specs/traffic.stl --system car.yaml",)
+            raise UsageError(Diagnostic("R101", f"there is no run in `{root}`", help=help_))
         return runs[-1]
 
     @classmethod
@@ -198,13 +190,9 @@ class RunDir:
         An incomplete last line, left by a kill, is removed first.
         """
         data = (dumps(row) + "\n").encode()
-        try:
-            with (self.path / name).open("ab+") as file:
-                _drop_torn_line(file.fileno())
-                os.write(file.fileno(), data)
-        except OSError as error:
-            reason = (error.strerror or type(error).__name__).lower()
-            raise MissingError(Diagnostic("R201", f"cannot write `{self.shown}/{name}`: {reason}")) from error
+        with reported(f"write `{self.shown}/{name}`"), (self.path / name).open("ab+") as file:
+            _drop_torn_line(file.fileno())
+            os.write(file.fileno(), data)
 
     def rows(self, name: str = ROWS) -> list[dict[str, Any]]:
         """The rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
@@ -244,11 +232,8 @@ def remove_run(run: RunDir) -> None:
         MissingError: R201, it cannot be deleted.
     """
     home = run.path.parent
-    try:
+    with reported(f"remove `{run.shown}`"):
         shutil.rmtree(run.path)
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise MissingError(Diagnostic("R201", f"cannot remove `{run.shown}`: {reason}")) from error
     runs = every_run(home.parent)
     for folder in (home, home.parent):
         link = folder / LATEST
@@ -280,10 +265,8 @@ def _by_name(where: str, root: Path) -> RunDir:
     if fitting:
         choices = tuple(f"{run.path.parent.name}/{run.name}" for run in fitting)
         raise UsageError(Diagnostic("R101", f"several runs are called `{where}`", help=choices))
-    near = closest(
-        where, {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
-    )
-    advice = (f"did you mean `{near}`?",) if near else ()
+    names = {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
+    advice = did_you_mean(where, names)
     raise UsageError(Diagnostic("R101", f"there is no run `{where}` in `{root}`", help=advice))
 
 
@@ -324,11 +307,7 @@ def _slug(name: str) -> str:
 
 def _checked(words: str) -> str:
     if _slug(words) != words or words == LATEST:
-        raise UsageError(
-            Diagnostic(
-                "U101", f"`{words}` cannot name a run", help=("use letters, digits, `-`, `_` and `.`",)
-            )
-        )
+        raise usage(f"`{words}` cannot name a run", "use letters, digits, `-`, `_` and `.`")
     return words
 
 

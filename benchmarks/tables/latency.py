@@ -20,9 +20,8 @@ from benchmarks.deployments import GUARDS, sampled_states
 from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import Times, after_warm_up, one_thread
-from stlc.cli.framework.options import SeedsOption
+from stlc.cli.framework.options import SeedsOption, parse_seeds
 from stlc.cli.framework.program import command
-from stlc.cli.framework.ranges import parse_seeds
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard

@@ -16,9 +16,8 @@ from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.repairs import Mended, repairs
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import one_thread
-from stlc.cli.framework.options import SeedsOption
+from stlc.cli.framework.options import SeedsOption, parse_seeds
 from stlc.cli.framework.program import command
-from stlc.cli.framework.ranges import parse_seeds
 from stlc.controller.training.run import Run
 
 TEXT = """## Repair of a plan

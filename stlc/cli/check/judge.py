@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from stlc.cli.framework.output import ColorMode
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.escape import operand
 from stlc.files import find_spec, read_source
 from stlc.source import Source
@@ -82,24 +82,6 @@ class Work:
     chunk: int = 0
     color: bool = False
     mode: ColorMode = "never"
-
-
-def usage(message: str, *advice: str) -> UsageError:
-    """The error U101 with a message and advice."""
-    return UsageError(Diagnostic("U101", message, help=advice))
-
-
-def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
-    """`["x=px"]` as `{"x": "px"}`. Raises UsageError (U101) for any other form."""
-    names: dict[str, str] = {}
-    for pair in pairs or ():
-        signal, sign, name = (part.strip() for part in pair.partition("="))
-        if not (signal and sign and name):
-            raise usage(f"`--map {pair}` is not of the form SIGNAL=NAME", "write it as --map v_lead=vlead")
-        if signal in names:
-            raise usage(f"`--map {signal}=…` is given twice")
-        names[signal] = name
-    return names
 
 
 def found(name: str, runs: Path) -> Path:

@@ -12,7 +12,7 @@ from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
 from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
-from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.diagnostics import StlcError, usage
 from stlc.stopping import leaving
 
 SMALL = 1_000_000
@@ -155,7 +155,7 @@ def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
         return [out]
     if out.suffix:
         message = f"`--out {out}` is one file, and {len(names)} traces are judged"
-        raise UsageError(Diagnostic("U101", message, help=("name a folder: --out robustness/",)))
+        raise usage(message, "name a folder: --out robustness/")
     stems = [Path(name).stem for name in names]
     if len(set(stems)) < len(stems):
         stems = [f"{i:04d}-{stem}" for i, stem in enumerate(stems)]

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.cli.check.document import requirement_record, trace_record
-from stlc.cli.check.judge import Question, Work, instant_of, monitor_of, reading_options, specification, usage
+from stlc.cli.check.judge import Question, Work, instant_of, monitor_of, reading_options, specification
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow
 from stlc.cli.check.text import in_unit, percent, robustness_text, signed, text_of
 from stlc.cli.framework.documents import CheckedRequirement
 from stlc.cli.framework.output import emit, wants_color
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.escape import visible
 from stlc.files import find_spec, read_source
 from stlc.monitor.judgement import beside

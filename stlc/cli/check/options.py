@@ -8,8 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.check.judge import End, Question, names_of, time_step
-from stlc.cli.framework.options import RequireOption, RunsOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.check.judge import End, Question, time_step
+from stlc.cli.framework.options import (
+    RequireOption,
+    RunsOption,
+    SetOption,
+    SystemOption,
+    parse_overrides,
+    parse_pairs,
+)
 from stlc.registry import SEMANTICS
 
 Files = Annotated[
@@ -81,7 +88,7 @@ class Traces:
         asked = {
             "spec": self.spec,
             "system": self.system,
-            "names": names_of(self.map_),
+            "names": parse_pairs(self.map_, "--map", "SIGNAL=NAME", "v_lead=vlead"),
             "require": tuple(self.require or ()),
             "resample": time_step("--resample", self.resample),
             "overrides": parse_overrides(self.set_),

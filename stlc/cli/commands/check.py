@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import Work, usage
+from stlc.cli.check.judge import Work
 from stlc.cli.framework.documents import CheckResult
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
+from stlc.diagnostics import usage
 from stlc.files import write_atomic
 
 if TYPE_CHECKING:

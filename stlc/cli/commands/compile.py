@@ -43,13 +43,13 @@ def compile_(
     syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc lint` also names, types
     and units.
     """
-    from stlc.diagnostics import Diagnostic, UsageError
+    from stlc.diagnostics import usage
 
     if show == "ast" or show == "dot":
         return _trees(spec_files(files), show)
     if len(files) > 1:
-        help_ = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")
-        raise UsageError(Diagnostic("U101", "one specification is compiled at a time", help=help_))
+        advice = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")
+        raise usage("one specification is compiled at a time", *advice)
     spec = Path(files[0])
     if not watch:
         return _compiled(spec, system, set_, show)
@@ -115,7 +115,7 @@ def _compiled(
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
-    from stlc.diagnostics import Diagnostic, UsageError
+    from stlc.diagnostics import usage
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
@@ -126,7 +126,7 @@ def _compiled(
     wanted = system or spec.system
     if wanted is None:
         help_ = (f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification')
-        raise UsageError(Diagnostic("U101", f"`{path}` names no system", help=help_))
+        raise usage(f"`{path}` names no system", *help_)
     decl = load_system_decl(find_system(wanted, path), overrides)
     purpose: Purpose = "check" if decl.judges_by(path) else "train"
     grid = Grid(decl.dt, decl.horizon)

@@ -16,8 +16,8 @@ from stlc.cli.framework import documents
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, Diagnostic, UsageError
-from stlc.registry import closest
+from stlc.diagnostics import CODES, usage
+from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
     from stlc.controller.guard.coverage import Axis, Chance
@@ -77,9 +77,8 @@ def explain(
 
 def _code(code: str) -> str:
     if code not in CODES:
-        near = closest(code, CODES)
-        advice = (f"did you mean `{near}`?",) if near else ("stlc explain  lists the codes",)
-        raise UsageError(Diagnostic("U101", f"there is no code `{code}`", help=advice))
+        advice = did_you_mean(code, CODES, "stlc explain  lists the codes")
+        raise usage(f"there is no code `{code}`", *advice)
     return code
 
 
@@ -111,9 +110,8 @@ def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
     items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
     for one in wanted:
         if one not in [item.name for item in items]:
-            near = closest(one, [item.name for item in items])
-            advice = (f"did you mean `{near}`?",) if near else ()
-            raise UsageError(Diagnostic("U101", f"`{name}` has no requirement `{one}`", help=advice))
+            advice = did_you_mean(one, [item.name for item in items])
+            raise usage(f"`{name}` has no requirement `{one}`", *advice)
     meanings = Meanings(spec)
     found: list[documents.RequirementInWords] = [
         {

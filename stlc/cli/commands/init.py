@@ -13,10 +13,10 @@ import typer
 from stlc.cli.framework.documents import CreatedFiles
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import operand, shell, visible
 from stlc.files import SPECS, SYSTEMS, write_atomic
-from stlc.registry import closest
+from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -73,9 +73,9 @@ def init(
     folders exist.
     """
     if sum(given is not None for given in (example, spec, system)) > 1:
-        raise UsageError(Diagnostic("U101", "`--example`, `--spec` and `--system` contradict each other"))
+        raise usage("`--example`, `--spec` and `--system` contradict each other")
     if from_ is not None and spec is None:
-        raise UsageError(Diagnostic("U101", "`--from` needs `--spec NAME`"))
+        raise usage("`--from` needs `--spec NAME`")
     if spec is not None:
         files, following = _specification(folder, spec, from_)
     elif system is not None:
@@ -135,9 +135,7 @@ def _example_files(name: str) -> dict[str, str]:
     """An installed system, its dependencies and its specifications: path within the project -> text."""
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
-        near = closest(name, examples())
-        advice = (f"did you mean `{near}`?",) if near else ()
-        note = (f"there are {', '.join(examples())}",)
+        advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
         raise UsageError(Diagnostic("U101", f"there is no example `{name}`", help=advice, note=note))
     files: dict[str, str] = {}
     judges = [SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))]
@@ -206,7 +204,7 @@ def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
     path = given if given.suffix in (suffix, ".stlc", ".yml") else given.with_name(f"{given.name}{suffix}")
     if not _NAME.fullmatch(path.stem) or path.stem in RESERVED or path.stem in BUILT_IN:
         advice = ("letters, digits and `_`, none of the words of the language",)
-        raise UsageError(Diagnostic("U101", f"`{path.stem}` cannot be a name", help=advice))
+        raise usage(f"`{path.stem}` cannot be a name", *advice)
     return folder / kind / path if path.parent == Path() and (folder / kind).is_dir() else folder / path
 
 

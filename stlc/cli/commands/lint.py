@@ -15,7 +15,7 @@ from stlc.cli.framework.documents import LintedFiles
 from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
 from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
+from stlc.diagnostics import CODES, Diagnostic, SpecError, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
 from stlc.source import Span
 from stlc.version import __version__
@@ -62,7 +62,7 @@ def lint(
     names = spec_files(files or ["."])
     for option, wanted in (("--watch", watch), ("--fix", fix)):
         if wanted and STDIN in names:
-            raise UsageError(Diagnostic("U101", f"`{option}` needs files, not the standard input"))
+            raise usage(f"`{option}` needs files, not the standard input")
 
     selection = Selection(_codes(select), _codes(ignore))
 

@@ -12,7 +12,7 @@ from stlc.cli.check import options as given
 from stlc.cli.framework.documents import PlottedTrace
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.diagnostics import Diagnostic, StlcError, UsageError, usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _target(output: Path | None, trace: Path) -> Path:
     target = output or trace.with_suffix(".svg")
     if target.suffix not in _FORMATS:
         advice = (f"its suffix is one of {' '.join(_FORMATS)}",)
-        raise UsageError(Diagnostic("U101", f"`{target}` is no picture", help=advice))
+        raise usage(f"`{target}` is no picture", *advice)
     return target
 
 
@@ -144,14 +144,14 @@ def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
     if chart is None:
         advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
         message = f"no requirement of `{monitor.spec.name}` names a place"
-        raise UsageError(Diagnostic("U101", message, help=advice))
+        raise usage(message, *advice)
     return draw_map(chart)
 
 
 def _require_trace(traces: int, wanted: int) -> None:
     if wanted >= traces:
         advice = (f"they go from 0 to {traces - 1}",)
-        raise UsageError(Diagnostic("U101", f"there is no trace {wanted}", help=advice))
+        raise usage(f"there is no trace {wanted}", *advice)
 
 
 def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:

@@ -13,7 +13,7 @@ from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import RunArgument, RunsOption
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
-from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
 from stlc.rundir import RUNS, RunDir, every_run, remove_run
 
@@ -109,7 +109,7 @@ def rm(
     going = [folder.shown for folder in folders if folder.status == "running"]
     if going and not force:
         advice = ("stop it first, or remove it with --force",)
-        raise UsageError(Diagnostic("U101", f"{', '.join(going)} is still going", help=advice))
+        raise usage(f"{', '.join(going)} is still going", *advice)
     for folder in folders:
         remove_run(folder)
     removed = [folder.shown for folder in folders]

@@ -9,8 +9,8 @@ import typer
 
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, UsageError
-from stlc.registry import closest
+from stlc.diagnostics import usage
+from stlc.registry import did_you_mean
 
 SYSTEM_FILE = "system-file"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -47,9 +47,8 @@ def load_schema(name: str) -> dict[str, Any]:
     """
     wanted = name if "/" in name else f"{name}/1"
     if wanted not in names():
-        near = closest(wanted, names())
-        advice = (f"did you mean `{near}`?",) if near else ("stlc schema  lists them",)
-        raise UsageError(Diagnostic("U101", f"there is no schema `{name}`", help=advice))
+        advice = did_you_mean(wanted, names(), "stlc schema  lists them")
+        raise usage(f"there is no schema `{name}`", *advice)
     command = wanted.partition("/")[0]
     if command == SYSTEM_FILE:
         from stlc.dynamics.declaration.load import system_schema

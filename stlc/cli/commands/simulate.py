@@ -17,12 +17,13 @@ from stlc.cli.framework.options import (
     RunsOption,
     SeedsOption,
     SetOption,
+    parse_limit,
     parse_overrides,
+    parse_seeds,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.cli.framework.ranges import parse_limit, parse_seeds
-from stlc.diagnostics import Diagnostic, RunError, UsageError
+from stlc.diagnostics import Diagnostic, RunError, usage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -227,7 +228,7 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
         return emit
     if json:
         message = "`--json` and `--robustness -` both want the standard output"
-        raise UsageError(Diagnostic("U101", message, help=("--robustness robustness.jsonl",)))
+        raise usage(message, "--robustness robustness.jsonl")
     return say
 
 
@@ -271,10 +272,10 @@ def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
 def _guard(backup: bool | None, guard: str | None) -> Mode:
     if guard not in (None, *GUARDS):
         advice = ("--guard none, paper or full",)
-        raise UsageError(Diagnostic("U101", f"there is no guard `{guard}`", help=advice))
+        raise usage(f"there is no guard `{guard}`", *advice)
     if backup is not None and guard is not None and backup != (guard == "paper"):
         option = "--backup" if backup else "--no-backup"
-        raise UsageError(Diagnostic("U101", f"`{option}` and `--guard {guard}` contradict each other"))
+        raise usage(f"`{option}` and `--guard {guard}` contradict each other")
     for mode in GUARDS:
         if mode == guard:
             return mode
@@ -375,7 +376,7 @@ def _require_robots(run: Run) -> None:
 
     if not isinstance(world_type(run.task.system.decl), Staged):
         message = f"`--window` shows robots, and `{run.task.system.decl.name}` has none"
-        raise UsageError(Diagnostic("U101", message))
+        raise usage(message)
     require_window()
 
 

@@ -15,12 +15,21 @@ import typer
 
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.documents import TrainedRun, TrainedRuns
-from stlc.cli.framework.options import PicturesOption, RunsOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.options import (
+    PicturesOption,
+    RunsOption,
+    SetOption,
+    SystemOption,
+    parse_clock,
+    parse_count,
+    parse_overrides,
+    parse_seconds,
+    parse_seeds,
+)
 from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.cli.framework.ranges import parse_clock, parse_count, parse_seconds, parse_seeds
 from stlc.cli.train.many import Many, train_many
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, usage
 from stlc.registry import METHODS
 from stlc.rundir import RUNS, RunDir
 
@@ -133,16 +142,15 @@ def train(
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not busy-wait
     specs = tuple(dict.fromkeys(spec or ()))
-    _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
-    _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
+    given = {
+        **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
+        **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
+        **{"--held-out": held_out, "--drives": drives, "--cluster": cluster},
+    }
+    _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
     logger = _logger(log)
     if resume is not None:
-        _refuse_on_resume(
-            {"SPEC": spec or None, "--system": system, "--seed": seed, "--method": method}
-            | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
-            | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--drives": drives}
-            | {"--cluster": cluster}
-        )
+        _refuse_on_resume({"SPEC": spec or None, **given})
         total = None if steps is None else parse_count(steps, "--steps")
         more = None if budget is None else parse_seconds(budget)
         with one_voice():
@@ -175,27 +183,18 @@ def train(
     return train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures))
 
 
-def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: str | None) -> None:
-    """Reject options that exclude each other."""
-    if budget is not None and steps is not None:
-        raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
-    if seeds is not None and seed is not None:
-        raise UsageError(Diagnostic("U101", "`--seed` and `--seeds` contradict each other"))
-
-
-def _check_many(
-    specs: Sequence[Path], *, seeds: str | None, system: str | None, jobs: int, cluster: str | None
-) -> None:
-    """Reject options that do not apply to one run, to several, or to a cluster."""
-    if len(specs) > 1 and system is not None:
-        help_ = ('a line `system "FILE"` in every specification',)
-        raise UsageError(Diagnostic("U101", "`--system` is for one specification", help=help_))
-    if cluster is not None and jobs > 1:
-        help_ = ("a cluster runs as many as it has cores for; --threads says how many a run has",)
-        raise UsageError(Diagnostic("U101", "`--jobs` and `--cluster` contradict each other", help=help_))
-    if len(specs) < 2 and seeds is None and jobs > 1:
-        help_ = ("stlc train SPEC --seeds 0..2 --jobs 2",)
-        raise UsageError(Diagnostic("U101", "`--jobs` needs several runs", help=help_))
+def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object]) -> None:
+    """Reject options that exclude each other, or do not apply to one run, to several, or to a cluster."""
+    for one, other in (("--budget", "--steps"), ("--seed", "--seeds")):
+        if given[one] is not None and given[other] is not None:
+            raise usage(f"`{one}` and `{other}` contradict each other")
+    if len(specs) > 1 and given["--system"] is not None:
+        raise usage("`--system` is for one specification", 'a line `system "FILE"` in every specification')
+    if given["--cluster"] is not None and jobs > 1:
+        advice = "a cluster runs as many as it has cores for; --threads says how many a run has"
+        raise usage("`--jobs` and `--cluster` contradict each other", advice)
+    if len(specs) < 2 and given["--seeds"] is None and jobs > 1:
+        raise usage("`--jobs` needs several runs", "stlc train SPEC --seeds 0..2 --jobs 2")
 
 
 def _logger(name: str | None) -> Opener | None:
@@ -203,7 +202,7 @@ def _logger(name: str | None) -> Opener | None:
     if name is None:
         return None
     if name != "tensorboard":
-        raise UsageError(Diagnostic("U101", f"there is no log `{name}`", help=("--log tensorboard",)))
+        raise usage(f"there is no log `{name}`", "--log tensorboard")
     from stlc.controller.training.tensorboard import find_writer
 
     return find_writer()
@@ -212,7 +211,7 @@ def _logger(name: str | None) -> Opener | None:
 def _method(name: str) -> str:
     """Check the name of a method. Raises UsageError (U101) if there is none."""
     if name not in METHODS:
-        raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(METHODS.suggest(name),)))
+        raise usage(f"there is no method `{name}`", METHODS.suggest(name))
     return name
 
 
@@ -226,15 +225,14 @@ def _steps(text: str) -> int | StepSchedule:
         return StepSchedule.parse(text)
     except ValueError as error:
         help_ = ("--steps 1200", "the schedule of a run is in its report and in its run.json")
-        raise UsageError(
-            Diagnostic("U101", f"`--steps {text}` is no number of steps", help=help_, note=(str(error),))
-        ) from None
+        message = f"`--steps {text}` is no number of steps"
+        raise UsageError(Diagnostic("U101", message, help=help_, note=(str(error),))) from None
 
 
 def _rate(value: float) -> float:
     """Parse a learning rate: a positive number."""
     if not 0.0 < value < math.inf:
-        raise UsageError(Diagnostic("U101", f"`--lr {value:g}` is not a learning rate", help=("--lr 1e-3",)))
+        raise usage(f"`--lr {value:g}` is not a learning rate", "--lr 1e-3")
     return value
 
 
@@ -248,13 +246,13 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
-        raise UsageError(Diagnostic("U101", "which specification is to be trained for?", help=(example,)))
+        raise usage("which specification is to be trained for?", example)
     path = find_spec(*specs)
     spec = parse(read_source(path))
     wanted = system or spec.system
     if wanted is None:
-        help_ = ("stlc train SPEC --system FILE", 'or a line `system "FILE"` in the specification')
-        raise UsageError(Diagnostic("U101", f"`{path}` names no system", help=help_))
+        other = 'or a line `system "FILE"` in the specification'
+        raise usage(f"`{path}` names no system", "stlc train SPEC --system FILE", other)
     found = find_system(wanted, path)
     say(f"system {found}")
     loaded = System.load(found, overrides)
@@ -298,13 +296,9 @@ def _refuse_on_resume(given: Mapping[str, object]) -> None:
     """Reject options on resume: only the length and `--device` of a run may change."""
     named = [option for option, value in given.items() if value is not None]
     if named:
-        raise UsageError(
-            Diagnostic(
-                "R104",
-                f"{', '.join(named)} cannot change when a run is resumed",
-                help=("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option"),
-            )
-        )
+        message = f"{', '.join(named)} cannot change when a run is resumed"
+        advice = ("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option")
+        raise UsageError(Diagnostic("R104", message, help=advice))
 
 
 # ------------------------------------------------------------------- several ranks

@@ -13,7 +13,7 @@ from pathlib import Path
 import typer
 
 from stlc.cli.framework.output import emit_json, show_diagnostics
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, os_reason
 
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
@@ -23,10 +23,8 @@ _NO_WRITING = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.EIO, errno.EMFILE}
 )
 _NO_FILE = frozenset({errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
-_EXTRAS = {
-    **{"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"},
-    **{"pygls": "lsp", "lsprotocol": "lsp"},
-}
+_EXTRAS = {"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"}
+_EXTRAS |= {"pygls": "lsp", "lsprotocol": "lsp"}
 
 
 class BugError(StlcError):
@@ -94,7 +92,7 @@ def _known(error: BaseException) -> StlcError | None:
 
 
 def _from_system(error: OSError) -> StlcError | None:
-    reason = (error.strerror or type(error).__name__).lower()
+    reason = os_reason(error)
     place = f" `{error.filename}`" if error.filename is not None else ""
     if error.errno in _NO_WRITING:
         return MissingError(Diagnostic("R201", f"cannot use{place or ' a file'}: {reason}"))
@@ -104,13 +102,9 @@ def _from_system(error: OSError) -> StlcError | None:
 
 
 def _missing_package(name: str) -> StlcError:
-    return MissingError(
-        Diagnostic(
-            "R301",
-            f"this needs the package `{name}`, which is not installed",
-            help=(f"pip install 'stlc[{_EXTRAS[name]}]'",),
-        )
-    )
+    advice = (f"pip install 'stlc[{_EXTRAS[name]}]'",)
+    message = f"this needs the package `{name}`, which is not installed"
+    return MissingError(Diagnostic("R301", message, help=advice))
 
 
 def _usage(error: BaseException) -> Diagnostic:
@@ -126,11 +120,8 @@ def _usage(error: BaseException) -> Diagnostic:
 def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
     headline = "".join(traceback.format_exception_only(error)).strip().splitlines()[-1]
     path = _write_report(error, argv)
-    advice: tuple[str, ...]
-    if path is None:
-        note, advice = "no crash report could be written", ()
-    else:
-        note, advice = f"the crash report is {path}", ("report it with that file",)
+    note = "no crash report could be written" if path is None else f"the crash report is {path}"
+    advice = () if path is None else ("report it with that file",)
     return BugError(Diagnostic("B001", f"a bug in stlc: {headline}", note=(note,), help=advice))
 
 

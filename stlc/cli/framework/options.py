@@ -1,15 +1,19 @@
-"""Options that several commands share."""
+"""Options that several commands share, and parsers of option values."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
+
+if TYPE_CHECKING:
+    from stlc.controller.training.budget import Clock
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
 SystemOption = Annotated[
@@ -62,21 +66,23 @@ SetOption = Annotated[
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
-    """`["T_red=3 s"]` as `{"T_red": "3 s"}`.
+    """`["T_red=3 s"]` as `{"T_red": "3 s"}`. Raises UsageError (U101) as `parse_pairs`."""
+    return parse_pairs(pairs, "--set", "NAME=VALUE", "T_red=3s")
+
+
+def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: str) -> dict[str, str]:
+    """The values of a repeated option, by the name before `=`.
 
     Raises:
-        UsageError: U101, an entry is not `NAME=VALUE`, or a name is given twice.
+        UsageError: U101, a value is not of the form, or a name is given twice.
     """
     values: dict[str, str] = {}
     for pair in pairs or ():
         name, sign, value = (part.strip() for part in pair.partition("="))
         if not (name and sign and value):
-            finding = Diagnostic(
-                "U101", f"`--set {pair}` is not of the form NAME=VALUE", help=("write it as --set T_red=3s",)
-            )
-            raise UsageError(finding)
+            raise usage(f"`{option} {pair}` is not of the form {form}", f"write it as {option} {example}")
         if name in values:
-            raise UsageError(Diagnostic("U101", f"`--set {name}=…` is given twice"))
+            raise usage(f"`{option} {name}=…` is given twice")
         values[name] = value
     return values
 
@@ -92,7 +98,7 @@ def spec_files(names: Sequence[str]) -> tuple[str, ...]:
         UsageError: U102, a folder without a specification; U101, nothing is named.
     """
     if not names:
-        raise UsageError(Diagnostic("U101", "which file?", help=("a .stl file, a folder, or - for a pipe",)))
+        raise usage("which file?", "a .stl file, a folder, or - for a pipe")
     return tuple(dict.fromkeys(path for name in names for path in _below(name)))
 
 
@@ -112,3 +118,64 @@ def _below(name: str) -> Iterator[str]:
 def _shown(path: Path, folder: Path) -> bool:
     """True if no part of the path below the folder is hidden."""
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
+# --------------------------------------------------------- durations, counts, seeds
+
+MOST_SEEDS = 1000
+_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")
+
+
+def parse_seconds(text: str) -> float:
+    """A duration such as `60s`, `5min`, `1.5 h`, in seconds; a bare number is seconds.
+
+    Raises:
+        UsageError: U101, it is not a duration.
+    """
+    from stlc.units import parse_unit
+
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz ").strip()
+    unit = text.strip()[len(number) :].strip() or "s"
+    try:
+        value = float(number) * float(parse_unit(unit).scale)
+        if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
+            raise ValueError
+    except ValueError as error:
+        raise usage(f"`{text}` is not a duration", "write it as --budget 60s or 5min") from error
+    return value
+
+
+def parse_count(text: str, option: str) -> int:
+    """A whole number of at least 1. Raises UsageError (U101) for anything else."""
+    if re.fullmatch(r"\s*0*[1-9]\d{0,17}\s*", text, re.ASCII):
+        return int(text)
+    raise usage(f"`{option} {text}` is no number from 1 on", f"{option} 1200")
+
+
+def parse_limit(text: str) -> float | None:
+    """A duration in seconds, or None for `none`. Raises UsageError (U101) for anything else."""
+    return None if text.strip() == "none" else parse_seconds(text)
+
+
+def parse_clock(text: str) -> Clock:
+    """Parse the clock of a budget. Raises UsageError (U101) for anything but `wall` and `processor`."""
+    match text:
+        case "wall" | "processor":
+            return text
+    raise usage(f"there is no clock `{text}`", "wall or processor")
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds such as `0..2`, `3`, or `0..2,7`, in that order, without duplicates.
+
+    Raises:
+        UsageError: U101, it is not such a list.
+    """
+    seeds: dict[int, None] = {}
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part)
+        low, high = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if high < low or high - low >= MOST_SEEDS:
+            raise usage(f"`{text}` is not a list of seeds", "write it as --seeds 0..2 or 0,3,7")
+        seeds.update(dict.fromkeys(range(low, high + 1)))
+    return tuple(seeds)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from stlc.diagnostics import Diagnostic, MissingError
 from stlc.escape import visible
+from stlc.files import reported
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.live import LiveMonitor
@@ -91,11 +91,8 @@ def _lines(where: str) -> Iterator[TextIO]:
 
 
 def _opened(where: str) -> TextIO:
-    try:
+    with reported(f"write `{where}`"):
         return Path(where).open("w", encoding="utf-8")
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise MissingError(Diagnostic("R201", f"cannot write `{where}`: {reason}")) from error
 
 
 def _write(oversight: LiveMonitor, stream: TextIO) -> None:

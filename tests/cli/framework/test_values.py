@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.cli.framework.ranges import MOST_SEEDS, parse_seconds, parse_seeds
+from stlc.cli.framework.options import MOST_SEEDS, parse_seconds, parse_seeds
 from stlc.diagnostics import UsageError
 
 
