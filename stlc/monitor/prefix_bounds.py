@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns, farthest
+from stlc.compile.ir.support import farthest
 from stlc.compile.ir.traverse import map_children, nodes
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -79,11 +79,6 @@ class _PrefixBound:
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
-
-
-def reads_seen(formula: ir.Formula) -> bool:
-    """True if `with_seen` is needed."""
-    return SEEN in columns(formula)
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:

@@ -60,7 +60,7 @@ def test_the_samples_before_are_forgotten() -> None:
         online.push({"a": 0.0})
     sides = [front.side for watched in online._watched[1:] for front in watched.values._fronts]
     assert max(len(column) for side in sides for column in side.rows.values()) < 20
-    assert len(online._watched[0].values.shared._env["#0"]) < 20
+    assert len(online._watched[0].values.shared.side.rows["#0"]) < 20
 
 
 def test_there_has_to_be_such_a_sample() -> None:

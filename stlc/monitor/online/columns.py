@@ -6,12 +6,13 @@ unknown the two agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, assert_never
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import execute
 from stlc.compile.backends.array.numpy_ops import NUMPY
@@ -22,18 +23,19 @@ from stlc.compile.ir.support import columns as names_of_columns
 from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact
 from stlc.monitor.holes import holes_in, unsure, without_holes
+from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.streams import (
     ColumnPlan,
+    DerivedColumn,
     PredicateColumn,
     RecursiveColumn,
     RecursiveOp,
     column,
     read_by,
 )
-from stlc.monitor.prefix_bounds import reads_seen, with_seen
+from stlc.monitor.prefix_bounds import SEEN, with_seen
 from stlc.monitor.values import by_truth
 
-Floats: TypeAlias = NDArray[np.float64]
 End: TypeAlias = Literal["lower", "upper", "truncate"]
 ColumnPlans: TypeAlias = Mapping[End, ColumnPlan]
 """Least and greatest value wherever the trace ends, and the value of the requirement as written."""
@@ -71,9 +73,9 @@ class ColumnReader:
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
-        """Values (count, traces) from row `start` on; rows beyond the shortest column are ignored."""
+        """Return values (count, traces) from row `start` on; the columns are of one length."""
         names = self.names or (NOTHING if NOTHING in env else next(iter(env)),)
-        length = min(len(env[name]) for name in names)
+        length = len(env[next(iter(names))])
         if count <= 0:
             return [next(iter(env.values()))[:0]] * len(self.formulas)
         key = (length, start, count)
@@ -83,8 +85,12 @@ class ColumnReader:
             self._known[key] = array_plan(
                 self.formulas, spanning(start, count), TraceDomain(length, self.end, self._stop)
             )
-        inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in names}
-        return execute(self._known[key], inner, _EXACT)
+        return execute(self._known[key], {name: env[name] for name in names}, _EXACT)
+
+    @property
+    def reads_seen(self) -> bool:
+        """True if the formulas read the column that marks existing samples."""
+        return SEEN in self.names
 
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
@@ -115,51 +121,60 @@ class ColumnReader:
 
 @dataclass(slots=True)
 class Side:
-    """The columns of a plan, at their least or greatest values.
+    """The columns of a plan, at their least or greatest values or at both.
 
     Attributes:
         plan: the columns to compute.
-        end: which bound: least, greatest, or with windows cut at the last sample.
+        end: the bound: least, greatest, with windows cut at the last sample, or least and greatest side by
+            side, (rows, 2).
         beyond: rows after the last sample that the formula over the columns reads.
         truth: predicates are true or false, +inf or -inf.
-        least: unknown values of a signal are taken at their least, else at their greatest.
-        base: number of the first stored sample.
-        rows: column -> values from `base` on, (stored + beyond, traces).
+        least: unknown values of a signal are taken at their least, else at their greatest; None at both.
+        rows: views of the columns from sample `base` on.
+        history: the stored rows.
     """
 
     plan: ColumnPlan
-    end: End
+    end: Beyond
     beyond: int
     truth: bool = False
-    least: bool = True
-    base: int = 0
-    rows: dict[str, Floats] = field(default_factory=dict)
+    least: bool | None = True
+    rows: dict[str, Floats] = field(default_factory=dict, init=False)
+    history: ColumnHistory = field(init=False)
     _over: bool = False
-    _told: bool = False
-    _seen: tuple[Mapping[str, Floats], int, int] | None = None
+    _last: tuple[Mapping[str, Floats], int, int] | None = None
     _settled: dict[str, int] = field(default_factory=dict)
-    _pads: dict[str, int] = field(default_factory=dict)
-    _leaves: list[tuple[list[PredicateColumn], ColumnReader]] = field(default_factory=list)
-    _latched: list[tuple[RecursiveColumn, ColumnReader]] = field(default_factory=list)
+    _predicates: list[tuple[list[PredicateColumn], ColumnReader]] = field(default_factory=list, init=False)
+    _recursive: list[tuple[RecursiveColumn, ColumnReader]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        leaves = [stream for stream in self.plan.streams if isinstance(stream, PredicateColumn)]
-        self._told = any(reads_seen(leaf.formula) for leaf in leaves)
-        for reads in dict.fromkeys((leaf.back, leaf.ahead) for leaf in leaves):
-            alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
-            formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
-            going_on = self.end != "truncate" and not self._over
-            self._leaves.append((alike, ColumnReader(formulas, self.end, going_on=going_on, back=reads[0])))
-        latched = [stream for stream in self.plan.streams if isinstance(stream, RecursiveColumn)]
-        self._latched = [(stream, ColumnReader(stream.parts, self.end)) for stream in latched]
+        streams = self.plan.streams
+        predicates = [stream for stream in streams if isinstance(stream, PredicateColumn)]
+        going_on = self.end != "truncate" and not self._over
+        for alike in dict.fromkeys((each.back, each.ahead, _of_the_present(each)) for each in predicates):
+            group = [e for e in predicates if (e.back, e.ahead, _of_the_present(e)) == alike]
+            formulas = [by_truth(each.formula) if self.truth else each.formula for each in group]
+            end = "truncate" if alike[2] else self.end
+            reader = ColumnReader(formulas, end, going_on=going_on and not alike[2], back=alike[0])
+            self._predicates.append((group, reader))
+        recursive = [stream for stream in streams if isinstance(stream, RecursiveColumn)]
+        self._recursive = [(stream, ColumnReader(stream.parts, self.end)) for stream in recursive]
+        self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
+
+    def _farthest(self) -> int:
+        """Rows after the last sample that are needed: those of the formula, and those that columns read."""
         if self.end == "truncate":
-            self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), 0)
-            return
-        self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
+            return 0
+        pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
         for stream in reversed(self.plan.streams):
-            wanted = self._pads[stream.name] + stream.ahead
             for name in read_by(stream):
-                self._pads[name] = max(self._pads[name], wanted)
+                pads[name] = max(pads[name], pads[stream.name] + stream.ahead)
+        return max(pads.values(), default=self.beyond)
+
+    @property
+    def base(self) -> int:
+        """Number of the first stored sample."""
+        return self.history.first
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
         """Take in new samples.
@@ -169,65 +184,79 @@ class Side:
             first: number of their first row.
             samples: total number of samples.
         """
-        self._seen = (signals, first, samples)
-        signals = with_seen(signals) if self._told else signals
-        traces = next(iter(signals.values())).shape[1]
-        self.rows[NOTHING] = np.zeros((samples + self.beyond - self.base, traces))
-        for leaves, reader in self._leaves:
-            self._grow_leaves(leaves, reader, signals, first, samples)
-        for stream, reader in self._latched:
-            self._grow_latched(stream, reader, samples)
+        self._last = (signals, first, samples)
+        names = (NOTHING, *(stream.name for stream in self.plan.streams))
+        width = 2 if self.end == "both" else next(iter(signals.values())).shape[1]
+        self.history.grow(names, samples - self.history.samples, width)
+        self.rows = self.history.columns()
+        if any(reader.reads_seen for _, reader in self._predicates):
+            signals = with_seen(signals)
+        for group, reader in self._predicates:
+            self._grow_predicates(group, reader, signals, first)
+        for stream, reader in self._recursive:
+            self._grow_recursive(stream, reader)
 
-    def over(self) -> Side:
-        """The columns with the last sample as the end of the trace: windows beyond it are clipped."""
-        if self._seen is None or all(stream.ahead == 0 for stream in self.plan.streams):
-            return self
-        last = replace(
-            self, rows=dict(self.rows), _settled=dict(self._settled), _leaves=[], _latched=[], _over=True
-        )
-        last.grow(*self._seen)
-        return last
-
-    def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
-        """Values (count, traces) of formulas over the columns, from sample `start` on."""
-        return reader(self.rows, start - self.base, count)
-
-    def drop(self, first: int) -> None:
-        """Forget rows before sample `first` that no column needs."""
-        needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._latched]
-        base = max(min([first, *needs]), self.base)
-        if base > self.base:
-            self.rows = {name: values[base - self.base :] for name, values in self.rows.items()}
-            self.base = base
-
-    def _grow_leaves(
-        self,
-        leaves: Sequence[PredicateColumn],
-        reader: ColumnReader,
-        env: Mapping[str, Floats],
-        first: int,
-        samples: int,
+    def _grow_predicates(
+        self, group: Sequence[PredicateColumn], reader: ColumnReader, env: Mapping[str, Floats], first: int
     ) -> None:
-        start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
-        count = samples + max(self._pads[leaf.name] for leaf in leaves) - start
-        found = reader.of_signals(env, start - first, count, least=self.least)
-        for leaf, values in zip(leaves, found, strict=True):
-            self._put(leaf.name, start, values[: samples + self._pads[leaf.name] - start])
-            self._settled[leaf.name] = max(samples - ahead, start)
+        samples, start = self.history.samples, self._settled.get(group[0].name, 0)
+        stop = samples if _of_the_present(group[0]) else self.base + len(self.rows[NOTHING])
+        found = reader.of_signals(env, start - first, stop - start, least=self.least)
+        for stream, values in zip(group, found, strict=True):
+            self.history.put(stream.name, start, values)
+            self._settled[stream.name] = max(samples - stream.ahead, start)
 
-    def _grow_latched(self, stream: RecursiveColumn, reader: ColumnReader, samples: int) -> None:
-        start = self._settled.get(stream.name, 0)
-        count = samples + self._pads[stream.name] - start
-        parts = self.values(reader, start, count)
+    def _grow_recursive(self, stream: RecursiveColumn, reader: ColumnReader) -> None:
+        samples, start = self.history.samples, self._settled.get(stream.name, 0)
+        parts = self.values(reader, start, self.base + len(self.rows[NOTHING]) - start)
         last = self.rows[stream.name][start - 1 - self.base] if start else None
-        self._put(stream.name, start, continued(stream.op, parts, last))
+        self.history.put(stream.name, start, continued(stream.op, parts, last))
         lags = [samples - self._settled[name] for name in read_by(stream)]
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
-    def _put(self, name: str, start: int, values: Floats) -> None:
-        """Replace all rows from sample `start` on."""
-        kept = self.rows.get(name)
-        self.rows[name] = values if kept is None else np.concatenate([kept[: start - self.base], values])
+    def over(self) -> Side:
+        """Return the columns with the last sample as the end of the trace: windows beyond it are clipped."""
+        if self._last is None or all(stream.ahead == 0 for stream in self.plan.streams):
+            return self
+        last = replace(self, _settled=dict(self._settled), _over=True)
+        last.history = deepcopy(self.history)
+        last.grow(*self._last)
+        return last
+
+    def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
+        """Return values (count, traces) of formulas over the columns, from sample `start` on."""
+        return reader(self.rows, start - self.base, count)
+
+    def drop(self, first: int) -> None:
+        """Drop rows before sample `first` that no column needs."""
+        needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
+        self.history.forget(min([first, *needs]))
+        self.rows = self.history.columns()
+
+
+_UNKNOWN: Mapping[Beyond, float | tuple[float, float]] = {
+    "lower": -math.inf,
+    "upper": math.inf,
+    "both": (-math.inf, math.inf),
+    "truncate": 0.0,
+}
+"""Value of a predicate after the last sample."""
+
+
+def _of_the_present(stream: DerivedColumn) -> bool:
+    """True for a predicate of its own sample, which is unknown after the last one."""
+    return isinstance(stream, PredicateColumn) and not (
+        stream.back or stream.ahead or isinstance(stream.formula, ir.Freeze)
+    )
+
+
+def shareable(plans: ColumnPlans) -> bool:
+    """True if both bounds follow from one formula, over predicates of the present and past operators."""
+    planned = plans["truncate"]
+    return plans["lower"] == plans["upper"] == planned and all(
+        _of_the_present(stream) or (isinstance(stream, RecursiveColumn) and not stream.ahead)
+        for stream in planned.streams
+    )
 
 
 def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:

@@ -1,12 +1,12 @@
-"""Sample history of a stream: columns that grow at the end and are trimmed at the front."""
+"""History of columns: consecutive rows, appended or replaced at the end and dropped at the front."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -14,45 +14,54 @@ _SPARE = 64
 """Rows that are free after the columns were moved."""
 
 
-class SampleHistory:
-    """Columns (samples, 1) of consecutive samples; appending one takes amortized constant time.
+class ColumnHistory:
+    """Columns (rows, width) in growing arrays; appending a row takes amortized constant time.
+
+    Args:
+        beyond: rows after the last sample that are stored, too.
+        fill: content of rows until they are written, a number or one per column of the array.
 
     Attributes:
         first: number of the first stored sample.
         samples: total number of samples taken in.
     """
 
-    def __init__(self) -> None:
-        self.first = 0
-        self.samples = 0
+    def __init__(self, beyond: int = 0, fill: ArrayLike = 0.0) -> None:
+        self.first = self.samples = 0
+        self._beyond, self._fill = beyond, fill
         self._rows: dict[str, Floats] = {}
-        self._origin = 0
-        self._room = 0
+        self._origin = self._room = 0
 
-    def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Append samples. Raises KeyError for columns with other names than those before."""
-        if self.samples + count - self._origin > self._room:
-            self._move(columns, count)
-        begin = self.samples - self._origin
-        for name, rows in self._rows.items():
-            rows[begin : begin + count] = columns[name]
+    def grow(self, names: Iterable[str], count: int, width: int = 1) -> None:
+        """Append unwritten samples to the columns `names`, which are the same in every call."""
+        stop = self.samples + count + self._beyond
+        if stop - self._origin > self._room:
+            known = slice(self.first - self._origin, self.samples - self._origin)
+            self._room = 2 * (stop - self.first) + _SPARE
+            moved = {name: np.full((self._room, width), self._fill) for name in names}
+            for name, old in self._rows.items():
+                moved[name][: self.samples - self.first] = old[known]
+            self._rows, self._origin = moved, self.first
         self.samples += count
 
-    def _move(self, columns: Mapping[str, Floats], count: int) -> None:
-        kept = slice(self.first - self._origin, self.samples - self._origin)
-        number = self.samples - self.first
-        self._room = 2 * (number + count) + _SPARE
-        moved = {name: np.empty((self._room, 1)) for name in columns}
-        for name, old in self._rows.items():
-            moved[name][:number] = old[kept]
-        self._rows, self._origin = moved, self.first
+    def put(self, name: str, start: int, values: Floats) -> None:
+        """Write the rows (rows, width) of a column from sample `start` on."""
+        self._rows[name][start - self._origin : start - self._origin + len(values)] = values
+
+    def take(self, columns: Mapping[str, Floats], count: int) -> None:
+        """Append samples, (count, width) by name."""
+        start = self.samples
+        self.grow(columns, count, next(iter(columns.values())).shape[1])
+        for name in self._rows:
+            self.put(name, start, columns[name])
 
     def columns(self, first: int | None = None, stop: int | None = None) -> dict[str, Floats]:
-        """Views of the stored samples from `first` up to `stop`."""
+        """Return views of the stored rows from `first` up to `stop`."""
+        end = self.samples + self._beyond
         low = max(self.first if first is None else first, self.first) - self._origin
-        high = min(self.samples if stop is None else stop, self.samples) - self._origin
+        high = (end if stop is None else min(stop, end)) - self._origin
         return {name: rows[low:high] for name, rows in self._rows.items()}
 
     def forget(self, before: int) -> None:
-        """Forget the samples before one; their memory is freed when the columns are next moved."""
+        """Drop the samples before one; their memory is freed when the columns are next moved."""
         self.first = min(max(before, self.first), self.samples)

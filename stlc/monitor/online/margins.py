@@ -13,6 +13,7 @@ from stlc.compile.ir.support import columns, history
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
+from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.trackers import RecomputeTracker
 
 if TYPE_CHECKING:
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int64]
-
-_ROOM = 64
-"""Samples that are free after the columns were moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,50 +145,33 @@ class Margins:
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
         self._watched = [_Watched(rule, horizon, RecomputeTracker(rule, horizon, "open")) for rule in rules]
         self._names = sorted({name for rule in rules for name in columns(rule.formula)})
-        self._kept: dict[str, Floats] = {}
-        self._first = 0
+        self._history = ColumnHistory()
         self._found: dict[str, Margin] = {}
-        self._looked = 0
-        self.samples = 0
+        self._evaluated = 0
 
     @property
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements, in order."""
         return tuple(watched.rule.name for watched in self._watched)
 
+    @property
+    def samples(self) -> int:
+        """Number of samples taken in."""
+        return self._history.samples
+
     def push(self, signals: Mapping[str, Floats]) -> None:
         """Take in one sample of every trace: (traces,) by name."""
-        used = self.samples - self._first
-        if not self._kept:
-            names = self._names or list(signals)[:1]
-            self._kept = {name: np.empty((_ROOM, len(signals[name]))) for name in names}
-        room = len(next(iter(self._kept.values())))
-        if used == room:
-            used = self._make_room(used)
-        for name, column in self._kept.items():
-            column[used] = signals[name]
-        self.samples += 1
+        names = self._names or list(signals)[:1]
+        self._history.take({name: np.asarray(signals[name])[None] for name in names}, 1)
 
     def look(self) -> dict[str, Margin]:
-        """Margins of every requirement at the last sample; there has to be one."""
-        if self._looked != self.samples:
-            env = {name: column[: self.samples - self._first] for name, column in self._kept.items()}
-            look = (each.look(env, self._first, self.samples) for each in self._watched)
-            self._found, self._looked = dict(zip(self.requirements, look, strict=True)), self.samples
+        """Return the margins of every requirement at the last sample; there has to be one."""
+        if self._evaluated != self.samples:
+            env, first = self._history.columns(), self._history.first
+            found = [each.look(env, first, self.samples) for each in self._watched]
+            self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
+            self._history.forget(min([each.needs() for each in self._watched], default=self.samples))
         return self._found
-
-    def _make_room(self, used: int) -> int:
-        """Drop unneeded samples, and double the columns if that frees too few; returns how many remain."""
-        dropped = min([each.needs() for each in self._watched], default=self.samples) - self._first
-        dropped = max(dropped, 0)
-        left = used - dropped
-        size = max(2 * left, _ROOM)
-        for name, column in self._kept.items():
-            moved = np.empty((size, column.shape[1]))
-            moved[:left] = column[dropped:used]
-            self._kept[name] = moved
-        self._first += dropped
-        return left
 
 
 def _traces(env: Mapping[str, Floats]) -> int:

@@ -17,7 +17,7 @@ from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.online.bounds import Bounds, Tracker, TrackingOptions
-from stlc.monitor.online.history import SampleHistory
+from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.tally import Flags, JudgedInstants, Tally
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
@@ -88,7 +88,7 @@ class Watched:
     tally: Tally = field(default_factory=Tally)
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
-    def grow(self, kept: SampleHistory) -> None:
+    def grow(self, kept: ColumnHistory) -> None:
         """Take in new samples."""
         if self.over or self.values.samples == kept.samples:
             return
@@ -144,7 +144,7 @@ class Online:
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.gaps: dict[str, Gap] = {}
         """Samples at which signals are unknown."""
-        self._kept = SampleHistory()
+        self._kept = ColumnHistory()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]

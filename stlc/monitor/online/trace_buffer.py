@@ -15,7 +15,7 @@ from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Prepared, Verdict
 from stlc.monitor.online.bounds import Floats
-from stlc.monitor.online.history import SampleHistory
+from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.streams import endless, looks_on
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
@@ -48,7 +48,7 @@ class TraceBuffer:
 
     compiled: Compiled
     t0: float
-    _kept: SampleHistory = field(default_factory=SampleHistory)
+    _kept: ColumnHistory = field(default_factory=ColumnHistory)
     _found: dict[str, tuple[Worst, Cause]] = field(default_factory=dict)
     _wide: int = 1
 

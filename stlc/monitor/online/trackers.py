@@ -17,11 +17,10 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
-from stlc.monitor.online.columns import FAR, ColumnPlans, ColumnReader, End, Side
-from stlc.monitor.online.interval_columns import IntervalColumns, fits
+from stlc.monitor.online.columns import FAR, Beyond, ColumnPlans, ColumnReader, End, Side, shareable
 from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, effort, span
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, RecursiveColumn, endless, looks_on, plan
-from stlc.monitor.online.unbounded import UnboundedState, skeleton
+from stlc.monitor.online.unbounded import UnboundedOperators, UnboundedState, skeleton
 from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, by_truth, window_bounds
 
@@ -186,6 +185,103 @@ class BoundedTracker(_ColumnTracker):
 
 
 @dataclass(slots=True)
+class IntervalColumns:
+    """Formulas with bounded windows whose instants are settled at the same time, evaluated together.
+
+    Their columns are common, (rows, 2): the least and the greatest value over all continuations. One
+    evaluation gives both bounds of all formulas.
+
+    Attributes:
+        truth: predicates are true or false, +inf or -inf.
+        samples: number of samples taken in.
+    """
+
+    truth: bool
+    samples: int = 0
+    side: Side = field(init=False)
+    _formulas: list[ir.Formula] = field(default_factory=list)
+    _starts: list[int] = field(default_factory=list)
+    _reader: ColumnReader = field(init=False)
+    _back: int = 0
+    _found: tuple[tuple[int, int], list[Floats]] | None = None
+
+    def add(self, formula: ir.Formula) -> IntervalTracker:
+        """Add a formula; only before the first sample."""
+        self._formulas.append(formula)
+        self._starts.append(0)
+        return IntervalTracker(self, len(self._starts) - 1, reach(formula).future)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take in new samples; the arguments are those of `Side.grow`."""
+        if samples == self.samples:
+            return
+        if not self.samples:
+            whole = plan(ir.BoolOp("and", tuple(self._formulas)))
+            assert isinstance(whole.formula, ir.BoolOp)
+            formulas = whole.formula.items
+            beyond = max(reach(formula).future for formula in formulas)
+            self.side = Side(whole, "both", beyond, self.truth, least=None)
+            self._reader, self._back = ColumnReader(formulas, "both"), max(map(history, formulas))
+        self.side.grow(signals, first, samples)
+        self.samples, self._found = samples, None
+
+    def values(self, which: int, start: int, stop: int) -> Floats:
+        """Return both bounds of a formula at consecutive instants, (instants, 2)."""
+        if self._found is None or self._found[0] != (start, stop):
+            self._found = (start, stop), self.side.values(self._reader, start, stop - start)
+        return self._found[1][which]
+
+    def drop(self, which: int, start: int) -> None:
+        """Drop rows that a formula needs only for instants before `start`."""
+        self._starts[which] = start
+        self.side.drop(min(self._starts) - self._back)
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalTracker:
+    """Tracker of one formula with bounded windows; shares columns with others.
+
+    Attributes:
+        shared: the columns.
+        which: number of the formula.
+        ahead: lookahead in samples.
+    """
+
+    shared: IntervalColumns
+    which: int
+    ahead: int
+
+    @property
+    def samples(self) -> int:
+        """Number of samples taken in."""
+        return self.shared.samples
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        return max(self.shared.samples - self.ahead, 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take in new samples."""
+        self.shared.grow(signals, first, samples)
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        if stop <= start:
+            return Bounds(np.zeros(0), np.zeros(0))
+        return Bounds(*self.shared.values(self.which, start, stop).T)
+
+    def ended(self, starts: range) -> Bounds:
+        """Bounds at the end of the trace: missing samples stay unknown."""
+        return self.live(starts.start, starts.stop)
+
+    def drop(self, start: int) -> int:
+        """Drop instants before `start`; no signals are stored."""
+        self.shared.drop(self.which, start)
+        return self.shared.samples
+
+
+@dataclass(slots=True)
 class PlanningWindowTracker(_ColumnTracker):
     """Tracker of a formula with windows to the end of a planning window, at consecutive instants.
 
@@ -285,7 +381,9 @@ class UnboundedTracker:
     _back: int = 0
 
     def __post_init__(self) -> None:
-        bones = {end: skeleton(planned.formula) for end, planned in self.plans.items()}
+        bones: dict[Beyond, UnboundedOperators] = {
+            end: skeleton(planned.formula) for end, planned in self.plans.items()
+        }
         self._lag = max(bones[end].reach + planned.lag for end, planned in self.plans.items()) + 1
         self._back = max(each.back for each in bones.values())
         beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
@@ -465,7 +563,7 @@ class Trackers:
                 if everywhere:
                     raise EndlessError
                 return UnboundedTracker(plans, options)
-            if options.ending == "truncate" or not fits(plans):
+            if options.ending == "truncate" or not shareable(plans):
                 return BoundedTracker(plans, options)
             counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
             later = max(counted or 0, reach(formula).future)

@@ -25,11 +25,11 @@ from stlc.monitor.online import paced
 from stlc.monitor.online import trackers as tracking
 from stlc.monitor.online.bounds import TrackingOptions
 from stlc.monitor.online.columns import FAR
-from stlc.monitor.online.interval_columns import IntervalTracker
 from stlc.monitor.online.online import How
 from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.trackers import (
     BoundedTracker,
+    IntervalTracker,
     PlanningWindowTracker,
     RecomputeTracker,
     Trackers,
@@ -466,15 +466,10 @@ def test_no_more_rows_for_windows_that_are_longer_than_the_stream(name: str) -> 
             online.push({"x": float(k % 3)})
         (watched,) = online._watched
         assert isinstance(watched.values, PacedTracker)
-        kept = [getattr(watched.values._inner, "shared", None), *getattr(watched.values._inner, "_sides", [])]
-        kept += [front.side for front in getattr(watched.values._inner, "_fronts", [])]
-        columns = [
-            column
-            for side in kept
-            if side is not None
-            for column in getattr(side, "rows", getattr(side, "_rows", {})).values()
-        ]
-        rows.append([len(column) for column in columns])
+        inner = watched.values._inner
+        kept = [inner.shared.side] if isinstance(inner, IntervalTracker) else getattr(inner, "_sides", [])
+        kept += [front.side for front in getattr(inner, "_fronts", [])]
+        rows.append([len(column) for side in kept for column in side.history._rows.values()])
     assert rows[0] == rows[1]
     assert 0 < max(rows[0]) < 20_000
 

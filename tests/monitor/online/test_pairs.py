@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.monitor.online.interval_columns import IntervalTracker
 from stlc.monitor.online.online import How
+from stlc.monitor.online.trackers import IntervalTracker
 from stlc.monitor.verdict import Monitor
 
 HEAD = "signal a\nsignal b\nsignal n: int\n"
@@ -55,7 +55,7 @@ def test_every_requirement_is_as_it_is_alone(tolerance: float, at) -> None:
         assert list(found) == wanted
         for name in REQUIREMENTS:
             assert together.open_starts(name) == alone[name].open_starts(name)
-        kept = max(kept, *(len(each.values.shared._env["#0"]) for each in together._watched))
+        kept = max(kept, *(len(each.values.shared.side.rows["#0"]) for each in together._watched))
     assert kept < 40
     finished = together.finish()
     for name in REQUIREMENTS:
