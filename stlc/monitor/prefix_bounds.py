@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import farthest
-from stlc.compile.ir.traverse import map_children, nodes
+from stlc.compile.ir.support import Reach, farthest
+from stlc.compile.ir.traverse import children, map_children, nodes
 
 Floats: TypeAlias = NDArray[np.float64]
+
+FAR = 1 << 40
+"""More samples than any trace has."""
 
 SEEN = "@seen"
 """A column that is 1 at every sample."""
@@ -89,24 +92,27 @@ def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
 # ---------------------------------------------------------------- windows without an end
 
 
+def own_span(node: ir.Formula) -> Reach:
+    """Return lookback and lookahead of an operator or predicate itself, without those of its operands.
+
+    Of an unbounded window only the lower bound counts.
+    """
+    reads = [Reach(0, 0), *(farthest(num) for num in children(node) if not isinstance(num, ir.Formula))]
+    past, future = (max(ends) for ends in zip(*reads, strict=True))
+    steps = node.steps if isinstance(node, ir.Shift) else 0
+    if isinstance(node, ir.Windowed):
+        width = node.window.lo if node.window.hi is None else node.window.hi
+        steps = -width if node.back else width
+    return Reach(past + max(-steps, 0), future + max(steps, 0))
+
+
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """The formula with windows to the end of the trace lengthened beyond all known values."""
-    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
-    return _long(formula, samples + sum(bounds) + 1)
+    """Return the formula with windows to the end of the trace lengthened beyond all known values."""
+    length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
 
+    def longer(node: ir.Formula) -> ir.Formula:
+        if isinstance(node, ir.Windowed) and not node.back and node.window.hi is None:
+            node = replace(node, window=ir.Window(node.window.lo, node.window.lo + length))
+        return map_children(node, formulas=longer)
 
-def _farthest(node: ir.Formula) -> int:
-    window: ir.Window | None = getattr(node, "window", None)
-    if window is not None:
-        return window.lo if window.hi is None else window.hi
-    return sum(farthest(node.num)) if isinstance(node, ir.Predicate) else 0
-
-
-def _long(formula: ir.Formula, length: int) -> ir.Formula:
-    if isinstance(formula, ir.Windowed) and not formula.back:
-        formula = replace(formula, window=_longer(formula.window, length))
-    return map_children(formula, formulas=lambda part: _long(part, length))
-
-
-def _longer(window: ir.Window, length: int) -> ir.Window:
-    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)
+    return longer(formula)

@@ -33,7 +33,7 @@ from stlc.monitor.online.streams import (
     column,
     read_by,
 )
-from stlc.monitor.prefix_bounds import SEEN, with_seen
+from stlc.monitor.prefix_bounds import FAR, SEEN, with_seen
 from stlc.monitor.values import by_truth
 
 End: TypeAlias = Literal["lower", "upper", "truncate"]
@@ -43,9 +43,6 @@ Beyond: TypeAlias = Literal["lower", "upper", "truncate", "both"]
 
 NOTHING = ""
 """Placeholder column for formulas that read no column."""
-
-FAR = 1 << 40
-"""More samples than any trace has."""
 
 _REMEMBERED = 256
 _EXACT = Windows(Exact(), NUMPY)
@@ -86,11 +83,6 @@ class ColumnReader:
                 self.formulas, spanning(start, count), TraceDomain(length, self.end, self._stop)
             )
         return execute(self._known[key], {name: env[name] for name in names}, _EXACT)
-
-    @property
-    def reads_seen(self) -> bool:
-        """True if the formulas read the column that marks existing samples."""
-        return SEEN in self.names
 
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
@@ -146,6 +138,8 @@ class Side:
     _settled: dict[str, int] = field(default_factory=dict)
     _predicates: list[tuple[list[PredicateColumn], ColumnReader]] = field(default_factory=list, init=False)
     _recursive: list[tuple[RecursiveColumn, ColumnReader]] = field(default_factory=list, init=False)
+    _names: tuple[str, ...] = field(init=False)
+    _reads_seen: bool = field(init=False)
 
     def __post_init__(self) -> None:
         streams = self.plan.streams
@@ -157,6 +151,8 @@ class Side:
             end = "truncate" if alike[2] else self.end
             reader = ColumnReader(formulas, end, going_on=going_on and not alike[2], back=alike[0])
             self._predicates.append((group, reader))
+        self._reads_seen = any(SEEN in reader.names for _, reader in self._predicates)
+        self._names = (NOTHING, *(stream.name for stream in streams))
         recursive = [stream for stream in streams if isinstance(stream, RecursiveColumn)]
         self._recursive = [(stream, ColumnReader(stream.parts, self.end)) for stream in recursive]
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
@@ -185,12 +181,10 @@ class Side:
             samples: total number of samples.
         """
         self._last = (signals, first, samples)
-        names = (NOTHING, *(stream.name for stream in self.plan.streams))
         width = 2 if self.end == "both" else next(iter(signals.values())).shape[1]
-        self.history.grow(names, samples - self.history.samples, width)
+        self.history.grow(self._names, samples - self.history.samples, width)
         self.rows = self.history.columns()
-        if any(reader.reads_seen for _, reader in self._predicates):
-            signals = with_seen(signals)
+        signals = with_seen(signals) if self._reads_seen else signals
         for group, reader in self._predicates:
             self._grow_predicates(group, reader, signals, first)
         for stream, reader in self._recursive:
@@ -211,7 +205,7 @@ class Side:
         parts = self.values(reader, start, self.base + len(self.rows[NOTHING]) - start)
         last = self.rows[stream.name][start - 1 - self.base] if start else None
         self.history.put(stream.name, start, continued(stream.op, parts, last))
-        lags = [samples - self._settled[name] for name in read_by(stream)]
+        lags = [samples - self._settled[name] for name in reader.names]
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
@@ -230,8 +224,9 @@ class Side:
     def drop(self, first: int) -> None:
         """Drop rows before sample `first` that no column needs."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
-        self.history.forget(min([first, *needs]))
-        self.rows = self.history.columns()
+        if (base := min([first, *needs])) > self.base:
+            self.history.forget(base)
+            self.rows = self.history.columns()
 
 
 _UNKNOWN: Mapping[Beyond, float | tuple[float, float]] = {

@@ -17,11 +17,11 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
-from stlc.monitor.online.columns import FAR, Beyond, ColumnPlans, ColumnReader, End, Side, shareable
-from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, effort, span
+from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, End, Side, shareable
+from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, span
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, RecursiveColumn, endless, looks_on, plan
 from stlc.monitor.online.unbounded import UnboundedOperators, UnboundedState, skeleton
-from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, by_truth, window_bounds
 
 
@@ -541,7 +541,7 @@ class Trackers:
             return Trackers(self.horizon).plain(part, options, everywhere=everywhere)
 
         paced = PacedTracker(rule, make, everywhere, isinstance(tried, RecomputeTracker), window)
-        found = effort(rule.formula, sum(span(rule.formula)) + (window or 0), paced)
+        found = paced.effort(rule.formula, sum(span(rule.formula)) + (window or 0))
         if found.own > MOST:
             raise UsageError(_too_much(rule, found))
         if paced.all_kept or found.rows > WIDE:

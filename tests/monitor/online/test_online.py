@@ -24,7 +24,6 @@ from stlc.diagnostics import StlcError, UsageError
 from stlc.monitor.online import paced
 from stlc.monitor.online import trackers as tracking
 from stlc.monitor.online.bounds import TrackingOptions
-from stlc.monitor.online.columns import FAR
 from stlc.monitor.online.online import How
 from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.trackers import (
@@ -35,7 +34,7 @@ from stlc.monitor.online.trackers import (
     Trackers,
     UnboundedTracker,
 )
-from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 
