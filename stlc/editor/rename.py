@@ -11,9 +11,8 @@ from stlc.editor.symbols import Occurrence, SymbolNames, names_of
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.show.printer import own_name
+from stlc.lint.lint import Edit, edited
 from stlc.source import Source, Span
-
-Edit = tuple[Span, str]
 
 _NAME = re.compile(r"[^\W\d]\w*")
 
@@ -73,20 +72,13 @@ def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
 
 def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
     """Raise RenameError unless every name keeps its binding."""
-    text = apply(document.source.text, edits)
+    text = edited(document.source.text, edits)
     try:
         after = names_of(parse(Source(document.source.name, text)))
     except SpecError as error:
         raise RenameError(f"`{name}` cannot stand everywhere: {error.diagnostics[0].message}") from None
     if _bindings(after) != _bindings(document.names) or _declared(after) != _declared(document.names):
         raise RenameError(f"`{name}` has a meaning already where this would be written")
-
-
-def apply(text: str, edits: Sequence[Edit]) -> str:
-    """Apply all edits to a text."""
-    for span, replacement in sorted(edits, key=lambda edit: edit[0].start, reverse=True):
-        text = text[: span.start] + replacement + text[span.end :]
-    return text
 
 
 def _bindings(names: SymbolNames) -> list[int]:

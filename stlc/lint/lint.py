@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
@@ -14,8 +15,10 @@ from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.lint.rules import RULES
 from stlc.registry import closest
-from stlc.source import Source
+from stlc.source import Source, Span
 
+Edit: TypeAlias = tuple[Span, str]
+"""A part of a text, and what replaces it."""
 ROUNDS = 20
 
 
@@ -25,7 +28,7 @@ class Fixed:
 
     Attributes:
         source: text after the repairs.
-        findings: remaining findings.
+        findings: findings that remain.
         count: number of repaired findings.
     """
 
@@ -34,57 +37,50 @@ class Fixed:
     count: int
 
 
-def fix(source: Source, look: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
+def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
     """Apply repairs until no repairable finding remains.
 
     A round that would introduce new errors is discarded. Overlapping repairs wait for the next round.
 
     Args:
         source: the text.
-        look: text -> its findings.
+        check: text -> its findings.
     """
-    findings, count = tuple(look(source)), 0
+    findings, count = tuple(check(source)), 0
     for _ in range(ROUNDS):
-        chosen = _apart([finding.fix for finding in findings if _fits(finding.fix, source)])
+        fixes = [found.fix for found in findings if found.fix is not None]
+        chosen = _apart(one for one in fixes if all(span.source is source for span, _ in one.edits))
         if not chosen:
             break
-        repaired = Source(source.name, _edited(source.text, chosen))
-        after = tuple(look(repaired))
-        if repaired.text == source.text or _errors(after) > _errors(findings):
+        text = edited(source.text, [edit for one in chosen for edit in one.edits])
+        repaired = Source(source.name, text)
+        after = tuple(check(repaired))
+        if text == source.text or _errors(after) > _errors(findings):
             break
         source, findings, count = repaired, after, count + len(chosen)
     return Fixed(source, findings, count)
-
-
-def _fits(repair: Fix | None, source: Source) -> bool:
-    return repair is not None and all(span.source is source for span, _ in repair.edits)
 
 
 def _errors(findings: Iterable[Diagnostic]) -> int:
     return sum(finding.severity == "error" for finding in findings)
 
 
-def _apart(repairs: Iterable[Fix | None]) -> list[Fix]:
+def _apart(repairs: Iterable[Fix]) -> list[Fix]:
     """Return non-overlapping repairs; of two overlapping ones the first."""
     chosen: list[Fix] = []
     taken: set[tuple[int, int]] = set()
     for repair in repairs:
-        if repair is None or not repair.edits:
-            continue
         places = {(span.start, span.end) for span, _ in repair.edits}
-        if not any(_touch(place, other) for place in places for other in taken):
+        overlaps = any(start <= last and first <= end for start, end in places for first, last in taken)
+        if places and not overlaps:
             chosen.append(repair)
             taken |= places
     return chosen
 
 
-def _touch(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    return one[0] <= other[1] and other[0] <= one[1]
-
-
-def _edited(text: str, repairs: Iterable[Fix]) -> str:
-    edits = [(span.start, span.end, new) for repair in repairs for span, new in repair.edits]
-    for start, end, new in sorted(edits, reverse=True):
+def edited(text: str, edits: Iterable[Edit]) -> str:
+    """Apply non-overlapping edits to a text."""
+    for start, end, new in sorted(((span.start, span.end, new) for span, new in edits), reverse=True):
         text = text[:start] + new + text[end:]
     return text
 
@@ -145,7 +141,10 @@ def lint(
         spec = parse(source)
     except SpecError as error:
         return error.diagnostics
-    found = [*_compiled(spec, within), *_written(spec, selection)]
+    found = list(_compiled(spec, within))
+    for code, rule in RULES.items():
+        if selection.wants(code):
+            found += rule.check(spec)
     kept = [finding for finding in found if selection.wants(finding.code)]
     return tuple(sorted(kept, key=lambda finding: _place(finding, source)))
 
@@ -160,12 +159,6 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
         return compile_resolved(resolved, within.grid, within.purpose).warnings
     except SpecError as error:
         return [*warnings, *error.diagnostics]
-
-
-def _written(spec: ast.Spec, selection: Selection) -> Iterator[Diagnostic]:
-    for code, rule in RULES.items():
-        if selection.wants(code):
-            yield from rule.check(spec)
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:

@@ -15,6 +15,7 @@ from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.source import Span
 
 _WHY: dict[AmbiguityKind, str] = {
     "scope": "here a temporal word ends before `{outer}`; RTAMT, MoonLight and FalCAuN take in what follows",
@@ -51,10 +52,7 @@ def _finding(code: str, part: Ambiguity) -> Diagnostic:
     )
 
 
-_SIGNS = {
-    **{"&&": "and", "&": "and", "||": "or", "|": "or", "!": "not"},
-    **{"=>": "->", "<=>": "<->"},
-}
+_SIGNS = {"&&": "and", "&": "and", "||": "or", "|": "or", "!": "not", "=>": "->", "<=>": "<->"}
 _WORDS = {
     **{word: name for word, name in {**UNARY_TEMPORAL, **BINARY_TEMPORAL}.items() if word != name},
     **{"implies": "->", "iff": "<->"},
@@ -112,44 +110,28 @@ def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
     used = Counter(_uses(spec))
     for item in spec.items:
         kind = _KINDS.get(type(item))
-        names = (
-            [item.name, *(name for name, _ in item.members)] if isinstance(item, ast.Enum) else [item.name]
-        )
-        if kind is not None and not any(used[name] for name in names):
-            yield Diagnostic(
-                "W105",
-                f"the {kind} `{item.name}` is never used",
-                item.name_span,
-                help=("remove it",),
-            )
+        members = [name for name, _ in item.members] if isinstance(item, ast.Enum) else []
+        if kind is not None and not any(used[name] for name in (item.name, *members)):
+            yield _unused(f"the {kind} `{item.name}` is never used", item.name_span)
         if isinstance(item, ast.Def):
-            yield from _unused_arguments(item)
+            inner = set(_uses(item.value))
+            for formal in item.formals:
+                if formal.name not in inner:
+                    message = f"`{item.name}` never uses its argument `{formal.name}`"
+                    yield _unused(message, formal.span, ", here and where the definition is used")
     for entry in spec.imports:
         name = entry.alias or (entry.target if not entry.is_file else "")
         if name and not used[name]:
-            yield Diagnostic("W105", f"the import `{name}` is never used", entry.span, help=("remove it",))
+            yield _unused(f"the import `{name}` is never used", entry.span)
 
 
-def _unused_arguments(item: ast.Def) -> Iterator[Diagnostic]:
-    used = set(_uses(item.value))
-    for formal in item.formals:
-        if formal.name not in used:
-            yield Diagnostic(
-                "W105",
-                f"`{item.name}` never uses its argument `{formal.name}`",
-                formal.span,
-                help=("remove it, here and where the definition is used",),
-            )
+def _unused(message: str, span: Span, where: str = "") -> Diagnostic:
+    return Diagnostic("W105", message, span, help=(f"remove it{where}",))
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
     """Yield all names that are read below a node."""
-    for node in descendants(root):
-        match node:
-            case ast.Name(name=name) | ast.TypeRef(name=name):
-                yield name
-            case _:
-                continue
+    return (node.name for node in descendants(root) if isinstance(node, ast.Name | ast.TypeRef))
 
 
 def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
@@ -157,12 +139,11 @@ def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
     kinds = {type(item) for item in spec.items}
     if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
         name = spec.name or spec.source.name
-        yield Diagnostic(
-            "W504",
+        message, advice = (
             f"`{name}` requires nothing",
-            spec.source.span(0, 0),
-            help=("say what must hold:  require name: always[0, T] x > 0",),
+            "say what must hold:  require name: always[0, T] x > 0",
         )
+        yield Diagnostic("W504", message, spec.source.span(0, 0), help=(advice,))
 
 
 Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]

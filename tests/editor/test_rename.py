@@ -9,8 +9,9 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Systems, analyse
-from stlc.editor.rename import RenameError, apply, can_rename, rename
+from stlc.editor.rename import RenameError, can_rename, rename
 from stlc.grammar.parse.parser import parse
+from stlc.lint.lint import edited
 from stlc.source import Source
 
 DATA = sorted((Path(__file__).parent.parent / "grammar/data").glob("*.stl"))
@@ -18,7 +19,7 @@ DATA = sorted((Path(__file__).parent.parent / "grammar/data").glob("*.stl"))
 
 def renamed(write, text: str, new: str) -> str:
     document, offset = write(text)
-    return apply(document.source.text, rename(document, offset, new))
+    return edited(document.source.text, rename(document, offset, new))
 
 
 def test_every_use(write):
@@ -104,7 +105,7 @@ def test_the_formulas_stay_whatever_is_renamed(path):
     assert before
     for one in document.names.occurrences[::2]:
         if one.declares and one.symbol.kind != "signal" and can_rename(document, one.span.start):
-            changed = apply(text, rename(document, one.span.start, "another_name"))
+            changed = edited(text, rename(document, one.span.start, "another_name"))
             assert changed != text
             assert formulas(changed) == before, one.symbol
 

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.columns import read_levels
 from stlc.dynamics.declaration.learning import INTEGERS, Term, term_list
-from stlc.dynamics.declaration.motion import SETS, Assign, rate_unit, read_sets, states_of
+from stlc.dynamics.declaration.motion import SETS, Assign, components, rate_unit, read_sets, states_of
 from stlc.dynamics.schema.expressions import written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
@@ -267,15 +267,11 @@ def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
     """Terms added to derivatives (or next values), in the unit of the state per second."""
     found: list[Assign] = []
-    here = cx.amounts().here
     for entry in cx.reader.entries(node, label):
         columns = states_of(entry, label, cx)
-        if not columns:
-            continue
-        unit = columns[0].unit if cx.discrete else rate_unit(columns[0].unit)
-        values = here.stored_each(entry.value, f"`{entry.key.text}`", unit, len(columns))
-        text = written(entry.value)
-        found.extend(Assign(c.name, value, text) for c, value in zip(columns, values or (), strict=False))
+        if columns:
+            unit = columns[0].unit if cx.discrete else rate_unit(columns[0].unit)
+            found.extend(components(columns, entry.value, f"`{entry.key.text}`", unit, cx.amounts()))
     return tuple(found)
 
 

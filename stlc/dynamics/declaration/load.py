@@ -135,10 +135,10 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
     if found.stlc is not None and version not in (None, VERSION):
         message, advice = f"schema version {version} is not known", f"this release reads `stlc: {VERSION}`"
         reader.report("S103", message, found.stlc.span, advice)
-    if not _empty(found.plugin):
-        assert found.plugin is not None
+    plugin = found.plugin
+    if plugin is not None and (plugin.size > 1 or (isinstance(plugin, Scalar) and not plugin.is_null)):
         message, label = f"{_PLUGIN} is not supported by this version", "not acted on, so it is refused"
-        reader.report("E015", message, first_line(found.plugin.span), label=label)
+        reader.report("E015", message, first_line(plugin.span), label=label)
     decl = _declaration(found, reader, path, overrides or {})
     reader.close()
     decl = replace(decl, bases=bases)
@@ -273,19 +273,6 @@ def moving_parts(decl: SystemDecl) -> MovingParts:
     reader = Reader(decl.source)
     found, _ = _sections(decl.source, decl.overrides, reader)
     return MovingParts(_named(found, reader).cx, found.flow, found.jump)
-
-
-def _empty(node: Node | None) -> bool:
-    """True if a section is empty."""
-    match node:
-        case None:
-            return True
-        case Scalar():
-            return node.is_null
-        case Mapping(entries=entries):
-            return not entries
-        case Sequence(items=items):
-            return not items
 
 
 # ---------------------------------------------------------------------------------- extends

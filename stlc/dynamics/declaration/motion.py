@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import sampler_names
+from stlc.compile.ir.traverse import subexpressions
 from stlc.dynamics.model.algebra import map_parts
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context
@@ -231,44 +232,24 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
     shared = {draw for draw, count in readers.items() if count > 1}
     if not shared:
         return tuple(assigns)
-    writer = _Writer(assigns[0].name, shared)
-    changed = [replace(assign, value=writer.rewrite(assign.value)) for assign in assigns]
-    return (*writer.before, *changed)
+    before: list[Assign] = []
+    known: dict[int, ir.Num] = {}
 
-
-def _samplers(num: ir.Num) -> frozenset[int]:
-    """Identities of the samplers in a number."""
-    found: set[int] = set()
-    seen: set[int] = set()
-
-    def visit(part: ir.Num) -> ir.Num:
-        if id(part) not in seen:
-            seen.add(id(part))
-            if isinstance(part, ir.Op) and part.name in _SAMPLERS:
-                found.add(id(part))
-            map_parts(part, visit)
-        return part
-
-    visit(num)
-    return frozenset(found)
-
-
-class _Writer:
-    """Replaces shared samplers by names; `before` are their assignments, in order."""
-
-    def __init__(self, prefix: str, shared: set[int]) -> None:
-        self.before: list[Assign] = []
-        self._prefix = prefix
-        self._shared = shared
-        self._known: dict[int, ir.Num] = {}
-
-    def rewrite(self, num: ir.Num) -> ir.Num:
+    def rewritten(num: ir.Num) -> ir.Num:
         """The number with shared samplers replaced by names."""
-        if id(num) not in self._known:
-            changed = map_parts(num, self.rewrite)
-            if id(num) in self._shared:
-                name = f"{self._prefix}#{len(self.before)}"
-                self.before.append(Assign(name, changed))
-                changed = ir.Signal(name)
-            self._known[id(num)] = changed
-        return self._known[id(num)]
+        if id(num) not in known:
+            changed = map_parts(num, rewritten)
+            if id(num) in shared:
+                before.append(Assign(f"{assigns[0].name}#{len(before)}", changed))
+                changed = ir.Signal(before[-1].name)
+            known[id(num)] = changed
+        return known[id(num)]
+
+    changed = [replace(assign, value=rewritten(assign.value)) for assign in assigns]
+    return (*before, *changed)
+
+
+def _samplers(num: ir.Num) -> set[int]:
+    """Identities of the samplers in a number."""
+    parts = subexpressions(num)
+    return {id(part) for part in parts if isinstance(part, ir.Op) and part.name in _SAMPLERS}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -27,17 +27,17 @@ class Rows:
     count: int
     generator: torch.Generator
 
+    def _drawn(self, sampler: Callable[..., Tensor]) -> Tensor:
+        generator = self.generator
+        return sampler(self.count, generator=generator, dtype=torch.float64, device=generator.device)
+
     def uniforms(self) -> Tensor:
         """Uniform numbers in [0, 1), (count,)."""
-        return torch.rand(
-            self.count, generator=self.generator, dtype=torch.float64, device=self.generator.device
-        )
+        return self._drawn(torch.rand)
 
     def normals(self) -> Tensor:
         """Standard normal numbers, (count,)."""
-        return torch.randn(
-            self.count, generator=self.generator, dtype=torch.float64, device=self.generator.device
-        )
+        return self._drawn(torch.randn)
 
     def blank(self) -> Tensor:
         """Zeros, (count,), to broadcast constants."""

@@ -6,12 +6,11 @@ multiplies batches of transforms. Where that package is installed, `stlc system 
 
 from __future__ import annotations
 
-import contextlib
 import io
-import warnings
-from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
+from warnings import catch_warnings
 
 import numpy as np
 import torch
@@ -58,8 +57,9 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
     if find_spec("pytorch_kinematics") is None:
         return Comparison(function.name, None, f"{LIBRARY} is not installed: pip install 'stlc[panda]'")
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (POSITIONS, len(function.body.formals)))
+    nowhere = io.StringIO()  # for the library's messages about tags that it ignores
     try:
-        with _silent():
+        with redirect_stdout(nowhere), redirect_stderr(nowhere), catch_warnings(action="ignore"):
             theirs = _by_library(function, q)
     except Exception as error:  # any error about a description that it does not support
         return Comparison(function.name, None, f"{LIBRARY} does not take it: {type(error).__name__}")
@@ -94,16 +94,3 @@ def _by_body(body: ir.Body, q: Doubles) -> Doubles:
     program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Suppress the library's messages about tags that it ignores."""
-    nowhere = io.StringIO()
-    with (
-        contextlib.redirect_stdout(nowhere),
-        contextlib.redirect_stderr(nowhere),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")
-        yield
