@@ -34,3 +34,21 @@ def add(left: ir.Num, right: ir.Num) -> ir.Num:
 def multiply(left: ir.Num, right: ir.Num) -> ir.Num:
     """Product of two numbers."""
     return ir.Op("mul", (left, right))
+
+
+class Assignments:
+    """Assignments that name intermediate results, so that none is duplicated.
+
+    Attributes:
+        lets: (name, number), in order.
+    """
+
+    def __init__(self) -> None:
+        self.lets: list[tuple[str, ir.Num]] = []
+
+    def name(self, num: ir.Num, pattern: str) -> ir.Num:
+        """A column that holds `num`; `{}` in the pattern of its name is the number of the assignment."""
+        if isinstance(num, ir.Const | ir.Signal):
+            return num
+        self.lets.append((pattern.format(len(self.lets)), num))
+        return ir.Signal(self.lets[-1][0])

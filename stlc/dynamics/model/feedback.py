@@ -27,10 +27,14 @@ from stlc.dynamics.declaration.learning import Feedback
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
     from numpy.typing import NDArray
 
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.dynamics.declaration.learning import FeedbackDecl
+
+    Doubles: TypeAlias = NDArray[np.float64]
 
 SLOPE = 1e-5
 """Step of the central differences, as a share of a column's range."""
@@ -57,10 +61,10 @@ class Linear:
         moving: their names.
     """
 
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    a: Doubles
+    b: Doubles
+    rest: Doubles
+    scale: Doubles
     moving: tuple[str, ...]
 
     @property
@@ -78,7 +82,11 @@ def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
     if turning:
         raise NoFeedbackError(f"the control `{turning[0]}` is a direction (`squash: angle`)")
     state, control = _rest(decl, asked.around)
-    gain = _given(decl, asked.gain) if asked.gain else _lqr(decl, asked.weights, state, control)
+    if asked.gain:
+        rows = (asked.gain.get(each.name, {}) for each in decl.controls)
+        gain = np.array([[row.get(name, 0.0) for name in decl.signature.names] for row in rows])
+    else:
+        gain = _lqr(decl, asked.weights, state, control)
     half = [0.5 * (each.high - each.low) for each in decl.controls]
     authority = tuple(asked.authority * each for each in half)
     feedback = Feedback(
@@ -99,7 +107,7 @@ def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
 # ------------------------------------------------------------------ linearisation
 
 
-def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubles]:
     """Operating point: state (n,) and control (m,), in the units of the columns.
 
     States that are not given are 0, or the middle of a range that excludes 0; controls are those within their
@@ -132,7 +140,7 @@ def _held(linear: Linear) -> NDArray[np.bool_]:
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
 
-def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np.float64]) -> Linear:
+def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
     """Linearise the exact step at a point (n,), (m,) by central differences, in the units of the columns."""
     columns, names = decl.signature.columns, decl.signature.names
     moved = {assign.name for assign in decl.flow}
@@ -166,7 +174,7 @@ def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np
     )
 
 
-def _stepped(decl: SystemDecl, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
     """One exact step without feedback from states and controls: (k, n + m) -> (k, n)."""
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
@@ -182,16 +190,7 @@ def _stepped(decl: SystemDecl, points: NDArray[np.float64]) -> NDArray[np.float6
 # ---------------------------------------------------------------------------------- gains
 
 
-def _given(decl: SystemDecl, gain: Mapping[str, Mapping[str, float]]) -> NDArray[np.float64]:
-    rows = [
-        [gain.get(each.name, {}).get(name, 0.0) for name in decl.signature.names] for each in decl.controls
-    ]
-    return np.array(rows, dtype=np.float64)
-
-
-def _lqr(
-    decl: SystemDecl, weights: Mapping[str, float], state: NDArray[np.float64], control: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _lqr(decl: SystemDecl, weights: Mapping[str, float], state: Doubles, control: Doubles) -> Doubles:
     """Gain of the linear-quadratic regulator, (m, n), in the units of the columns.
 
     Costs are squares of deviations divided by half the range, times `weights`; a state that nothing depends
@@ -218,16 +217,14 @@ def _lqr(
     return whole
 
 
-def riccati(
-    a: NDArray[np.float64], b: NDArray[np.float64], q: NDArray[np.float64], r: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
     """Limit gain (m, n) of the Riccati recursion.
 
     Unlike the algebraic equation it works where an integrator is uncontrollable and no stabilising solution
     exists.
     """
-    cost: NDArray[np.float64] = q.copy()
-    gain: NDArray[np.float64] = np.zeros((b.shape[1], len(a)))
+    cost: Doubles = q.copy()
+    gain: Doubles = np.zeros((b.shape[1], len(a)))
     with np.errstate(all="ignore"):
         for _ in range(RECURSIONS):
             before = gain
@@ -265,26 +262,18 @@ def growth_of(decl: SystemDecl) -> float:
 
     With an inner feedback, that of the closed loop.
     """
+    feedback = decl.feedback
     try:
-        if decl.feedback is None:
+        if feedback is None:
             linear = linearised(decl, *_rest(decl, {}))
-            return _power(linear.growth, decl.horizon)
-        point = np.array(decl.feedback.state), np.array(decl.feedback.control)
-        linear = linearised(_opened(decl, decl.feedback), *point)
+            factor = linear.growth
+        else:
+            ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
+            own = tuple(replace(each, low=low, high=high) for each, low, high in ends)
+            plant = replace(decl, controls=own, feedback=None)
+            linear = linearised(plant, np.array(feedback.state), np.array(feedback.control))
+            gain = np.array(feedback.gain)[:, [decl.signature.names.index(name) for name in linear.moving]]
+            factor = float(np.abs(np.linalg.eigvals(linear.a - linear.b @ gain)).max(initial=0.0))
     except (NoFeedbackError, ArithmeticError, TypeError, KeyError, np.linalg.LinAlgError):
         return 1.0
-    at = [decl.signature.names.index(name) for name in linear.moving]
-    gain = np.array(decl.feedback.gain)[:, at]
-    loop = np.abs(np.linalg.eigvals(linear.a - linear.b @ gain)).max(initial=0.0)
-    return _power(float(loop), decl.horizon)
-
-
-def _opened(decl: SystemDecl, feedback: Feedback) -> SystemDecl:
-    """The plant with the actuators' own ranges, without feedback."""
-    ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
-    own = tuple(replace(each, low=low, high=high) for each, low, high in ends)
-    return replace(decl, controls=own, feedback=None)
-
-
-def _power(factor: float, steps: int) -> float:
-    return math.exp(min(steps * math.log(max(factor, 1e-300)), 700.0))
+    return math.exp(min(decl.horizon * math.log(max(factor, 1e-300)), 700.0))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.model.algebra import add, multiply, substitute
+from stlc.dynamics.model.algebra import Assignments, add, multiply, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
 
@@ -26,25 +26,6 @@ class ModelStep:
     next: Mapping[str, ir.Num]
 
 
-@dataclass
-class _Writer:
-    """Writer of assignments that names intermediate results, so that none is duplicated."""
-
-    lets: list[tuple[str, ir.Num]] = field(default_factory=list)
-
-    def name(self, hint: str, num: ir.Num) -> ir.Num:
-        """A column that holds `num`."""
-        if isinstance(num, ir.Const | ir.Signal):
-            return num
-        name = f"{hint}#{len(self.lets)}"
-        self.lets.append((name, num))
-        return ir.Signal(name)
-
-    def named(self, state: State) -> dict[str, ir.Num]:
-        """All components as named columns."""
-        return {name: self.name(name, num) for name, num in state.items()}
-
-
 def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.
 
@@ -52,9 +33,9 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     read the state at the start of the step, clamps act after each substep, and of two jumps on one component
     the later one wins.
     """
-    writer = _Writer()
+    writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
-    given = {name: writer.name(name, num) for name, num in commands(decl).items()}
+    given = {name: writer.name(num, name + "#{}") for name, num in commands(decl).items()}
     state = _flow(decl, writer, start, given)
     moved = {assign.name for assign in decl.flow}
     for jump in decl.jumps:
@@ -95,18 +76,21 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
     return replace(jump, guard=substitute(jump.guard, given), resets=resets)
 
 
-def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
+def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
     """All substeps of the continuous part; `given` are the actuator commands."""
 
+    def named(at: State) -> State:
+        return {name: writer.name(num, name + "#{}") for name, num in at.items()}
+
     def rate(at: State) -> State:
-        table = {**writer.named(at), **given}
+        table = {**named(at), **given}
         return {assign.name: substitute(assign.value, table) for assign in decl.flow}
 
     integrate = INTEGRATORS.get(decl.integrator)
     length = float(decl.dt) / decl.substeps
     for substep in range(decl.substeps):
         if substep:
-            state = writer.named(state)
+            state = named(state)
         moved = {**state, **rate(state)} if decl.discrete else integrate(rate, state, length)
         state = {name: _clamped(decl, name, num) for name, num in moved.items()}
     return state

@@ -13,16 +13,18 @@ from typing import TypeAlias
 import numpy as np
 
 from stlc.compile.ir import nodes as ir
+from stlc.dynamics.model.algebra import Assignments
 from stlc.dynamics.robots.urdf import Doubles, Joint
 
 Point: TypeAlias = tuple[ir.Num, ...]
+NAME = "v{}"
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
     """Position of the tip in the frame of the base, (3,) m, from the positions of the moving joints."""
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
-    writer = _Lines()
+    writer = Assignments()
     point: Point = (ir.Const(0.0),) * 3
     for joint in reversed(joints):
         if joint.kind == "revolute":
@@ -33,48 +35,33 @@ def position(joints: Sequence[Joint]) -> ir.Body:
     return ir.Body(tuple(formals.values()), tuple(writer.lets), point)
 
 
-class _Lines:
-    """Writer of named intermediate results, so that none is duplicated."""
-
-    def __init__(self) -> None:
-        self.lets: list[tuple[str, ir.Num]] = []
-
-    def name(self, num: ir.Num) -> ir.Num:
-        """A column that holds `num`."""
-        if isinstance(num, ir.Const | ir.Signal):
-            return num
-        name = f"v{len(self.lets)}"
-        self.lets.append((name, num))
-        return ir.Signal(name)
-
-
-def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point:
+def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> Point:
     """A point rotated about an axis (Rodrigues)."""
     along = _linear(np.outer(axis, axis), point)
-    across = tuple(writer.name(num) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
+    across = tuple(writer.name(num, NAME) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
     if all(num == ir.Const(0.0) for num in across):
         return point
     x, y, z = axis
     aside = _linear(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), point)
-    cosine, sine = (writer.name(ir.Op(name, (angle,))) for name in ("cos", "sin"))
+    cosine, sine = (writer.name(ir.Op(name, (angle,)), NAME) for name in ("cos", "sin"))
     return tuple(
-        writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)))
+        writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)), NAME)
         for kept, part, turned in zip(along, across, aside, strict=True)
     )
 
 
-def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Point:
+def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) -> Point:
     """A point translated along an axis."""
     return tuple(
-        writer.name(_sum(part, _product(ir.Const(float(share)), length)))
+        writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
         for part, share in zip(point, axis, strict=True)
     )
 
 
-def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: _Lines) -> Point:
+def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: Assignments) -> Point:
     """`rotation @ point + offset`."""
     return tuple(
-        writer.name(_sum(part, ir.Const(float(shift))))
+        writer.name(_sum(part, ir.Const(float(shift))), NAME)
         for part, shift in zip(_linear(rotation, point), offset, strict=True)
     )
 
