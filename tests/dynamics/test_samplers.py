@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.init.draws import Rows
+from stlc.dynamics.init.samplers import Rows
 from stlc.dynamics.model.system import System
 
 Make = Callable[..., System]

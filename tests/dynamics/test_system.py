@@ -13,7 +13,7 @@ import torch
 
 from stlc.compile.semantics.switch import Tanh
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.describe import describe
+from stlc.dynamics.declaration.decl import describe
 from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.dynamics.model.controls import raw_width, squash
 from stlc.dynamics.model.system import PROBED, System
@@ -180,7 +180,7 @@ def test_the_description_is_a_table(make: Make) -> None:
 def test_a_declaration_needs_no_torch() -> None:
     code = (
         "import sys; from stlc.dynamics.declaration.load import load_system_decl;"
-        "from stlc.dynamics.declaration.describe import describe;"
+        "from stlc.dynamics.declaration.decl import describe;"
         "print(describe(load_system_decl('examples/car.yaml'))); assert 'torch' not in sys.modules"
     )
     root = Path(__file__).parent.parent.parent

@@ -30,7 +30,7 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 @subcommand(GROUP, "show", "stlc system show car.yaml")
 def show(system: _File, set_: SetOption = None) -> Answer[documents.SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
-    from stlc.dynamics.declaration.describe import describe as in_words
+    from stlc.dynamics.declaration.decl import describe as in_words
 
     decl = _load(system, parse_overrides(set_))
 

@@ -89,7 +89,7 @@ class Worlds:
             with blamed(world, "reset", "begin"):
                 given.append(world.reset())
         parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
-        starts = [self.system.begun(x, generator) for x, generator in parts]
+        starts = [self.system.with_added(x, generator) for x, generator in parts]
         self.redrawn = 0
         if self.task.system.decl.test.starts == "any":
             return torch.cat(starts)

@@ -15,7 +15,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.controller.streams import seeded
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
-from stlc.dynamics.init.draws import Drawing, Rows
+from stlc.dynamics.init.samplers import Drawing, Rows
 from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
 from stlc.units import parse_unit
 

@@ -185,14 +185,14 @@ class FeedbackDecl:
 @reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """Read the requested feedback: `lqr`, or a mapping."""
-    asked = None
+    request = None
     if not isinstance(node, Scalar):
-        asked = read(FeedbackDecl, cx, node, label)
+        request = read(FeedbackDecl, cx, node, label)
     elif node.text == "lqr":
-        asked = FeedbackDecl()
+        request = FeedbackDecl()
     elif not node.is_null:
         cx.reader.wrong(node, label, "`lqr`, or a mapping", "feedback: {weights: {angle: 10}}")
-    return {"feedback": asked, "feedback_span": node.span}
+    return {"feedback": request, "feedback_span": node.span}
 
 
 @reads(items_of(VECTOR))

@@ -1,9 +1,13 @@
-"""Random initial states: a situation by weight, its variables in order, rejected unless `where` holds."""
+"""Random initial states: samplers such as `uniform`, and situations of a mixture, with an explicit generator.
+
+A situation is picked by weight, its variables are drawn in order, and states that fail `where` are rejected.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,12 +16,116 @@ from torch import Tensor
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import sampler_names
 from stlc.compile.semantics.switch import Hard
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation
-from stlc.dynamics.init.draws import Drawing, Rows
+from stlc.dynamics.declaration.motion import Assign
+from stlc.dynamics.model.algebra import map_parts
 from stlc.trace import load_trace
 from stlc.trace.formats.npz import read_npz
+
+_HARD = Hard()
+_SAMPLERS = frozenset(sampler_names())
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Number of rows to draw, and a random generator; float64 on the generator's device."""
+
+    count: int
+    generator: torch.Generator
+
+    def _drawn(self, sampler: Callable[..., Tensor]) -> Tensor:
+        generator = self.generator
+        return sampler(self.count, generator=generator, dtype=torch.float64, device=generator.device)
+
+    def uniforms(self) -> Tensor:
+        """Uniform numbers in [0, 1), (count,)."""
+        return self._drawn(torch.rand)
+
+    def normals(self) -> Tensor:
+        """Standard normal numbers, (count,)."""
+        return self._drawn(torch.randn)
+
+    def blank(self) -> Tensor:
+        """Zeros, (count,), to broadcast constants."""
+        return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
+
+    def pick(self, weights: Sequence[float]) -> Tensor:
+        """Random indices with probabilities proportional to `weights`, (count,)."""
+        edges = torch.tensor(weights, dtype=torch.float64).cumsum(0)
+        edges = (edges / edges[-1])[:-1].to(self.generator.device)
+        return torch.bucketize(self.uniforms(), edges, right=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Call:
+    """One occurrence of a sampler; equal expressions are drawn independently."""
+
+    name: str
+    sampler: str
+    args: ArrayProgram
+    arity: int
+
+
+class Drawing:
+    """An assignment with its samplers compiled."""
+
+    def __init__(self, assign: Assign) -> None:
+        self.name = assign.name
+        self._calls: list[_Call] = []
+        self._seen: dict[int, ir.Num] = {}
+        self._program = ArrayProgram({assign.name: self._extract(assign.value)})
+        self._seen.clear()
+
+    def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
+        """Value in every row, (count,) float64; `env` holds at least one (count,) column."""
+        if self._calls:
+            env = dict(env)
+            for call in self._calls:
+                args = call.args(env, TORCH, _HARD)
+                env[call.name] = _draw(call.sampler, [args[str(i)] for i in range(call.arity)], rows)
+        value: Tensor = self._program(env, TORCH, _HARD)[self.name]
+        return value.expand(rows.count)
+
+    def _extract(self, num: ir.Num) -> ir.Num:
+        """The number with every sampler replaced by a column drawn before."""
+        if id(num) in self._seen:
+            return self._seen[id(num)]
+        if isinstance(num, ir.Op) and num.name in _SAMPLERS:
+            args = {str(i): self._extract(arg) for i, arg in enumerate(num.args)}
+            name = f"draw#{len(self._calls)}"
+            self._calls.append(_Call(name, num.name, ArrayProgram(args), len(args)))
+            found: ir.Num = ir.Signal(name)
+        else:
+            found = map_parts(num, self._extract)
+        self._seen[id(num)] = found
+        return found
+
+
+def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
+    """Draw from a sampler, one number per row."""
+    match sampler, args:
+        case "uniform", [low, high]:
+            return torch.lerp(low, high, rows.uniforms())
+        case "normal", [mean, deviation]:
+            return mean + deviation * rows.normals()
+        case "truncnorm", [mean, deviation, low, high]:
+            below, above = (torch.special.ndtr((end - mean) / deviation) for end in (low, high))
+            quantile = torch.lerp(below, above, rows.uniforms())
+            return torch.clamp(mean + deviation * torch.special.ndtri(quantile), low, high)
+        case "bernoulli", [chance]:
+            return (rows.uniforms() < chance).to(torch.float64)
+        case "randint", [low, high]:
+            span = high - low + 1.0
+            return low + torch.minimum(torch.floor(rows.uniforms() * span), span - 1.0)
+        case "choice", options:
+            index = torch.floor(rows.uniforms() * len(options)).to(torch.int64)
+            return torch.stack(options).gather(0, index[None])[0]
+        case _:
+            raise ValueError(f"unknown sampler {sampler}")
+
 
 MAX_ROUNDS = 500
 MAX_BATCH = 1 << 20
@@ -28,7 +136,6 @@ RATED = 10_000
 SHUFFLED = 1 << 20
 """Grids up to this size are drawn in permutations; in larger ones each axis is drawn independently."""
 
-_HARD = Hard()
 Table = dict[str, Tensor]
 
 
@@ -80,14 +187,14 @@ class InitialStates:
 
     Attributes:
         drawn: number of states proposed so far.
-        kept: number of states that met every condition.
+        accepted: number of states that met every condition.
     """
 
     def __init__(self, decl: InitDecl, names: tuple[str, ...]) -> None:
         self.decl = decl
         self.names = names
         self.drawn = 0
-        self.kept = 0
+        self.accepted = 0
         self._params = tuple(Drawing(assign) for assign in decl.params)
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
@@ -96,7 +203,7 @@ class InitialStates:
     @property
     def acceptance(self) -> float:
         """Share of proposed states that were accepted; 1 before the first draw."""
-        return self.kept / self.drawn if self.drawn else 1.0
+        return self.accepted / self.drawn if self.drawn else 1.0
 
     def sample(self, n: int, generator: torch.Generator) -> Tensor:
         """Draw initial states, (n, dim) float64 on the generator's device.
@@ -104,23 +211,23 @@ class InitialStates:
         Raises SystemFileError (S301) where (nearly) every proposed state is rejected.
         """
         if not self.decl.where:
-            self.drawn, self.kept = self.drawn + n, self.kept + n
+            self.drawn, self.accepted = self.drawn + n, self.accepted + n
             return self._propose(n, generator)
         found: list[Tensor] = []
-        missing, drawn, kept = n, 0, 0
+        missing, drawn, accepted = n, 0, 0
         for _ in range(MAX_ROUNDS):
-            rate = max(kept / drawn, 1e-4) if drawn else 0.5
+            rate = max(accepted / drawn, 1e-4) if drawn else 0.5
             batch = min(int(missing / rate * 1.1) + 64, MAX_BATCH)
             proposed = self._propose(batch, generator)
             good = proposed[self.holds(proposed)]
-            drawn, kept = drawn + batch, kept + len(good)
+            drawn, accepted = drawn + batch, accepted + len(good)
             found.append(good[:missing])
             missing -= len(found[-1])
-            if not missing or (drawn >= 1_000_000 and kept < drawn * 1e-5):
+            if not missing or (drawn >= 1_000_000 and accepted < drawn * 1e-5):
                 break
-        self.drawn, self.kept = self.drawn + drawn, self.kept + kept
+        self.drawn, self.accepted = self.drawn + drawn, self.accepted + accepted
         if missing:
-            raise self._rejected(drawn, kept)
+            raise self._rejected(drawn, accepted)
         return torch.cat(found)
 
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
@@ -147,14 +254,14 @@ class InitialStates:
 
     def require_many(self, n: int = 256, *, seed: int = 0) -> None:
         """Raise SystemFileError (S301) where less than 1 % of proposed states is accepted."""
-        before = self.drawn, self.kept
+        before = self.drawn, self.accepted
         self.sample(n, torch.Generator().manual_seed(seed))
-        drawn, kept = self.drawn - before[0], self.kept - before[1]
-        if kept < FEW * drawn:
-            raise self._rejected(drawn, kept)
+        drawn, accepted = self.drawn - before[0], self.accepted - before[1]
+        if accepted < FEW * drawn:
+            raise self._rejected(drawn, accepted)
 
-    def _rejected(self, drawn: int, kept: int) -> SystemFileError:
-        message = f"of {drawn} initial states that were drawn, {kept} meet every condition of `where`"
+    def _rejected(self, drawn: int, accepted: int) -> SystemFileError:
+        message = f"of {drawn} initial states that were drawn, {accepted} meet every condition of `where`"
         return SystemFileError(
             self._finding("S301", message, "too narrow, or it contradicts `mixture`", self._rates())
         )

@@ -73,7 +73,7 @@ class Linear:
         return float(np.abs(np.linalg.eigvals(self.a)).max(initial=0.0))
 
 
-def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
+def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
     """Add the requested inner feedback to a declaration.
 
     Raises NoFeedbackError: an unstable mode is uncontrollable, or a control is an `angle`.
@@ -81,14 +81,14 @@ def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
     turning = [control.name for control in decl.controls if control.squash == "angle"]
     if turning:
         raise NoFeedbackError(f"the control `{turning[0]}` is a direction (`squash: angle`)")
-    state, control = _rest(decl, asked.around)
-    if asked.gain:
-        rows = (asked.gain.get(each.name, {}) for each in decl.controls)
+    state, control = _rest(decl, request.around)
+    if request.gain:
+        rows = (request.gain.get(each.name, {}) for each in decl.controls)
         gain = np.array([[row.get(name, 0.0) for name in decl.signature.names] for row in rows])
     else:
-        gain = _lqr(decl, asked.weights, state, control)
+        gain = _lqr(decl, request.weights, state, control)
     half = [0.5 * (each.high - each.low) for each in decl.controls]
-    authority = tuple(asked.authority * each for each in half)
+    authority = tuple(request.authority * each for each in half)
     feedback = Feedback(
         tuple(map(tuple, gain.tolist())),
         tuple(state.tolist()),

@@ -18,13 +18,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.describe import describe
+from stlc.dynamics.declaration.decl import SystemDecl, describe
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.init.draws import Drawing, Rows
-from stlc.dynamics.init.samplers import InitialStates
+from stlc.dynamics.init.samplers import Drawing, InitialStates, Rows
 from stlc.dynamics.model.algebra import add, multiply, names_in, substitute
 from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
@@ -151,7 +149,7 @@ class System:
         moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
         return torch.stack([moved[name] for name in self.names], 1)
 
-    def begun(self, states: Tensor, generator: torch.Generator) -> Tensor:
+    def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """Append parameters, drawn, and timers at mission start to states: (B, n - added) -> (B, n)."""
         if not self.added:
             return states
@@ -280,7 +278,7 @@ class System:
             else:
                 generator.manual_seed(seed)
         states = self.initial.sample(n, generator)
-        return self.begun(states, generator).to(device=device, dtype=dtype)
+        return self.with_added(states, generator).to(device=device, dtype=dtype)
 
     # -------------------------------------------------------------- policy, objective
 

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.robots.urdf import Doubles, read_urdf
+from stlc.dynamics.robots.kinematics import Doubles, read_urdf
 
 LIBRARY = "pytorch-kinematics"
 POSITIONS = 256

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any, final
@@ -108,18 +109,24 @@ class Bound:
 
     def __call__(self, *components: Array) -> Sequence[Array]:
         """All components of the result. Raises SystemFileError (S208) where the function fails."""
-        torch_there = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
-        to_torch, to_numpy = self.decl.library == "torch", self.decl.library == "numpy"
-        parts: Sequence[Array] = components
-        if to_torch and not torch_there:
-            parts = [_torch().as_tensor(np.asarray(part)) for part in np.broadcast_arrays(*components)]
-        elif to_numpy and torch_there:
-            parts = [part.detach().cpu().numpy() for part in _torch().broadcast_tensors(*components)]
-        found = self._checked(_joined(parts, self.arguments), _shape(parts))
-        if to_torch and not torch_there:
+        given = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
+        wanted = given if self.decl.library is None else self.decl.library == "torch"
+        torch: Any = importlib.import_module("torch") if given or wanted else None
+        parts: Sequence[Array] = (torch.broadcast_tensors if given else np.broadcast_arrays)(*components)
+        shape = tuple(parts[0].shape) if parts else ()
+        if wanted and not given:
+            parts = [torch.as_tensor(np.asarray(part)) for part in parts]
+        elif given and not wanted:
+            parts = [part.detach().cpu().numpy() for part in parts]
+        stack, rest = torch.stack if wanted else np.stack, iter(parts)
+        values = [
+            next(rest) if size is None else stack(list(islice(rest, size)), -1) for size in self.arguments
+        ]
+        found = self._checked(values, shape)
+        if wanted and not given:
             found = found.detach().numpy()
-        elif to_numpy and torch_there:
-            found = _torch().as_tensor(found).to(components[0])
+        elif given and not wanted:
+            found = torch.as_tensor(found).to(components[0])
         return [found] if self.result is None else [found[..., i] for i in range(self.result)]
 
     def _checked(self, values: Sequence[Array], batch: tuple[int, ...]) -> Array:
@@ -133,32 +140,6 @@ class Bound:
         wanted = batch if self.result is None else (*batch, self.result)
         if shape == wanted:
             return found
-        given = ", ".join(str(tuple(value.shape)) for value in values)
+        shapes = ", ".join(str(tuple(value.shape)) for value in values)
         message = f"the function `{self.decl.name}` gives an array {shape}, declared is {wanted}"
-        raise _refused(self.decl, message, f"for arguments {given}")
-
-
-def _torch() -> Any:
-    return importlib.import_module("torch")
-
-
-def _shape(parts: Sequence[Array]) -> tuple[int, ...]:
-    return np.broadcast_shapes(*(tuple(getattr(part, "shape", ())) for part in parts))
-
-
-def _joined(parts: Sequence[Array], sizes: tuple[int | None, ...]) -> list[Array]:
-    """Arguments joined from their components, broadcast to one shape except for the last axis."""
-    if all(isinstance(part, (float, np.ndarray, np.generic)) for part in parts):
-        library: Any = np
-        spread = np.broadcast_arrays(*parts)
-    else:
-        library = _torch()
-        spread = library.broadcast_tensors(*parts)
-    values, start = [], 0
-    for size in sizes:
-        if size is None:
-            values.append(spread[start])
-        else:
-            values.append(library.stack(list(spread[start : start + size]), -1))
-        start += 1 if size is None else size
-    return values
+        raise _refused(self.decl, message, f"for arguments {shapes}")

@@ -1,20 +1,161 @@
-"""Forward kinematics: a chain of joints, unrolled into numbers of the IR.
+"""Robot descriptions (URDF), and their forward kinematics as numbers of the IR.
 
-Constants are folded, so a seven-joint arm needs the sines and cosines of its joints and some thirty products
-and sums: the torch graph and the C kernel compute the same few operations.
+A chain of joints is unrolled. Constants are folded, so a seven-joint arm needs the sines and cosines of its
+joints and some thirty products and sums: the torch graph and the C kernel compute the same few operations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import TypeAlias
+from pathlib import Path
+from typing import Literal, TypeAlias
+from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import Assignments
-from stlc.dynamics.robots.urdf import Doubles, Joint
+
+Doubles: TypeAlias = NDArray[np.float64]
+Kind: TypeAlias = Literal["revolute", "prismatic", "fixed"]
+MAX_BYTES = 10_000_000
+_SNAP = 1e-9
+"""Tolerance within which an entry of a rotation is rounded to an integer: files round pi / 2."""
+_KINDS: Mapping[str, Kind] = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "fixed": "fixed",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint, in the frame of its parent link.
+
+    Attributes:
+        name: as written.
+        kind: type of the joint.
+        parent: link that it is attached to.
+        child: link that it moves.
+        offset: origin of the child, (3,) m.
+        rotation: of the child at rest, (3, 3).
+        axis: unit vector in the frame of the child, (3,).
+    """
+
+    name: str
+    kind: Kind
+    parent: str
+    child: str
+    offset: Doubles
+    rotation: Doubles
+    axis: Doubles
+
+
+def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
+    """The joints from `base` (the root of the robot, if left out) to the link `tip`.
+
+    Raises:
+        ValueError: the text is not URDF, lacks the link, or has an unsupported joint.
+    """
+    joints = {joint.get("name", ""): joint for joint in robot_of(text).findall("joint")}
+    above = {_link(joint, "child"): joint for joint in joints.values()}
+    links = above.keys() | {_link(joint, "parent") for joint in joints.values()}
+    for link in (tip, base):
+        if link is not None and link not in links:
+            raise ValueError(f"there is no link `{link}`; links: {', '.join(sorted(links))}")
+    found: list[Joint] = []
+    here = tip
+    while here in above and here != base:
+        if len(found) > len(joints):
+            raise ValueError(f"the joints above `{tip}` form a ring")
+        found.append(_joint(above[here]))
+        here = found[-1].parent
+    if base is not None and here != base:
+        raise ValueError(f"`{base}` is not above `{tip}`")
+    return tuple(reversed(found))
+
+
+def read_urdf(path: Path) -> str:
+    """The text of a file. Raises OSError, or ValueError where it is too large or not UTF-8."""
+    if path.stat().st_size > MAX_BYTES:
+        raise ValueError(f"it is larger than {MAX_BYTES // 1_000_000} MB")
+    return path.read_text(encoding="utf-8")
+
+
+def robot_of(text: str) -> ElementTree.Element:
+    """Root element of a description. Raises ValueError where it is not URDF, or not plain XML."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("a robot description has no document type and no entities")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is not XML: {error}") from error
+    if root.tag != "robot":
+        raise ValueError(f"its root is <{root.tag}>, not <robot>")
+    return root
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    found = joint.find(end)
+    name = None if found is None else found.get("link")
+    if name is None:
+        raise ValueError(f"the joint `{joint.get('name')}` has no <{end} link>")
+    return name
+
+
+def _joint(element: ElementTree.Element) -> Joint:
+    name = element.get("name", "")
+    written = element.get("type", "")
+    if written not in _KINDS:
+        raise ValueError(f"the joint `{name}` is {written or 'of no type'}; known: {', '.join(_KINDS)}")
+    origin, axis = element.find("origin"), element.find("axis")
+    kind = _KINDS[written]
+    along = _triple(axis, "xyz", (1.0, 0.0, 0.0), name)
+    length = float(np.linalg.norm(along))
+    if kind != "fixed" and length < _SNAP:
+        raise ValueError(f"the axis of the joint `{name}` is zero")
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=_link(element, "parent"),
+        child=_link(element, "child"),
+        offset=_triple(origin, "xyz", (0.0, 0.0, 0.0), name),
+        rotation=_rotation(*_triple(origin, "rpy", (0.0, 0.0, 0.0), name)),
+        axis=along / length if kind != "fixed" else along,
+    )
+
+
+def _triple(element: ElementTree.Element | None, key: str, default: tuple[float, ...], joint: str) -> Doubles:
+    text = None if element is None else element.get(key)
+    if text is None:
+        return np.array(default)
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.array([math.nan])
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(f"`{key}` of the joint `{joint}` is not three numbers: `{text}`")
+    return values
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> Doubles:
+    """Rz(yaw) Ry(pitch) Rx(roll), as in URDF; entries close to an integer are rounded."""
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll, pitch, yaw))
+    found = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+    whole = np.rint(found)
+    return np.where(np.abs(found - whole) < _SNAP, whole, found)
+
 
 Point: TypeAlias = tuple[ir.Num, ...]
 NAME = "v{}"

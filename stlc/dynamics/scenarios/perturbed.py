@@ -82,9 +82,9 @@ def perturbable(decl: SystemDecl) -> Perturbable:
         rewriting.entries[name] = each_number(names.entries[name], scaled)
     for factor in texts:
         rewriting.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
-    loose = _laid_over(decl, *read(rewriting))
-    found = (Uncertain(factor, text, _readers(loose, factor)) for factor, text in texts.items())
-    return Perturbable(loose, tuple(each for each in found if each.states))
+    factored = _laid_over(decl, *read(rewriting))
+    found = (Uncertain(factor, text, _readers(factored, factor)) for factor, text in texts.items())
+    return Perturbable(factored, tuple(each for each in found if each.states))
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
@@ -222,13 +222,13 @@ class PerturbedSystem(System):
     """True dynamics of some agents, each with its own factors; all are stepped in one batch.
 
     Args:
-        loose: the dynamics, with a factor at every uncertain number.
+        factored: the dynamics, with a factor at every uncertain number.
         factors: (agents, numbers), 1 where a number is exact.
     """
 
-    def __init__(self, loose: Perturbable, factors: Tensor) -> None:
-        super().__init__(loose.decl)
-        self._factors = {each.factor: factors[:, index] for index, each in enumerate(loose.numbers)}
+    def __init__(self, factored: Perturbable, factors: Tensor) -> None:
+        super().__init__(factored.decl)
+        self._factors = {each.factor: factors[:, index] for index, each in enumerate(factored.numbers)}
 
     def _inputs(self, u: Tensor) -> Columns:
         """Controls, and the factors of uncertain numbers."""

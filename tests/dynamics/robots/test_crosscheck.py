@@ -12,8 +12,7 @@ from stlc.cli.framework.app import main
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.robots import crosscheck
-from stlc.dynamics.robots.kinematics import position
-from stlc.dynamics.robots.urdf import chain
+from stlc.dynamics.robots.kinematics import chain, position
 
 ROBOT = """<robot name="crane">
   <link name="ground"/><link name="mast"/><link name="boom"/><link name="hook"/>
