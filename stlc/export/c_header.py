@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 from importlib.resources import files
 from string import Template
 from typing import TYPE_CHECKING, assert_never
@@ -23,14 +22,24 @@ from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.backends.numbers import Leaf, Untranslatable
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import nodes
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.problem.native import motion_of
-from stlc.controller.problem.task import KEPT, PULL, SHORT, Task
+from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.controls import raw_width
 from stlc.dynamics.model.step import commands
 from stlc.escape import c_comment, c_string
+from stlc.export.description import (
+    MARGIN,
+    REDUCED,
+    CostTerm,
+    control_images,
+    cost_terms,
+    observation,
+    state_images,
+)
 from stlc.runtime.prefixes import generators
 
 if TYPE_CHECKING:
@@ -41,8 +50,6 @@ if TYPE_CHECKING:
     from stlc.compile.backends.c.plan import Plan
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
-    from stlc.controller.problem.pending_goals import PendingGoal
-    from stlc.dynamics.model.mirror import Mirror
     from stlc.signature import Column
 
 
@@ -174,43 +181,6 @@ def _float(value: float) -> str:
 # --------------------------------------------------------------------------------------------- numbers
 
 
-def observed(task: Task) -> list[str]:
-    """Statements that fill `seen` from the state `x`."""
-    system = task.system
-    numbers = [*system.decl.policy.observe, *(ir.Signal(column.name) for column in system.added)]
-    if not system.decl.policy.observe:
-        numbers = [ir.Signal(name) for name in system.names]
-    return _assigned("seen", numbers, {name: f"x[{i}]" for i, name in enumerate(system.names)})
-
-
-def later(task: Task) -> list[str]:
-    """Statements that fill `later` with clocks, statuses and timers one step after the state `x`."""
-    numbers = [timer.update for timer in task.system.timers]
-    return _assigned("later", numbers, {name: f"x[{i}]" for i, name in enumerate(task.names)})
-
-
-def image_of_state(mirror: Mirror, task: Task) -> list[str]:
-    """Statements that fill `image` from the state `x`."""
-    names = task.names
-    moved = {each.name: each.value for each in task.system.decl.policy.mirror}
-    numbers = [moved.get(name, ir.Signal(name)) for name in names]
-    assert mirror.side < len(names)
-    return _assigned("image", numbers, {name: f"x[{i}]" for i, name in enumerate(names)})
-
-
-def image_of_action(task: Task) -> list[str]:
-    """Statements that fill `image` from the controls `u`; angles stay within a turn of their range."""
-    controls = task.system.decl.controls
-    moved = {each.name: each.value for each in task.system.decl.policy.mirror}
-    numbers = [moved.get(each.name, ir.Signal(each.name)) for each in controls]
-    lines = _assigned("image", numbers, {each.name: f"u[{i}]" for i, each in enumerate(controls)})
-    for i, each in enumerate(controls):
-        if each.squash == "angle":
-            low = literal(each.low)
-            lines.append(f"image[{i}] = floored_mod(image[{i}] - {low}, 2.0 * PI) + {low};")
-    return lines
-
-
 def squashed(task: Task) -> list[str]:
     """Statements that fill `u` from the network's output for one step, `raw`."""
     lines, at = [], 0
@@ -242,70 +212,49 @@ def _assigned(target: str, numbers: Sequence[ir.Num], places: Mapping[str, str])
     return [*writer.lines, *(f"{target}[{i}] = {value};" for i, value in enumerate(values))]
 
 
+def _places(array: str, names: Sequence[str]) -> dict[str, str]:
+    return {name: f"{array}[{i}]" for i, name in enumerate(names)}
+
+
 def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
     return lambda leaf: places[leaf.name] if isinstance(leaf, ir.Signal) else None
 
 
-# ------------------------------------------------------------------------ cost
-
-
 def cost(task: Task) -> list[str]:
-    """Statements that add the cost of a plan to `cost`, of lane `j` with robustness `rho`."""
+    """Statements that add the cost of a plan to `cost`, of lane `j` with robustness `rho`.
+
+    Raises:
+        Untranslatable: a goal has no margin at one sample.
+    """
     at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.names)}
     at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.names)}
     at |= {"k": "(double)k", "t": f"(k * {literal(task.dt)})", "sat": "1.0", "rho": "rho"}
-    inputs = {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
-    states, controlled = task.system.objective
-    lines: list[str] = []
-    if states is not None:
-        lines += _mean(states, at, task.horizon + 1)
-    if controlled is not None:
-        lines += _mean(controlled, at | inputs, task.horizon)
-    for promise in task.promises.items:
-        lines += _promise(promise, task, at)
-    if task.compiled.guidance_cost is not None:
-        lines += _mean(ir.Op("mul", (ir.Const(PULL), task.compiled.guidance_cost)), at, task.horizon + 1)
-    if task.compiled.timers:
-        gamma = literal(task.system.decl.objective.gamma)
-        lines.append(f"cost += {literal(SHORT)} * MIN(MAX({gamma} - rho, 0.0), {gamma});")
-    return lines
+    at |= {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
+    return [line for term in cost_terms(task) for line in _term(term, at)]
 
 
-def _mean(number: ir.Num, places: Mapping[str, str], count: int) -> list[str]:
-    writer = NumberWriter(_columns(places))
-    value = writer.number(number)
-    body = " ".join([*writer.lines, f"sum += {value};"])
-    return [f"{{ double sum = 0.0; for (int k = 0; k < {count}; ++k) {{ {body} }} cost += sum / {count}; }}"]
-
-
-def _promise(promise: PendingGoal, task: Task, places: Mapping[str, str]) -> list[str]:
-    """The shortfall from gamma where a goal is pending."""
-    writer = NumberWriter(_columns(places))
-    margin = writer.number(margin_of(promise.body))
-    clock = places[task.promises.clock]
-    status = places[promise.status].replace("[k]", "[0]")
-    gamma = literal(task.system.decl.objective.gamma)
-    counts = f"{clock} >= {literal(promise.first)} && {clock} <= {literal(promise.last)}"
-    body = " ".join([*writer.lines, f"if ({counts}) top = MAX(top, {margin});"])
+def _term(term: CostTerm, at: Mapping[str, str]) -> list[str]:
+    each = NumberWriter(_columns(at))
+    if term.goal is not None:
+        if any(isinstance(node, ir.Predicate) and node.guard for node in nodes(term.goal)):
+            raise Untranslatable("a goal with a timer")
+        each.bound[MARGIN.name] = each.margin(term.goal)
+    number = each.number(term.number)
+    first, join, reduced = "0.0", f"all += {number};", f"all / {term.samples}"
+    if term.greatest:
+        first, join, reduced = "-INFINITY", f"all = MAX(all, {number});", "all"
+    result = NumberWriter(_columns({**at, REDUCED.name: reduced}))
+    value = result.number(term.value)
+    condition = ""
+    if term.condition is not None:
+        gate = NumberWriter(_columns(at))
+        truth = gate.truth(term.condition)
+        condition = " ".join(["int counts; {", *gate.lines, f"counts = {truth}; }} if (counts) "])
     return [
-        f"if (fabs({status}) < 0.5) {{ double top = -INFINITY;",
-        f"for (int k = 0; k <= {task.horizon}; ++k) {{ {body} }}",
-        f"cost += {literal(KEPT)} * MIN(MAX({gamma} - top, 0.0), {gamma}); }}",
+        f"{{ {condition}{{ double all = {first};",
+        " ".join([f"for (int k = 0; k < {term.samples}; ++k) {{", *each.lines, join, "}"]),
+        " ".join([*result.lines, f"cost += {value}; }} }}"]),
     ]
-
-
-def margin_of(formula: ir.Formula) -> ir.Num:
-    """The exact robustness of a state formula as a number. Raises Untranslatable for any other formula."""
-    match formula:
-        case ir.Predicate(num, sign, guard=False):
-            return num if sign > 0 else ir.Op("neg", (num,))
-        case ir.BoolOp(op, items):
-            pick = "min" if op == "and" else "max"
-            return reduce(lambda a, b: ir.Op(pick, (a, b)), map(margin_of, items))
-        case ir.Truth(value):
-            return ir.Const(float("inf") if value else float("-inf"))
-        case _:
-            raise Untranslatable(type(formula).__name__)
 
 
 # ------------------------------------------------------------------------------------------ the header
@@ -350,7 +299,12 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     """Sizes, constants and straight-line code."""
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
-    controls = task.system.decl.controls
+    controls, names = task.system.decl.controls, task.system.control_names
+    states, inputs = _places("x", task.names), _places("u", names)
+    moved, reflected = state_images(task), list(control_images(task).values())
+    images = [moved.get(name, ir.Signal(name)) for name in task.names]
+    given = commands(task.system.decl)
+    commanded = [given.get(name, ir.Signal(name)) for name in names]
     return {
         "NAME": c_comment(task.system.decl.name),
         "SPEC": c_comment(task.compiled.name),
@@ -380,12 +334,12 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "REST": ", ".join(literal(min(max(0.0, each.low), each.high)) for each in controls),
         "MIRRORED": int(mirror is not None),
         "SIDE": 0 if mirror is None else mirror.side,
-        "OBSERVE": _block(observed(task)),
-        "IMAGE_STATE": "" if mirror is None else _block(image_of_state(mirror, task)),
-        "IMAGE_ACTION": "" if mirror is None else _block(image_of_action(task)),
+        "OBSERVE": _block(_assigned("seen", observation(task), states)),
+        "IMAGE_STATE": "" if mirror is None else _block(_assigned("image", images, states)),
+        "IMAGE_ACTION": "" if mirror is None else _block(_assigned("image", reflected, inputs)),
         "SQUASH": _block(squashed(task)),
         "FORWARD": _block(forward(network)),
-        "COMMAND": _block(command(task)),
+        "COMMAND": _block(_assigned("command", commanded, states | inputs)),
         "COST": _block(cost(task)),
         "OVERALL": _block(_overall(task.rules, task.rules)),
         "SAFE": _block(_overall(task.compiled.safety, task.rules)),
@@ -415,7 +369,9 @@ def _added(task: Task) -> dict[str, object]:
         "BEGIN": _block(
             [f"x[{place + i}] = {literal(each.initial)};" for i, each in enumerate(system.timers)]
         ),
-        "ADVANCE": _block(later(task)),
+        "ADVANCE": _block(
+            _assigned("later", [timer.update for timer in system.timers], _places("x", task.names))
+        ),
     }
 
 

@@ -20,13 +20,20 @@ from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
-from stlc.controller.problem.pending_goals import HELD
-from stlc.controller.problem.task import KEPT, PULL, SHORT, TIE, Task
+from stlc.controller.problem.task import TIE, Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.controls import EPS, raw_width
 from stlc.dynamics.model.schedule import RolloutStage, schedule
 from stlc.dynamics.model.step import ModelStep
+from stlc.export.description import (
+    MARGIN,
+    REDUCED,
+    control_images,
+    cost_terms,
+    observation,
+    state_images,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -165,7 +172,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
     controls = {each.name: _squashed(each, columns) for each in task.system.decl.controls}
     if swapped is not None:
         mask = swapped.reshaped(1, BATCH, 1, 1)
-        images = _images(task, controls)
+        images = assigned(control_images(task), controls)
         controls = {name: ONNX_OPS.where(mask, images[name], value) for name, value in controls.items()}
     return joined(list(controls.values())).transposed(1, 2, 3, 0).cast("float64")
 
@@ -176,9 +183,7 @@ def _folded(
     """States reflected to the side of the mirror that the network was trained on, and which are images."""
     if network.mirror is None:
         return state, None
-    names = set(task.names)
-    images = [each for each in task.system.decl.policy.mirror if each.name in names]
-    moved = assigned({each.name: each.value for each in images}, state)
+    moved = assigned(state_images(task), state)
     side = task.names[network.mirror.side]
     swapped = ONNX_OPS.gt(moved[side], state[side])
     folded = {name: ONNX_OPS.where(swapped, moved[name], state[name]) for name in moved}
@@ -187,10 +192,7 @@ def _folded(
 
 def _observed(task: Task, state: Mapping[str, Value]) -> Value:
     """Observation of the network, (batch, k) float32."""
-    system = task.system
-    numbers: list[ir.Num] = [*system.decl.policy.observe, *(ir.Signal(each.name) for each in system.added)]
-    if not system.decl.policy.observe:
-        numbers = [ir.Signal(name) for name in system.names]
+    numbers = observation(task)
     seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
     like = next(iter(state.values()))
     rows = [seen[str(place)].spread(1, BATCH, like=like) for place in range(len(numbers))]
@@ -225,17 +227,6 @@ def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
             unit = ONNX_OPS.atan2(next(columns), first + EPS) / math.pi
     scaled: Value = unit * ((control.high - control.low) / 2) + (control.low + control.high) / 2
     return scaled
-
-
-def _images(task: Task, controls: Mapping[str, Value]) -> dict[str, Value]:
-    """The mirror images of controls; angles stay within a turn of their range."""
-    names = set(task.names)
-    images = [each for each in task.system.decl.policy.mirror if each.name not in names]
-    moved = {**controls, **assigned({each.name: each.value for each in images}, controls)}
-    for each in task.system.decl.controls:
-        if each.squash == "angle":
-            moved[each.name] = ONNX_OPS.mod(moved[each.name] - each.low, 2.0 * math.pi) + each.low
-    return moved
 
 
 # -------------------------------------------------------------------------------------------- verdicts
@@ -345,50 +336,26 @@ def rank(found: Verdicts) -> Value:
 
 def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
     """The performance terms as if every plan were satisfying, (1, batch)."""
-    system, rows = task.system, task.horizon
-    moments = rho.sheet.constant([[float(k)] for k in range(rows + 1)])
-    env = {"k": moments, "t": moments * task.dt, "sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
-    env |= {name + START: column[:1] for name, column in states.items()}
-    over_states, over_controls = system.objective
-    before = {name: column[:rows] for name, column in (env | dict(states)).items()}
+    moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
+    once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
+    once |= {name + START: column[:1] for name, column in states.items()}
+    timed = {"k": moments, "t": moments * task.dt} | dict(states)
     parts = [rho.sheet.constant([[0.0]])]
-    if over_states is not None:
-        parts.append(_mean(over_states, env | dict(states), rows + 1))
-    if over_controls is not None:
-        parts.append(_mean(over_controls, before | dict(controls), rows))
-    if task.promises.items:
-        parts.append(_short(task, states) * KEPT)
-    if task.compiled.guidance_cost is not None:
-        parts.append(_mean(task.compiled.guidance_cost, states, rows + 1) * PULL)
-    if task.compiled.timers:
-        parts.append(_lacking(task, rho) * SHORT)
+    for term in cost_terms(task):
+        rows = term.samples
+        env = once | {name: column[:rows] for name, column in timed.items()}
+        if rows == task.horizon:
+            env |= controls
+        if term.goal is not None:
+            env[MARGIN.name] = written([term.goal], states, count=rows)[0]
+        each = assigned({"each": term.number}, env)["each"]
+        each = each.spread(rows, each.shape[1])
+        reduced = ONNX_OPS.amax(each) if term.greatest else _reduced("ReduceMean", each, (0,))
+        value = term.value
+        if term.condition is not None:
+            value = ir.Where(term.condition, value, ir.Const(0.0))
+        parts.append(assigned({"value": value}, {**once, REDUCED.name: reduced})["value"])
     return reduce(ONNX_OPS.add, parts).spread(1, BATCH, like=rho)
-
-
-def _mean(number: ir.Num, env: States, rows: int) -> Value:
-    value = assigned({"cost": number}, env)["cost"]
-    return _reduced("ReduceMean", value.spread(rows, value.shape[1]), (0,))
-
-
-def _lacking(task: Task, spared: Value) -> Value:
-    """The shortfall of a value from gamma."""
-    gamma = task.system.decl.objective.gamma
-    lack: Value = ONNX_OPS.clamp(gamma - spared, 0.0, gamma)
-    return lack
-
-
-def _short(task: Task, states: States) -> Value:
-    """`Promises.short`."""
-    promises = task.promises
-    clock = states[promises.clock]
-    margins = written([each.body for each in promises.items], states, count=len(clock))
-    lacks = []
-    for promise, margin in zip(promises.items, margins, strict=True):
-        counts = ONNX_OPS.both(ONNX_OPS.ge(clock, promise.first), ONNX_OPS.ge(promise.last, clock))
-        best = ONNX_OPS.amax(ONNX_OPS.where(counts, margin, -math.inf))
-        still_open = ONNX_OPS.gt(HELD, ONNX_OPS.abs(states[promise.status][:1]))
-        lacks.append(ONNX_OPS.where(still_open, _lacking(task, best), 0.0))
-    return reduce(ONNX_OPS.add, lacks)
 
 
 def deepened(task: Task, states: States) -> Value:

@@ -149,7 +149,7 @@ def test_what_no_loop_changes_is_computed_outside_of_it() -> None:
     node = ir.Freeze((("a", ir.Signal("x")),), ir.BoolOp("and", (shared, _gap("x", "a", 1.0))))
     plan = plan_of([ir.Temporal("always", ir.Window(0, 9), node)], LAST + 1)
     found = [type(step.node).__name__ for step in plan.schedule.steps]
-    assert found == ["Predicate", "Temporal", "Freeze", "Temporal"]
+    assert found == ["Predicate", "Temporal", "Frozen", "Temporal"]
 
 
 def test_windows_to_the_end_are_one_pass() -> None:

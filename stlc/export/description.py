@@ -1,0 +1,101 @@
+"""Parts of a controller as numbers of the IR, which the C header and the ONNX graphs print."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from stlc.compile.ir import nodes as ir
+from stlc.controller.problem.pending_goals import HELD
+from stlc.controller.problem.task import KEPT, PULL, SHORT
+from stlc.dynamics.declaration.learning import START
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+
+REDUCED, MARGIN = ir.Signal("#reduced"), ir.Signal("#margin")
+
+
+def observation(task: Task) -> list[ir.Num]:
+    """Return the observation of the network, as numbers of the states."""
+    system = task.system
+    observed = system.decl.policy.observe or [ir.Signal(name) for name in system.decl.signature.names]
+    return [*observed, *(ir.Signal(column.name) for column in system.added)]
+
+
+def state_images(task: Task) -> dict[str, ir.Num]:
+    """Return the mirror images of states, by name; states without an image are absent."""
+    names = set(task.names)
+    return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
+
+
+def control_images(task: Task) -> dict[str, ir.Num]:
+    """Return the mirror image of every control, by name; angles stay within a turn of their range."""
+    images = {each.name: each.value for each in task.system.decl.policy.mirror}
+    found: dict[str, ir.Num] = {}
+    for each in task.system.decl.controls:
+        image = images.get(each.name, ir.Signal(each.name))
+        if each.squash == "angle":
+            low = ir.Const(each.low)
+            turned = ir.Op("mod", (ir.Op("sub", (image, low)), ir.Const(2.0 * math.pi)))
+            image = ir.Op("add", (turned, low))
+        found[each.name] = image
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class CostTerm:
+    """Summand of a plan's cost: a number, reduced over samples.
+
+    Attributes:
+        number: at each sample, of the states, of the controls where there are `horizon` samples, of states at
+            the first sample (`START`), `k`, `t`, `sat`, `rho` and `MARGIN`.
+        samples: number of samples, from the first on.
+        greatest: whether the greatest number is `REDUCED`; otherwise their mean.
+        goal: formula whose robustness at each sample is `MARGIN`.
+        value: the summand, of `REDUCED`.
+        condition: of states at the first sample; where it is false the summand is 0.
+    """
+
+    number: ir.Num
+    samples: int
+    greatest: bool = False
+    goal: ir.Formula | None = None
+    value: ir.Num = REDUCED
+    condition: ir.Formula | None = None
+
+
+def cost_terms(task: Task) -> Iterator[CostTerm]:
+    """Yield the terms of `Task.cost`."""
+    states, controlled = task.system.objective
+    compiled, samples, goals = task.compiled, task.horizon + 1, task.promises
+    gamma = ir.Const(task.system.decl.objective.gamma)
+
+    def shortfall(margin: ir.Num, weight: float) -> ir.Num:
+        lack = ir.Op("clip", (ir.Op("sub", (gamma, margin)), ir.Const(0.0), gamma))
+        return ir.Op("mul", (ir.Const(weight), lack))
+
+    if states is not None:
+        yield CostTerm(states, samples)
+    if controlled is not None:
+        yield CostTerm(controlled, task.horizon)
+    for goal in goals.items:
+        clock, status = ir.Signal(goals.clock), ir.Signal(goal.status + START)
+        since = ir.Predicate(ir.Op("sub", (clock, ir.Const(goal.first))))
+        until = ir.Predicate(ir.Op("sub", (ir.Const(goal.last), clock)))
+        counted = ir.Where(ir.BoolOp("and", (since, until)), MARGIN, ir.Const(-math.inf))
+        pending = ir.Predicate(ir.Op("sub", (ir.Const(HELD), ir.Op("abs", (status,)))), strict=True)
+        yield CostTerm(
+            counted,
+            samples,
+            greatest=True,
+            goal=goal.body,
+            value=shortfall(REDUCED, KEPT),
+            condition=pending,
+        )
+    if compiled.guidance_cost is not None:
+        yield CostTerm(ir.Op("mul", (ir.Const(PULL), compiled.guidance_cost)), samples)
+    if compiled.timers:
+        yield CostTerm(shortfall(ir.Signal("rho"), SHORT), 1)
