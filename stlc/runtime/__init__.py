@@ -6,6 +6,9 @@ controller = Controller.load("controller", guard="paper")
 decision = controller.decide(state)
 """
 
-from stlc.runtime.controller import Controller, Decision, Guard
+from stlc.runtime.controller import ControlDecision, Controller, Guard
 
-__all__ = ["Controller", "Decision", "Guard"]
+Decision = ControlDecision
+"""The former name of `ControlDecision`."""
+
+__all__ = ["ControlDecision", "Controller", "Decision", "Guard"]

@@ -22,7 +22,7 @@ KEPT = "kept"
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class ControlDecision:
     """The decision for one agent, or for a batch with a leading axis of agents.
 
     Attributes:
@@ -131,7 +131,7 @@ class Controller:
         """Forget the previous plans, and restart the mission."""
         self._begun = self._added = None
 
-    def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> Decision:
+    def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> ControlDecision:
         """Return the decision for a state.
 
         Args:
@@ -237,15 +237,15 @@ class Controller:
 
     def _decision(
         self, followed: _Followed, control: Numbers, policy_rho: Numbers, *, single: bool
-    ) -> Decision:
+    ) -> ControlDecision:
         judged = followed.judged
         source = np.array(RULES)[followed.source]
         rule = np.where(followed.kept, KEPT, source)
         each = dict(zip(self.facts.requirements, judged.each.T, strict=True))
         if not single:
             plan, t0 = judged.plan.copy(), followed.t0.copy()
-            return Decision(control, rule, plan, judged.rho, judged.safe, each, source, t0, policy_rho)
-        return Decision(
+            return ControlDecision(control, rule, plan, judged.rho, judged.safe, each, source, t0, policy_rho)
+        return ControlDecision(
             control[0],
             str(rule[0]),
             judged.plan[0].copy(),
