@@ -1,4 +1,4 @@
-"""The cache folder: reproducible artefacts kept between processes, protected from other users.
+"""The cache folder: reproducible artefacts shared by processes, protected from other users.
 
 Code is loaded from here, so the folder and each file read from it must belong to the user, be no link, and be
 writable by the user only. Otherwise, or if no such folder can be created, a temporary folder of the process
@@ -33,7 +33,7 @@ _UNFINISHED = ".new-"
 _OPEN_FOLDERS = Path("/proc/self/fd")
 
 
-class Unusable(Exception):  # noqa: N818 - an answer, caught by who asks
+class Unusable(Exception):  # noqa: N818 - an answer that callers catch
     """Error: a folder cannot be used as the cache.
 
     Attributes:
@@ -52,8 +52,8 @@ class Cache:
     """A cache folder that only the user can write to.
 
     Attributes:
-        shown: its path.
-        folder: the same through an open file descriptor, where the system supports that: it stays the checked
+        shown: path of the folder.
+        folder: path through an open file descriptor, where the system supports that: the path of the checked
             folder even if a parent folder is renamed or replaced.
     """
 
@@ -85,9 +85,9 @@ class Cache:
         """Remove an untrusted file and warn about it."""
         with suppress(OSError):
             (self.folder / name).unlink()
-        _tell(f"`{self.shown / name}` {why}", "it is made anew")
+        _warn(f"`{self.shown / name}` {why}", "it is made anew")
 
-    def keep(self, name: str, data: bytes) -> bool:
+    def write(self, name: str, data: bytes) -> bool:
         """Write a file atomically (temporary file, then rename); return whether that succeeded."""
         beside = self.folder / f"{_UNFINISHED}{os.urandom(8).hex()}"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
@@ -99,7 +99,7 @@ class Cache:
             with suppress(OSError):
                 beside.unlink(missing_ok=True)
             return False
-        _pruned(self)
+        _prune_once(self)
         return True
 
     def names(self, start: str) -> list[str]:
@@ -110,7 +110,7 @@ class Cache:
             return []
 
     def size(self) -> tuple[int, int]:
-        """Number of files and of their bytes."""
+        """Number of files, and their total size in bytes."""
         sizes = [found.st_size for _, found in _entries(self)]
         return len(sizes), sum(sizes)
 
@@ -127,8 +127,8 @@ def _require_own(found: os.stat_result, right_kind: bool, otherwise: str) -> Non
         raise Unusable(f"may be written by others (mode {found.st_mode & 0o777:o})", distrusted=True)
 
 
-def _tell(what: str, instead: str) -> None:
-    notice(Diagnostic("W701", f"{what}; {instead}"))
+def _warn(problem: str, instead: str) -> None:
+    notice(Diagnostic("W701", f"{problem}; {instead}"))
 
 
 # ---------------------------------------------------------------------- persistent cache
@@ -148,7 +148,7 @@ def place() -> Path:
     return Path(home) / ".cache" / "stlc"
 
 
-def lasting() -> Cache | None:
+def persistent() -> Cache | None:
     """The user's cache folder, created if missing; None if it cannot be used.
 
     A folder that another user could have changed causes a warning, once per command.
@@ -158,8 +158,8 @@ def lasting() -> Cache | None:
     except Unusable as refused:
         if refused.distrusted:
             advice = "remove it, or set `XDG_CACHE_HOME` to a folder of your own"
-            said = f"the cache folder `{place()}` {refused.why}; it is not used"
-            notice(Diagnostic("W701", said, help=(advice,)))
+            message = f"the cache folder `{place()}` {refused.why}; it is not used"
+            notice(Diagnostic("W701", message, help=(advice,)))
         return None
 
 
@@ -179,7 +179,7 @@ def opened() -> Cache:
     return private(place())
 
 
-_held: dict[Path, int] = {}
+_descriptors: dict[Path, int] = {}
 """Open folders; their paths below `_OPEN_FOLDERS` are valid as long as the process lives."""
 
 
@@ -197,18 +197,18 @@ def private(path: Path) -> Cache:
             raise Unusable("is a symbolic link", distrusted=True)
         if os.name != "posix":
             return Cache(path, path)
-        return Cache(path, _looked_at(path))
+        return Cache(path, _checked_folder(path))
     except OSError as error:
         raise Unusable(f"cannot be used: {os_reason(error)}") from error
     except ValueError as error:  # a zero byte in the name
         raise Unusable("cannot be used: it is no name of a folder") from error
 
 
-def _looked_at(path: Path) -> Path:
+def _checked_folder(path: Path) -> Path:
     """The path of a folder through an open descriptor, after a check of its owner and mode."""
-    held = _held.get(path)
-    fresh = held is None or not os.path.samestat(os.fstat(held), path.lstat())
-    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else held
+    open_one = _descriptors.get(path)
+    fresh = open_one is None or not os.path.samestat(os.fstat(open_one), path.lstat())
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else open_one
     assert folder is not None
     try:
         found = os.fstat(folder)
@@ -224,9 +224,9 @@ def _looked_at(path: Path) -> Path:
             os.close(folder)
         return path
     if fresh:
-        if held is not None:
-            os.close(held)
-        _held[path] = folder
+        if open_one is not None:
+            os.close(open_one)
+        _descriptors[path] = folder
     return _OPEN_FOLDERS / str(folder)
 
 
@@ -262,25 +262,25 @@ def _temporary(process: int) -> Cache | None:
 
 
 @cache
-def _pruned(kept: Cache) -> None:
+def _prune_once(store: Cache) -> None:
     """Prune the cache, once per process."""
-    prune(kept)
+    prune(store)
 
 
-def prune(kept: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
+def prune(store: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
     """Remove files that were not used for `most_days`, then the oldest ones beyond `most_bytes`."""
     now, left = time.time(), most_bytes
-    for name, found in sorted(_entries(kept), key=lambda entry: entry[1].st_mtime, reverse=True):
+    for name, found in sorted(_entries(store), key=lambda entry: entry[1].st_mtime, reverse=True):
         days = (now - found.st_mtime) / _DAY
         left -= found.st_size
         if left < 0 or days > (1 if name.startswith(_UNFINISHED) else most_days):
             with suppress(OSError):
-                (kept.folder / name).unlink()
+                (store.folder / name).unlink()
 
 
-def _entries(kept: Cache) -> Iterator[tuple[str, os.stat_result]]:
+def _entries(store: Cache) -> Iterator[tuple[str, os.stat_result]]:
     """The files of the cache that are stlc's own."""
-    with suppress(OSError), os.scandir(kept.folder) as entries:
+    with suppress(OSError), os.scandir(store.folder) as entries:
         for entry in entries:
             if entry.name.startswith((*KINDS, _UNFINISHED)):
                 with suppress(OSError):

@@ -66,17 +66,17 @@ Doubles = "NDArray[np.float64]"
 
 
 @dataclass(frozen=True, slots=True)
-class Climb:
+class SearchOptions:
     """Parameters of a local search; all arrays contiguous float64.
 
     Attributes:
         bounds: lowest and highest value of each control, and 1 for a periodic angle, (3, m).
         factors: scale of each requirement's robustness in the total, (R,).
-        bank: plan library of other states, (k, T, m).
-        generations: of `LANES` changed plans each.
+        bank: plans of other states, (k, T, m).
+        generations: number of generations, of `LANES` changed plans each.
         enough: target robustness at which the search of a row ends.
-        seed: of the random changes.
-        stop: ends the search before all rows are done.
+        seed: seed of the random changes.
+        stop: condition that ends the search before all rows are done.
     """
 
     bounds: NDArray[np.float64]
@@ -89,7 +89,7 @@ class Climb:
 
 
 class Kernel:
-    """A built `judge` and `climb`; see `stlc.compile.backends.c.emit`."""
+    """The compiled functions `judge` and `climb`; see `stlc.compile.backends.c.emit`."""
 
     def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
         self._judge, self._climb = library.judge, library.climb
@@ -108,14 +108,14 @@ class Kernel:
         Args:
             x0: (B, n), contiguous float64.
             u: (B, T, m), contiguous float64.
-            threads: to share the rows among.
+            threads: number of threads.
             columns: whether the states are returned too.
 
         Returns:
             Robustness per requirement (B, R), and the states (n, T+1, B) or None.
 
         Raises:
-            MemoryError: there is no room.
+            MemoryError: there is not enough memory.
         """
         x0, u = np.ascontiguousarray(x0, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)
         batch = len(x0)
@@ -131,33 +131,33 @@ class Kernel:
         return rho, seen
 
     def climb(
-        self, x0: NDArray[np.float64], plans: NDArray[np.float64], how: Climb, *, threads: int = 1
+        self, x0: NDArray[np.float64], plans: NDArray[np.float64], search: SearchOptions, *, threads: int = 1
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Improve plans by batched local search on the exact robustness.
 
         Args:
             x0: (B, n), contiguous float64.
             plans: initial guesses, (B, T, m).
-            how: parameters of the search.
-            threads: to share the rows among; the result does not depend on it.
+            search: parameters of the search.
+            threads: number of threads; the result does not depend on it.
 
         Returns:
             Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN. If the search was
             stopped, the last rows are unchanged, and their robustness is NaN.
 
         Raises:
-            MemoryError: there is no room.
+            MemoryError: there is not enough memory.
         """
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
         rho = np.full(len(x0), np.nan)
-        arrays = [a.ctypes.data for a in (x0, plans, rho, how.bounds, how.factors, how.bank)]
-        last_ones = (len(how.bank), how.generations, how.enough, how.seed)
+        arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.bank)]
+        scalars = (len(search.bank), search.generations, search.enough, search.seed)
 
         def rows(first: int, last: int) -> int:
-            done: int = self._climb(first, last, *arrays, *last_ones)
+            done: int = self._climb(first, last, *arrays, *scalars)
             return done
 
-        _share(rows, len(x0), threads, grain=1, stop=how.stop)
+        _share(rows, len(x0), threads, grain=1, stop=search.stop)
         return plans, rho
 
 
@@ -166,9 +166,9 @@ class ObjectiveSlopes:
     """Derivatives of an objective by robustness and states.
 
     Attributes:
-        by_rho: its derivative by the robustness of each requirement, (B, R).
-        by_columns: its derivative by the states, (n, T+1, B); None if it does not depend on them.
-        slope: of smoothed conditions, per unit.
+        by_rho: derivative by the robustness of each requirement, (B, R).
+        by_columns: derivative by the states, (n, T+1, B); None if the objective does not depend on states.
+        slope: slope of smoothed conditions, per unit.
     """
 
     by_rho: NDArray[np.float64]
@@ -177,7 +177,7 @@ class ObjectiveSlopes:
 
 
 class Adjoint:
-    """A built `pull`; see `stlc.compile.backends.c.adjoint`."""
+    """The compiled function `pull`; see `stlc.compile.backends.c.adjoint`."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._pull = library.pull
@@ -197,13 +197,13 @@ class Adjoint:
             x0: (B, n).
             u: (B, T, m).
             outcome: derivatives of the objective.
-            threads: to share the rows among.
+            threads: number of threads.
 
         Returns:
             (B, T, m).
 
         Raises:
-            MemoryError: there is no room.
+            MemoryError: there is not enough memory.
         """
         arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (x0, u, outcome.by_rho)]
         columns = None if outcome.by_columns is None else np.ascontiguousarray(outcome.by_columns, np.float64)
@@ -252,7 +252,7 @@ class _Parts:
         self._lock = Lock()
 
     def end(self) -> None:
-        """Hand out no more."""
+        """Hand out no more parts."""
         self._next = self._batch
 
     def work(self, rows: Callable[[int, int], int]) -> None:
@@ -280,8 +280,8 @@ def load(text: str) -> ctypes.CDLL | None:
     try:
         return _loaded(text, using)
     except CompilerError as error:
-        said = f"the C compiler `{using}` {error.why}; the same is done without it, slower"
-        notice(Diagnostic("W702", said, help=("`stlc doctor` tries it again",)))
+        message = f"the C compiler `{using}` {error.why}; the same is done without it, slower"
+        notice(Diagnostic("W702", message, help=("`stlc doctor` tries it again",)))
         return None
 
 
@@ -300,10 +300,10 @@ def why_none(text: str) -> str:
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
     """The library, cached or built. Raises CompilerError."""
     key = _key(text, using)
-    kept = cache.lasting()
-    places = [place for place in (kept, _made.get("here")) if place is not None]
+    store = cache.persistent()
+    places = [place for place in (store, _temporary.get("here")) if place is not None]
     for place in places:
-        library = _kept(place, key)
+        library = _cached(place, key)
         if library is not None:
             return library
     why = trouble(key)
@@ -313,22 +313,22 @@ def _loaded(text: str, using: str) -> ctypes.CDLL | None:
     if data is None:
         return None
     name = f"kernel-{key}-{hashlib.sha256(data).hexdigest()[:32]}.so"
-    if kept is None:
+    if store is None:
         why = cache.why_not()
-    elif not kept.keep(name, data):
-        why = f"`{kept.shown}` cannot be written to"
-    elif (library := _opened(kept, name)) is not None:
+    elif not store.write(name, data):
+        why = f"`{store.shown}` cannot be written to"
+    elif (library := _load(store, name)) is not None:
         return library
     else:
-        why = f"programs cannot be loaded from `{kept.shown}`"
-    here = _made["here"] = cache.temporary()
-    if here is None or not here.keep(name, data):
+        why = f"programs cannot be loaded from `{store.shown}`"
+    here = _temporary["here"] = cache.temporary()
+    if here is None or not here.write(name, data):
         raise CompilerError("has no folder to write to")
     notice(Diagnostic("W701", f"{why}; kernels in C are built anew in every process"))
-    return _opened(here, name)
+    return _load(here, name)
 
 
-_made: dict[str, Cache | None] = {}
+_temporary: dict[str, Cache | None] = {}
 """The temporary folder, created when needed."""
 
 
@@ -338,7 +338,7 @@ def _key(text: str, using: str) -> str:
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
 
 
-def _kept(place: Cache, key: str) -> ctypes.CDLL | None:
+def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
     """A cached library, if its content is unchanged."""
     for name in place.names(f"kernel-{key}-"):
         data = place.read(name)
@@ -346,12 +346,12 @@ def _kept(place: Cache, key: str) -> ctypes.CDLL | None:
             continue
         if name != f"kernel-{key}-{hashlib.sha256(data).hexdigest()[:32]}.so":
             place.refuse(name, "is not what was written there")
-        elif (library := _opened(place, name)) is not None:
+        elif (library := _load(place, name)) is not None:
             return library
     return None
 
 
-def _opened(place: Cache, name: str) -> ctypes.CDLL | None:
+def _load(place: Cache, name: str) -> ctypes.CDLL | None:
     """Load a library; None if the system refuses, such as from a `noexec` disk."""
     try:
         return ctypes.CDLL(str(place.folder / name))

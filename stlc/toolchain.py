@@ -55,8 +55,8 @@ class HangsError(Exception):
     """A program exceeded its limits and was killed.
 
     Attributes:
-        why: reason, printed after its name.
-        worked: it used the processor, but exceeded the time or memory limit.
+        why: reason, printed after the name of the program.
+        worked: whether the program used the processor, and so exceeded the time or memory limit.
     """
 
     def __init__(self, why: str, *, worked: bool = False) -> None:
@@ -66,12 +66,12 @@ class HangsError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """Result of a program: its exit code and its output."""
+class ProgramResult:
+    """Result of a program: exit code, standard output, standard error."""
 
     code: int
     out: str
-    said: str
+    errors: str
 
 
 def compiler() -> str | None:
@@ -80,7 +80,7 @@ def compiler() -> str | None:
     return next((found for name in names if name and (found := shutil.which(name))), None)
 
 
-def compiled(using: str, arguments: Sequence[str]) -> Done:
+def compiled(using: str, arguments: Sequence[str]) -> ProgramResult:
     """Run a compiler.
 
     Raises:
@@ -142,11 +142,11 @@ def works(using: str) -> str:
     return "" if done.code == 0 else failure(done)
 
 
-def failure(done: Done) -> str:
+def failure(done: ProgramResult) -> str:
     """Error message of a compiler in one line."""
-    lines = [line.strip() for line in (done.said or done.out).splitlines() if line.strip()]
-    told = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
-    return f"fails with exit code {done.code}" + (f": {told[:160]}" if told else "")
+    lines = [line.strip() for line in (done.errors or done.out).splitlines() if line.strip()]
+    message = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
+    return f"fails with exit code {done.code}" + (f": {message[:160]}" if message else "")
 
 
 # ---------------------------------------------------------------------- remembered
@@ -159,13 +159,13 @@ def trouble(key: str) -> str:
     """Reason of a recent failure, in this process or another; "" where there was none."""
     if key in _known:
         return _known[key]
-    kept = cache.lasting()
-    return "" if kept is None else _recorded(kept, _file(key))
+    store = cache.persistent()
+    return "" if store is None else _recorded(store, _file(key))
 
 
-def _recorded(kept: Cache, name: str) -> str:
+def _recorded(store: Cache, name: str) -> str:
     with suppress(ValueError, TypeError, KeyError):
-        record = json.loads(kept.read(name) or b"")
+        record = json.loads(store.read(name) or b"")
         if 0 <= time.time() - record["at"] <= min(float(record["for"]), LONG_REMEMBERED):
             return str(record["why"])
     return ""
@@ -174,16 +174,16 @@ def _recorded(kept: Cache, name: str) -> str:
 def remember(key: str, why: str, *, seconds: float | None = None) -> None:
     """Remember a failure for `seconds` (default: `REMEMBERED`)."""
     _known[key] = why
-    kept = cache.lasting()
-    if kept is not None:
+    store = cache.persistent()
+    if store is not None:
         record = {"at": time.time(), "for": REMEMBERED if seconds is None else seconds, "why": why}
-        kept.keep(_file(key), json.dumps(record).encode())
+        store.write(_file(key), json.dumps(record).encode())
 
 
 def remembered() -> list[str]:
     """Remembered reasons for which commands do not use the compiler."""
-    kept = cache.lasting()
-    found = [] if kept is None else [_recorded(kept, name) for name in kept.names(_TROUBLE)]
+    store = cache.persistent()
+    found = [] if store is None else [_recorded(store, name) for name in store.names(_TROUBLE)]
     return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
 
 
@@ -191,11 +191,11 @@ def forget() -> None:
     """Forget all failures."""
     _known.clear()
     _versions.clear()
-    kept = cache.lasting()
-    if kept is not None:
-        for name in kept.names(_TROUBLE):
+    store = cache.persistent()
+    if store is not None:
+        for name in store.names(_TROUBLE):
             with suppress(OSError):
-                (kept.folder / name).unlink()
+                (store.folder / name).unlink()
 
 
 def _file(key: str) -> str:
@@ -205,53 +205,58 @@ def _file(key: str) -> str:
 # ---------------------------------------------------------------------- run
 
 
-def run(command: Sequence[str], *, given: str = "") -> Done:
+def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
     """Run a program in its own session; kill it with its child processes if it exceeds the limits.
 
     No process is left when the wait is interrupted.
 
     Args:
         command: the program and its arguments.
-        given: on its standard input.
+        given: text on the standard input.
 
     Raises:
-        HangsError: it used no processor time for `IDLE` seconds, or more than `BUSY`, or more than `MEMORY`.
-        OSError: it cannot be started.
+        HangsError: the program used no processor time for `IDLE` seconds, more processor time than `BUSY`,
+            or more memory than `MEMORY`.
+        OSError: the program cannot be started.
     """
     # files, not pipes: a surviving child process could keep a pipe open
-    with tempfile.TemporaryFile() as into, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as said:
+    with (
+        tempfile.TemporaryFile() as into,
+        tempfile.TemporaryFile() as out,
+        tempfile.TemporaryFile() as errors,
+    ):
         into.write(given.encode())
         into.seek(0)
         process: subprocess.Popen[bytes] | None = None
         try:
-            with _whole():
+            with _signals_deferred():
                 process = subprocess.Popen(
-                    command, stdin=into, stdout=out, stderr=said, start_new_session=True
+                    command, stdin=into, stdout=out, stderr=errors, start_new_session=True
                 )
             started = process
             with leaving(lambda _code: _kill(started)):
-                _bound(process)
+                _limit_time(process)
                 _await(process)
         except BaseException:
             if process is not None:
                 _end(process)
             raise
         texts = []
-        for file in (out, said):
-            file.seek(0)
-            texts.append(file.read().decode(errors="replace"))
-    return Done(process.returncode, *texts)
+        for stream in (out, errors):
+            stream.seek(0)
+            texts.append(stream.read().decode(errors="replace"))
+    return ProgramResult(process.returncode, *texts)
 
 
 @contextmanager
-def _whole() -> Iterator[None]:
+def _signals_deferred() -> Iterator[None]:
     """Defer stop signals: a half-started process could not be killed."""
     if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
         yield
         return
-    came: list[int] = []
+    received: list[int] = []
     before = {
-        number: signal.signal(number, lambda number, _: came.append(number))
+        number: signal.signal(number, lambda number, _: received.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
         if signal.getsignal(number) not in (None, signal.SIG_IGN)
     }
@@ -260,11 +265,11 @@ def _whole() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for each in came:
+        for each in received:
             signal.raise_signal(each)
 
 
-def _bound(process: subprocess.Popen[bytes]) -> None:
+def _limit_time(process: subprocess.Popen[bytes]) -> None:
     """Limit the processor time of a program and its children, in case this process dies."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         import resource

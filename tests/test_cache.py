@@ -20,7 +20,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebod
 @pytest.fixture
 def kept(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "deep/down"))
-    return cache.lasting()
+    return cache.persistent()
 
 
 def mode(path: Path) -> int:
@@ -30,7 +30,7 @@ def mode(path: Path) -> int:
 def test_the_folder_and_its_files_are_the_user_s_alone(kept, tmp_path):
     before = os.umask(0)
     try:
-        assert kept.keep("kernel-1", b"code")
+        assert kept.write("kernel-1", b"code")
     finally:
         os.umask(before)
     assert kept.shown == tmp_path / "deep/down/stlc"
@@ -43,12 +43,12 @@ def test_the_folder_and_its_files_are_the_user_s_alone(kept, tmp_path):
 
 def test_a_folder_that_others_may_read_is_closed(kept):
     kept.shown.chmod(0o755)
-    assert cache.lasting() is not None
+    assert cache.persistent() is not None
     assert mode(kept.shown) == 0o700
 
 
 def test_the_folder_stays_the_one_that_was_looked_at(kept, tmp_path):
-    kept.keep("kernel-1", b"mine")
+    kept.write("kernel-1", b"mine")
     kept.shown.rename(tmp_path / "away")
     kept.shown.mkdir()
     (kept.shown / "kernel-1").write_bytes(b"theirs")
@@ -72,7 +72,7 @@ def test_where_it_belongs(monkeypatch, variables, expected):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     if expected is None:
-        assert cache.lasting() is None
+        assert cache.persistent() is None
         assert cache.why_not() == "there is no home directory"
     else:
         assert cache.place() == Path(expected)
@@ -81,21 +81,21 @@ def test_where_it_belongs(monkeypatch, variables, expected):
 def test_no_folder_can_be_made(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert cache.lasting() is None
+    assert cache.persistent() is None
     assert cache.why_not() == f"`{tmp_path}/file/stlc` cannot be used: file exists"
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/nothing")
-    assert cache.lasting() is None
+    assert cache.persistent() is None
 
 
 def test_what_is_distrusted_is_told(kept):
     kept.shown.chmod(0o777)
     with pytest.warns(Notice, match=r"W701: the cache folder .* may be written by others .* your own"):
-        assert cache.lasting() is None
+        assert cache.persistent() is None
 
 
 def test_the_temporary_folder_ends_with_its_process(tmp_path):
     script = (
-        "import os; from stlc.cache import temporary; t = temporary(); t.keep('kernel-1', b'x')\n"
+        "import os; from stlc.cache import temporary; t = temporary(); t.write('kernel-1', b'x')\n"
         "if os.fork() == 0: raise SystemExit\n"  # a forked process leaves it alone
         "os.wait(); assert t.read('kernel-1') == b'x'; print(t.shown)"
     )
@@ -129,7 +129,7 @@ def test_old_files_go_and_then_the_oldest(kept):
 
 
 def test_what_is_used_is_not_old(kept):
-    kept.keep("kernel-1", b"code")
+    kept.write("kernel-1", b"code")
     os.utime(kept.shown / "kernel-1", (1, 1))
     kept.read("kernel-1")
     cache.prune(kept)

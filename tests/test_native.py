@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stlc import native, toolchain
-from stlc.cache import lasting
+from stlc.cache import persistent
 from stlc.compile.backends.c.emit import LANES, Motion, emit
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Notice
@@ -153,9 +153,9 @@ class Built:
 def built(cache: Path) -> Built:
     text = f"{SMALL}/* {cache} */"
     name, data = library(text)
-    kept = lasting()
+    kept = persistent()
     assert kept is not None
-    assert kept.keep(name, data)
+    assert kept.write(name, data)
     return Built(text, cache / name, library(f"{EVIL}/* {cache} */")[1])
 
 

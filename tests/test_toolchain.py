@@ -60,7 +60,7 @@ def _runs(process: int) -> bool:
 
 def test_what_a_program_gives():
     done = run(["sh", "-c", "cat; echo no >&2; exit 3"], given="yes")
-    assert (done.code, done.out, done.said) == (3, "yes", "no\n")
+    assert (done.code, done.out, done.errors) == (3, "yes", "no\n")
 
 
 def test_one_that_sleeps_is_ended_with_all_it_started(sleeper, tmp_path):

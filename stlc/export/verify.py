@@ -213,7 +213,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
         if broken:
             raise Unchecked(f"the C compiler `{using}` {broken}")
         raise RunError(
-            Diagnostic("R105", "the exported C does not compile", note=tuple(done.said.splitlines()[:5]))
+            Diagnostic("R105", "the exported C does not compile", note=tuple(done.errors.splitlines()[:5]))
         )
     rules, shape = len(task.rules), (task.horizon, len(task.system.decl.controls))
 

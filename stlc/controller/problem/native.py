@@ -18,7 +18,7 @@ from torch import Tensor
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.native import Adjoint, Climb, Kernel, ObjectiveSlopes, Stop, load, never, why_none
+from stlc.native import Adjoint, Kernel, ObjectiveSlopes, SearchOptions, Stop, load, never, why_none
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class NativeJudge:
             Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
         """
         arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, bank)]
-        how = Climb(
+        how = SearchOptions(
             self._bounds,
             self._factors,
             arrays[2],

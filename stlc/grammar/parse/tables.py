@@ -20,7 +20,7 @@ from lark import UnexpectedInput
 from lark.grammar import Rule
 from lark.lexer import TerminalDef
 
-from stlc.cache import lasting
+from stlc.cache import persistent
 from stlc.grammar.words import PATTERNS
 
 _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, lark.exceptions.LarkError)
@@ -30,12 +30,12 @@ _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, 
 def load_parser() -> lark.Lark:
     """Return the parser of the language, with the start rules `start` and `expr`."""
     grammar = grammar_text()
-    kept, name = lasting(), cache_name(grammar)
+    kept, name = persistent(), cache_name(grammar)
     parser = None if kept is None else _read(kept.read(name))
     if parser is None:
         parser = build_parser(grammar)
         if kept is not None:
-            kept.keep(name, _dumped(parser).encode())
+            kept.write(name, _dumped(parser).encode())
     return parser
 
 
