@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -34,9 +35,9 @@ class Augmented:
     """Requirement rewritten for training.
 
     Attributes:
-        formula: that every plan has to satisfy.
-        alive: whether the requirement can still be satisfied after the mission so far.
-        goal: absolute formulas of the requirement; None where it has none.
+        formula: formula that every plan has to satisfy.
+        alive: test of the state: the requirement can still be satisfied after the mission so far.
+        goal: absolute formulas of the requirement; None without any.
     """
 
     formula: typed.Formula
@@ -76,7 +77,7 @@ def augment(
 @final
 @dataclass(frozen=True, slots=True)
 class _Goals:
-    """Absolute formulas of a requirement, evaluated at the start of the mission."""
+    """Builder of the goals of one requirement."""
 
     grid: Grid
     table: TimerTable
@@ -84,9 +85,9 @@ class _Goals:
     name: str
 
     def of(self, node: typed.Formula) -> Goal:
-        """Goals of a formula without past operators.
+        """Return the goals of a formula without past operators, evaluated at the start of the mission.
 
-        Relative operators are evaluated at the start of the mission, where relative and mission time agree.
+        Relative operators become absolute ones: at that sample relative and mission time agree.
         """
         if is_state(node, augmented=True):
             return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
@@ -123,16 +124,17 @@ class _Goals:
         return GoalLeaf(formula, self.table.add(draft, update(formula, clock)), clock)
 
 
-_LATCHED: dict[AbsoluteOp, str] = {
+_LATCHED: Mapping[AbsoluteOp, str] = {
     "always": "false where {right} fails",
     "eventually": "true where {right} holds",
     "until": "true where {right} holds, false where {left} fails before",
     "release": "true where {left} holds, false where {right} fails before",
 }
+"""Operator -> the condition that latches its status."""
 
 
 def _about(formula: Absolute) -> str:
-    """Description of a status: `open | true | false`, and the condition that latches it."""
+    """Return the description of a status: `open | true | false`, and the condition that latches it."""
     left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
     window = formula.window
     if formula.right.span == formula.left.span:  # rewritten, with no text of its own

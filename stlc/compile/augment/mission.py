@@ -69,7 +69,7 @@ class GoalBranch:
 
 
 Goal: TypeAlias = GoalLeaf | GoalBranch
-"""The Boolean structure of a requirement above its absolute formulas."""
+"""Boolean structure of a requirement, with its absolute formulas as leaves."""
 
 
 def last_step(formula: Absolute) -> int:
@@ -101,7 +101,7 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Next value of an open status, after the current sample."""
+    """Return the next value of an open status, after the current sample."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -120,11 +120,12 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
 
 
 def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    begun = at_least(clock, ir.Const(float(window.lo)))
+    """True if the current sample is within a window on the mission clock."""
+    started = at_least(clock, ir.Const(float(window.lo)))
     if window.hi is None:
-        return begun
+        return started
     not_over = at_least(ir.Const(float(window.hi)), clock)
-    return not_over if window.lo == 0 else both(begun, not_over)
+    return not_over if window.lo == 0 else both(started, not_over)
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
@@ -132,11 +133,11 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
-# ------------------------------------------------------------------------- what plans do
+# ------------------------------------------------------------------------- progression
 
 
 def progress(goal: Goal, horizon: int) -> typed.Formula:
-    """Progressed formula for a plan from its first sample on: true unless falsified by the plan's end."""
+    """Return the formula for a plan's first sample that is true unless the plan falsifies the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
@@ -147,6 +148,7 @@ def progress(goal: Goal, horizon: int) -> typed.Formula:
 
 
 def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula:
+    """Return that formula for one absolute formula."""
     span, left, right = formula.span, formula.left, formula.right
     known = time_test(leaf.status, _KNOWN, span)
     alive = possible(leaf)
@@ -163,10 +165,8 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
             return typed.Logic(span, "or", (known, far, soon))
         case "until":
             later = typed.Logic(span, "and", (far, _all_along(left)))
-            soon_or_later = typed.Logic(
-                span, "or", (later, typed.Until(span, "until", _plan(span), left, met))
-            )
-            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, soon_or_later))))
+            either = typed.Logic(span, "or", (later, typed.Until(span, "until", _plan(span), left, met)))
+            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, either))))
         case "release":
             freed = typed.Until(span, "release", _plan(span), left, asked)
             return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, freed))))
@@ -175,7 +175,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """Time test on the current state: true if the mission so far has not falsified the goal."""
+    """Return a test of the current state that is true if the mission so far has not falsified the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -187,11 +187,11 @@ def possible(goal: Goal) -> typed.Formula:
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
     """Time test: true if the current sample is within a window on the mission clock."""
-    begun = time_test(clock, ir.Const(float(window.lo)), span)
+    started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
-        return begun
+        return started
     not_over = time_test(ir.Const(float(window.hi)), clock, span)
-    return not_over if window.lo == 0 else typed.Logic(span, "and", (begun, not_over))
+    return not_over if window.lo == 0 else typed.Logic(span, "and", (started, not_over))
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
@@ -203,9 +203,10 @@ def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
 
 
 def _all_along(body: typed.Formula) -> typed.Formula:
+    """Return: `body` at every sample of the plan."""
     return typed.Temporal(body.span, "always", _plan(body.span), body)
 
 
 def _plan(span: Span) -> typed.Interval:
-    """The whole planning window."""
+    """Return the interval of the whole plan."""
     return typed.Interval(typed.Time(), typed.Time(horizons=Fraction(1), span=span), span=span)

@@ -37,6 +37,7 @@ REGISTER = 64
 """Maximum delay in samples that a register holds, one state per sample."""
 
 _ZERO, _ONE = ir.Const(0.0), ir.Const(1.0)
+_SO_FAR = ir.Window(0, None)
 _Op: TypeAlias = Literal["and", "or"]
 
 
@@ -188,16 +189,13 @@ class Past:
             node, self._condition(left), self._condition(right), window.hi, positive=positive
         )
         met = typed.Logic(node.span, ops[1], (right, recent.now))
-        whole = typed.Temporal(
-            node.span, "historically" if positive else "once", in_steps(ir.Window(0, None), node.span), left
-        )
-        before = typed.Logic(node.span, ops[0], (whole, recent.along))
+        throughout = self._throughout(left, node.span, positive=positive)
+        before = typed.Logic(node.span, ops[0], (throughout, recent.along))
+        inside = _since_inside(node, left, right, window, positive=positive)
         return typed.Recalled(
             node.span,
             now=typed.Logic(node.span, ops[0], (left, met)),
-            along=typed.Logic(
-                node.span, ops[1], (_since_inside(node, left, right, window, positive=positive), before)
-            ),
+            along=typed.Logic(node.span, ops[1], (inside, before)),
         )
 
     def _recent(
@@ -216,9 +214,8 @@ class Past:
         since = self.table.add(
             draft, lambda own: choose(held, choose(met, _ONE, _counted(own, most + 1)), far)
         )
-        if positive:
-            return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
-        return _Test(since, far, node.span, later=1).decides()
+        sides: tuple[ir.Num, ir.Num] = (ir.Const(float(most)), since) if positive else (since, far)
+        return _Test(sides[0], sides[1], node.span, later=1).decides()
 
     # ------------------------------------------------------------------------- rise, fall
 
@@ -268,12 +265,8 @@ class Past:
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
         ago = self._delayed(node, self._since(recent, positive=positive), lo, before=not positive)
-        held = typed.Temporal(
-            node.span,
-            "historically" if positive else "once",
-            in_steps(ir.Window(0, lo), node.span),
-            normal(node.left, 1 if positive else -1),
-        )
+        left = normal(node.left, 1 if positive else -1)
+        held = self._throughout(left, node.span, ir.Window(0, lo), positive=positive)
         return typed.Logic(node.span, "and" if positive else "or", (self._window(held), ago))
 
     def _lasting(
@@ -291,44 +284,33 @@ class Past:
             return choose(held, running, _ZERO)
 
         age = self.table.add(draft, update)
-        span, bound = node.span, ir.Const(float(least))
+        span, bound, few = node.span, ir.Const(float(least)), ir.Const(least - 1.0)
         first, elapsed = ir.at_first(age), ir.Signal(ir.ELAPSED)
         after = ir.Op("add", (first, elapsed))
-        whole = in_steps(ir.Window(0, None), span)
+        throughout = self._throughout(left, span, positive=positive)
         inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
         if not positive:
-            none = typed.Logic(
-                span,
-                "or",
-                (
-                    typed.Temporal(span, "once", whole, left),
-                    time_test(_ZERO, first, span),
-                    time_test(ir.Const(least - 1.0), after, span),
-                ),
-            )
-            now = typed.Logic(span, "or", (left, time_test(ir.Const(least - 1.0), age, span)))
+            tests = time_test(_ZERO, first, span), time_test(few, after, span)
+            none = typed.Logic(span, "or", (throughout, *tests))
+            now = typed.Logic(span, "or", (left, time_test(few, age, span)))
             return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
-        memory = typed.Logic(
-            span,
-            "and",
-            (
-                typed.Temporal(span, "historically", whole, left),
-                time_test(first, _ONE, span),
-                time_test(after, bound, span),
-            ),
-        )
+        tests = time_test(first, _ONE, span), time_test(after, bound, span)
+        memory = typed.Logic(span, "and", (throughout, *tests))
         missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Const(-1.0)))
         lacks = typed.Predicate(span, ir.Op("mul", (missing, ir.Const(MISSING))), strict=False)
-        return typed.Recalled(
-            span,
-            now=typed.Logic(span, "and", (left, time_test(age, bound, span))),
-            along=typed.Logic(span, "or", (inside, memory, lacks)),
-        )
+        now = typed.Logic(span, "and", (left, time_test(age, bound, span)))
+        return typed.Recalled(span, now=now, along=typed.Logic(span, "or", (inside, memory, lacks)))
 
     # -------------------------------------------------------------------------- in common
 
     def _draft(self, kind: TimerKind, what: str, initial: float, high: float, about: str) -> Timer:
         return Timer(f"{self.name}_{what}", kind, initial, _ZERO, 0.0, high, about)
+
+    def _throughout(
+        self, body: typed.Formula, span: Span, window: ir.Window = _SO_FAR, *, positive: bool
+    ) -> typed.Temporal:
+        """Return `historically[window] body`, or its dual if not `positive`."""
+        return typed.Temporal(span, "historically" if positive else "once", in_steps(window, span), body)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
         return tolerant(condition(at_hand(body), flat=True))
