@@ -55,7 +55,7 @@ def _head(compiled: Compiled) -> Iterator[str]:
 
 
 def _both(steps: int, grid: Grid) -> str:
-    """Text of a time in seconds and in steps."""
+    """Return the text of a time in seconds and in steps."""
     count = f"{steps} step{'' if steps == 1 else 's'}"
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
@@ -67,7 +67,7 @@ def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
 
 
 def _beside(compiled: Compiled) -> Iterator[str]:
-    """Requirements in two columns: as written and as compiled."""
+    """Yield the requirements in two columns: as written and as compiled."""
     written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"
@@ -80,7 +80,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 
 
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
-    """Compiled form of a requirement: formula, added states, intervals."""
+    """Yield the compiled form of a requirement: formula, added states, intervals."""
     yield show_formula(rule.formula)
     read = columns(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
@@ -92,14 +92,14 @@ def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
 
 
 def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
-    """Wrapped lines of a formula; comparisons and sums are not broken."""
+    """Return the wrapped lines of a formula; comparisons and sums are not broken."""
     tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
     lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
 def _cut(lines: list[str]) -> list[str]:
-    """First lines of a very long formula."""
+    """Return the lines of a formula, the first ones of a very long formula."""
     if len(lines) <= LONG:
         return lines
     return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
@@ -125,7 +125,7 @@ def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) 
 
 
 def _added(timer: Timer) -> str:
-    """Line for an added state: its name and meaning."""
+    """Return the line of an added state: its kind, name and meaning."""
     return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
 
 
@@ -134,7 +134,7 @@ def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
 
 
 def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
-    """Distinct intervals: operator, seconds, samples."""
+    """Yield the distinct intervals: operator, seconds, samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
         if isinstance(node, ir.Windowed):

@@ -56,20 +56,20 @@ class CompiledRequirement:
     """Compiled requirement.
 
     Attributes:
-        name: of the requirement.
+        name: name of the requirement.
         doc: its `##` comment.
         tags: bare tag names.
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
-        formula: in negation normal form and steps.
+        formula: formula in negation normal form and steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
         windowed: it mentions `T`, and so applies to every planning window.
         uses_end: it has a window to the end of the trace.
         absolute: it has an interval on the mission clock.
         alive: for training, state formula: the requirement can still be satisfied after the mission so far.
-        span: of the declaration.
-        typed: formula before lowering.
+        span: place of the declaration.
+        typed: requirement before lowering.
     """
 
     name: str
@@ -102,14 +102,14 @@ class Compiled:
     """Compiled specification.
 
     Attributes:
-        name: of the specification.
+        name: name of the specification.
         spec: syntax tree.
         signature: columns that requirements and assumptions read, then the timers.
-        requirements: in order.
-        assumptions: `assume`s, in order; not part of the overall robustness.
+        requirements: every `require`, in order.
+        assumptions: every `assume`, in order; not part of the overall robustness.
         timers: states that the requirements add to those of the system.
         parameters: for training, values drawn per trajectory that are not states of the system.
-        pull: for training, guidance cost at one sample; None without goals beyond the horizon.
+        guidance_cost: for training, cost at one sample; None without goals beyond the horizon.
         mission: last step of the mission that a requirement refers to; None without one.
         recurring: for an unbounded mission, the steps that its timers count, about one period; None if all
             missions are bounded.
@@ -156,7 +156,7 @@ def compile_spec(
     Args:
         spec: as parsed.
         grid: time step and horizon, as far as known.
-        interface: of a system; None leaves the signals as declared in the file.
+        interface: signals of a system; None leaves them as declared in the file.
         overrides: constant -> its value, as text.
         purpose: training or judging recorded traces.
 
@@ -196,7 +196,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
     assumptions = tuple(map(stage.rule, spec.assumptions))
     errors = [finding for finding in sink if finding.severity == "error"]
     if not errors and purpose == "train":
-        errors = [_too_far(rule, grid) for rule in requirements if _leaves(rule, grid)]
+        errors = [_too_far(rule, grid) for rule in requirements if _leaves_plan(rule, grid)]
     if errors:
         raise SpecError(*errors)
     return Compiled(
@@ -219,7 +219,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
 @final
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """Compilation of resolved requirements, collecting timers, goals and findings."""
+    """Compiler of resolved requirements that collects their timers, goals and findings."""
 
     grid: Grid
     purpose: Purpose
@@ -251,20 +251,18 @@ class _Stage:
             windowed=mentions_horizon(written),
             uses_end=uses_end(formula),
             absolute=absolute(written),
-            alive=self._lowered(rewritten.alive),
+            alive=simplify(lower(rewritten.alive, self.grid, self.sink)),
             span=requirement.span,
             typed=requirement,
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
+        """Rewrite intervals on the mission clock, and for training past operators."""
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)
         written = requirement.formula
         formula = from_first_sample(written) if absolute(written) else written
         return Augmented(formula, typed.Truth(written.span, True), None)
-
-    def _lowered(self, formula: typed.Formula) -> ir.Formula:
-        return simplify(lower(formula, self.grid, self.sink))
 
 
 def _remembered(timers: Iterable[Timer]) -> int:
@@ -279,12 +277,14 @@ def _without(interface: Interface, names: Iterable[str]) -> Interface:
 
 
 def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
+    """Return the columns that requirements read, then the timers."""
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
 
 
-def _leaves(rule: CompiledRequirement, grid: Grid) -> bool:
+def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
+    """True if a requirement is undefined at the first sample of a plan, as it needs samples outside."""
     if grid.horizon is None:
         return False
     from stlc.compile.ir.defined import defined

@@ -21,12 +21,12 @@ _TOLERANCE = 1e-6
 
 def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
     """Yield W505 for each conjunction in a formula that is unsatisfiable for all signal values."""
-    told: set[Span] = set()
+    reported: set[Span] = set()
     for node in nodes(formula):
-        if isinstance(node, typed.Logic) and node.op == "and" and node.span not in told:
+        if isinstance(node, typed.Logic) and node.op == "and" and node.span not in reported:
             found = _contradiction(node)
             if found is not None:
-                told |= {inner.span for inner in nodes(node)}
+                reported |= {inner.span for inner in nodes(node)}
                 yield found
 
 
@@ -84,7 +84,7 @@ def _contradiction(node: typed.Logic) -> Diagnostic | None:
 
 
 def _conjuncts(formula: typed.Formula) -> Iterator[typed.Predicate]:
-    """Predicates that must all hold at one instant."""
+    """Yield the predicates that must all hold at one instant."""
     match formula:
         case typed.Predicate():
             yield formula
@@ -117,8 +117,8 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
     """Yield a warning for each predicate with a modulo that is discontinuous within its signals' ranges.
 
     Args:
-        formula: as resolved.
-        ranges: of columns, declared or enforced, in stored units.
+        formula: resolved formula.
+        ranges: ranges of columns, declared or enforced, in stored units.
     """
     for node in nodes(formula):
         if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
@@ -167,7 +167,7 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) ->
 
 
 def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
-    """Truth value at every instant of every trace, by enforced ranges; None where they leave it open."""
+    """Return the truth value at all instants of all traces within the enforced ranges; None if it varies."""
     return _truth(normal(formula), facts)
 
 
@@ -193,7 +193,7 @@ def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """Left sides of required implications (those under no negation)."""
+    """Yield the left sides of implications that must hold, under no negation."""
     match formula:
         case typed.Logic(_, "->", (left, right)):
             yield left
@@ -208,7 +208,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
-    """Text `: x is in [0, 5]` for the columns whose enforced range decides the formula."""
+    """Return the text `: x is in [0, 5]` for the columns whose enforced ranges decide the formula."""
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
     for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):
@@ -266,7 +266,7 @@ def _open(window: typed.Interval) -> bool:
 
 
 def _promise(formula: typed.Formula) -> Span:
-    """Span of the part that no finite prefix can violate."""
+    """Return the place of the part that no finite prefix can violate."""
     if isinstance(formula, typed.Freeze):
         return _promise(formula.body)
     if isinstance(formula, typed.Logic):

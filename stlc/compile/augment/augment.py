@@ -25,7 +25,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import condition, normal
-from stlc.compile.ir.traverse import absolute, at_hand, is_state, looks_back
+from stlc.compile.ir.traverse import absolute, is_state, looks_back, timer_form
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
@@ -117,7 +117,7 @@ class _Goals:
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):
             tell(self.sink, _without_deadline(node.span))
-        left, right = (condition(at_hand(body), flat=True) for body in operands)
+        left, right = (condition(timer_form(body), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.table.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
         draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))

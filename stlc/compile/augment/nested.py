@@ -166,7 +166,7 @@ class _Writer:
 
     Args:
         table: receives the mission clock.
-        span: of the absolute operator.
+        span: place of the absolute operator.
         soon: whether to detect a violation at once, by the left side of an `until`.
     """
 

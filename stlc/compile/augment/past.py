@@ -29,7 +29,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import Sign, condition, flip, negate, normal
-from stlc.compile.ir.traverse import at_hand, is_state, looks_back
+from stlc.compile.ir.traverse import is_state, looks_back, timer_form
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
@@ -48,7 +48,7 @@ class _Test:
     Attributes:
         left: left side.
         right: right side.
-        span: of the operator.
+        span: place of the operator.
         later: increment of the timer per step while it is not reset.
     """
 
@@ -72,9 +72,9 @@ class _Test:
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
         """Both sides at a later sample of the plan, extrapolated from the timer at the first sample."""
-        return self._since_first(self.left), self._since_first(self.right)
+        return self._extrapolated(self.left), self._extrapolated(self.right)
 
-    def _since_first(self, side: ir.Num) -> ir.Num:
+    def _extrapolated(self, side: ir.Num) -> ir.Num:
         if not isinstance(side, ir.Signal):
             return side
         first = ir.at_first(side)
@@ -90,7 +90,7 @@ class Past:
         grid: time step and horizon.
         table: receives the timers.
         sink: receives the findings, E309 for operators that no timer represents.
-        name: of the requirement; prefix of the timers' names.
+        name: name of the requirement; prefix of the timers' names.
     """
 
     grid: Grid
@@ -313,7 +313,7 @@ class Past:
         return typed.Temporal(span, "historically" if positive else "once", in_steps(window, span), body)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
-        return tolerant(condition(at_hand(body), flat=True))
+        return tolerant(condition(timer_form(body), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """Return the body without past operators if that is a state formula; else None, and E309."""

@@ -30,16 +30,16 @@ MISSING = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """State that the compiler adds.
+    """State that the compiler adds to those of the system.
 
     Attributes:
-        name: of its column.
+        name: name of its column.
         kind: clock, status, latch or timer.
         initial: value at the start of a mission.
         update: value one step later, as a function of the state at the start of the step.
         low: least value.
         high: greatest value, where the count saturates; larger ones make no difference to any formula.
-        about: meaning in words.
+        about: meaning in words, for texts.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Timer:
 
 
 def clock_of(name: str, high: int) -> Timer:
-    """Mission clock in integer steps, free of rounding, saturating at `high`."""
+    """Return the mission clock, which counts integer steps up to `high`."""
     later = ir.Op("min", (ir.Op("add", (ir.Signal(name), ir.Const(1.0))), ir.Const(float(high))))
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
@@ -117,10 +117,10 @@ def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """Test `left >= right` of a fact before the plan; where it fails, it costs `MISSING` per missing step.
+    """Test `left >= right` of samples before the plan; where it fails, its robustness is `-MISSING` per step.
 
-    A missing step costs more than any predicate, so that instants that the plan can influence are preferred;
-    it is finite, so that plans that all fail can still be ranked.
+    That is less than the robustness of any predicate, so that instants that the plan can influence are
+    preferred; it is finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))

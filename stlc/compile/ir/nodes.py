@@ -184,13 +184,13 @@ class Windowed(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """The window, for the one operand."""
+        """Offsets of the operand: the window."""
         return (self.window_offsets,)
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Truth constant: robustness +inf or -inf. Folded before evaluation."""
+    """Truth constant, with robustness +inf or -inf; `simplify` removes those in operators."""
 
     value: bool
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -222,7 +222,7 @@ class BoolOp(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Now, for every item."""
+        """Offsets of each item: now."""
         return (NOW,) * len(self.items)
 
 
@@ -262,7 +262,7 @@ class Until(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """From now to the end of the window, and the window."""
+        """Offsets of `left`, from now to the end of the window, and of `right`: the window."""
         return Offsets(0, self.window.hi), self.window_offsets
 
 
@@ -280,13 +280,13 @@ class Since(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """From the far end of the window to now, and the window."""
+        """Offsets of `left`, from the far end of the window to now, and of `right`: the window."""
         return Offsets(self.window_offsets.first, 0), self.window_offsets
 
 
 @dataclass(frozen=True, slots=True)
 class Shift(Operator):
-    """Value `steps` later (negative: earlier).
+    """Value of `body` `steps` samples later (negative: earlier).
 
     `outside` is the value beyond the ends of the trace: None is undefined, as for windows; False is used by
     `rise` and `fall` at the first sample. Where windows are cut, an undefined value is false, or true for a
@@ -301,7 +301,7 @@ class Shift(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """One instant."""
+        """Offsets of the operand: one instant."""
         return (Offsets(self.steps, self.steps),)
 
 
@@ -319,7 +319,7 @@ class Freeze:
 
 @dataclass(frozen=True, slots=True)
 class AtStart:
-    """Value at the first sample, at any instant: for operators on the mission clock."""
+    """Value of `body` at the first sample, for operators on the mission clock."""
 
     body: Formula
     span: Span | None = field(default=None, compare=False, repr=False)

@@ -50,7 +50,7 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
 
 
 def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
-    """`a -> b`; `a <-> b` is both implications, `a xor b` its negation."""
+    """Rewrite `a -> b`, `a <-> b` (both implications) or `a xor b` (the negation of that)."""
     left, right = node.items
     if node.op == "xor":
         sign = flip(sign)
@@ -63,7 +63,7 @@ def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
 
 
 def _unless(node: typed.Until) -> typed.Formula:
-    """`left unless[a, b] right` is `always[0, b] left or left until[a, b] right`."""
+    """Rewrite `left unless[a, b] right` as `always[0, b] left or left until[a, b] right`."""
     whole = replace(node.interval, lo=typed.Time(), lo_open=False)
     held = typed.Temporal(node.span, "always", whole, node.left)
     return typed.Logic(node.span, "or", (held, replace(node, op="until")))
@@ -112,7 +112,7 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
 
 
 def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
-    """Return the `and` or `or` of formulas, constants removed; `neutral` is the value of an empty one."""
+    """Return the `and` or `or` of formulas without constants; `neutral` is that of no formulas."""
     kept: list[ir.Formula] = []
     for item in items:
         if not isinstance(item, ir.Truth):

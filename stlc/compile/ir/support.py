@@ -75,7 +75,7 @@ class Reach(NamedTuple):
 
 
 def reach(formula: ir.Formula) -> Reach:
-    """Return lookback and lookahead of a formula: the samples required around its instant.
+    """Return lookback and lookahead of a formula: how many samples it requires around its instant.
 
     A window to the end of the trace counts with its start alone. Operators on the mission clock count from
     the first sample, regardless of enclosing operators.
@@ -85,17 +85,17 @@ def reach(formula: ir.Formula) -> Reach:
 
 
 def reach_of(num: ir.Num) -> Reach:
-    """Return lookback and lookahead of a number: the samples required for it to be defined."""
+    """Return lookback and lookahead of a number: how many samples it needs to be defined."""
     return _offsets([leaf.steps for leaf in _shifts(num) if not leaf.clamped])
 
 
 def farthest(num: ir.Num) -> Reach:
-    """Return the samples before and after now that a number reads where they exist."""
+    """Return how many samples before and after now a number reads where they exist."""
     return _offsets([leaf.steps for leaf in _shifts(num)])
 
 
 def history(formula: ir.Formula) -> int:
-    """Return the samples before its instant that a formula reads where they exist; 2^40 means all."""
+    """Return how many samples before its instant a formula reads where they exist; 2^40 means all."""
     return fold(formula, _HISTORY)
 
 
@@ -170,31 +170,28 @@ def columns(formula: ir.Formula) -> frozenset[str]:
     return frozenset(name for num in numbers(formula) for name in columns_of(num))
 
 
-def looks_at_ends(num: ir.Num) -> bool:
+def depends_on_ends(num: ir.Num) -> bool:
     """True if a number depends on where the trace begins or ends."""
     return any(leaf.clamped for leaf in _shifts(num))
-
-
-def looks_on(num: ir.Num) -> bool:
-    """True if a number depends on where the trace ends."""
-    return any(leaf.clamped and leaf.steps > 0 for leaf in _shifts(num))
 
 
 def uses_end(formula: ir.Formula) -> bool:
     """True if a future window extends to the end of the trace, or a `sweep` is clamped there."""
     windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
     endless = any(node.window.hi is None and not node.back for node in windowed)
-    return endless or any(map(looks_on, numbers(formula)))
+    return endless or any(
+        leaf.clamped and leaf.steps > 0 for num in numbers(formula) for leaf in _shifts(num)
+    )
 
 
-# ------------------------------------------------------------------------------ steady tails
+# ------------------------------------------------------------------------------ constant tails
 
 
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
-    """Return an instant from which a formula is constant, +inf or -inf, on an open trace; None: unknown.
+    """Return an instant from which a formula is constant on an open trace, +inf or -inf; None: not known.
 
-    Beyond the last sample all predicates are unknown and so are formulas of them alone: a window far beyond a
-    short trace needs one such instant instead of all.
+    Beyond the last sample the value of every predicate is the same bound, so formulas are constant from some
+    instant on, and a window far beyond a short trace needs one such instant instead of all.
 
     Args:
         formula: in negation normal form.

@@ -156,7 +156,7 @@ def leaves(num: Node) -> Iterator[NumberLeaf]:
 
 
 def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
-    """Return a number or a formula with each leaf of its numbers replaced."""
+    """Return a number or a formula with each leaf of its numbers replaced by `change(leaf)`."""
     if isinstance(node, LEAVES):
         return change(node)  # type: ignore[return-value]
 
@@ -170,35 +170,34 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """Return the name of a leaf among the inputs of a program."""
+    """Return the key of a leaf in the inputs of a program."""
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name
 
 
 def frozen_in(num: ir.Num) -> frozenset[str]:
-    """Return the names of the frozen values that a number reads."""
+    """Return the names of the frozen values in a number."""
     return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, ir.FrozenVar))
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """Return a number `steps` and a `delay` later; `clamped` repeats the end samples outside the trace."""
+    """Return the number with the values of `steps` samples and `delay` later.
+
+    Outside the trace a `clamped` number repeats the first or last sample.
+    """
 
     def moved(leaf: ir.Num) -> ir.Num:
-        match leaf:
-            case typed.DelayedSignal(name, before, end, known):
-                return typed.DelayedSignal(name, before + steps, clamped or end, known.plus(delay))
-            case ir.Signal(name) if delay is not None:
-                return typed.DelayedSignal(name, steps, clamped, delay)
-            case ir.ShiftedSignal(name, before, end) if delay is not None:
-                return typed.DelayedSignal(name, before + steps, clamped or end, delay)
-            case ir.Signal(name):
-                return ir.ShiftedSignal(name, steps, clamped) if steps else leaf
-            case ir.ShiftedSignal(name, before, end):
-                there = before + steps
-                return ir.ShiftedSignal(name, there, clamped or end) if there else ir.Signal(name)
-            case _:
-                return leaf
+        if not isinstance(leaf, (ir.Signal, ir.ShiftedSignal)):
+            return leaf
+        there, ends, later = steps, clamped, delay
+        if isinstance(leaf, ir.ShiftedSignal):
+            there, ends = there + leaf.steps, ends or leaf.clamped
+        if isinstance(leaf, typed.DelayedSignal):
+            later = leaf.delay.plus(delay)
+        if later is not None:
+            return typed.DelayedSignal(leaf.name, there, ends, later)
+        return ir.ShiftedSignal(leaf.name, there, ends) if there else ir.Signal(leaf.name)
 
     return map_leaves(num, moved)
 
@@ -230,12 +229,12 @@ def margin_unit(formula: typed.Formula) -> str:
 
 
 def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
-    """True if the interval of this operator is on the mission clock."""
+    """True for a temporal operator with an interval on the mission clock."""
     return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"
 
 
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
-    """Return the operator with its interval relative to now, equivalent at the first sample."""
+    """Return the operator with its interval relative to now; at the first sample both are equal."""
     return replace(node, interval=replace(node.interval, clock="now"))
 
 
@@ -246,9 +245,8 @@ def absolute(formula: typed.Formula) -> bool:
 
 def looks_back(formula: typed.Formula) -> bool:
     """True if a formula has a past operator."""
-    past = ("once", "historically", "since")
-    timed = (node.op for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
-    return any(op in past for op in timed) or any(isinstance(node, typed.Edge) for node in nodes(formula))
+    past = ("once", "historically", "since", "rise", "fall")
+    return any(getattr(node, "op", None) in past for node in nodes(formula))
 
 
 def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
@@ -274,8 +272,8 @@ def mentions_horizon(formula: typed.Formula) -> bool:
     return any(end is not None and end.horizons != 0 for each in timed for end in (each.lo, each.hi))
 
 
-def at_hand(formula: typed.Formula) -> typed.Formula:
-    """Return a state formula with each `Recalled` node replaced by its timer form."""
+def timer_form(formula: typed.Formula) -> typed.Formula:
+    """Return a state formula with each `Recalled` node replaced by the test of its timers."""
     if isinstance(formula, typed.Recalled):
-        return at_hand(formula.now)
-    return map_children(formula, formulas=at_hand)
+        return timer_form(formula.now)
+    return map_children(formula, formulas=timer_form)

@@ -174,16 +174,16 @@ class Requirement:
     """Requirement (`require`) with its evaluated tags.
 
     Attributes:
-        name: of the requirement.
+        name: name of the requirement.
         doc: its `##` comment.
         tags: bare tag names (`safety`, `liveness`).
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
         id: of `@id("…")`, or "".
         group: of `@group(name)`, or "".
-        formula: as typed.
+        formula: typed formula.
         written: formula as written, for messages.
-        span: of the declaration.
+        span: place of the declaration.
     """
 
     name: str
@@ -203,8 +203,8 @@ class Parameter:
     """Component of a `param`: constant along a trajectory.
 
     Attributes:
-        span: of its name.
-        column: of the value, with its range.
+        span: place of its name.
+        column: column of the value, with its range.
         draw: distribution as a number with samplers, in the unit of the column.
         text: distribution as written.
         carried: the system has it as a state, and draws it.
@@ -222,13 +222,13 @@ class Spec:
     """Resolved specification.
 
     Attributes:
-        name: of the `spec` pragma, else the stem of the file.
+        name: that in the `spec` pragma, else the stem of the file.
         signature: declared signals, with their declared units.
         constants: every `const`, in SI units.
-        requirements: in order.
-        assumptions: `assume`s, in order.
-        source_ast: as parsed.
-        parameters: every `param`, by component.
+        requirements: every `require`, in order.
+        assumptions: every `assume`, in order.
+        source_ast: syntax tree.
+        parameters: components of every `param`.
         taken: names that states added by the compiler must not use.
         warnings: findings that are not errors.
     """

@@ -105,7 +105,7 @@ def at_least(instant: Instant, least: int) -> Instant:
 
 
 def at_most(instant: Instant, most: int) -> Instant:
-    """Return an instant, or `most` where it may exceed it."""
+    """Return an instant, or `most` where the instant may be later."""
     if isinstance(instant, int):
         return min(instant, most)
     return most if instant.high > most else instant
@@ -203,7 +203,7 @@ def _first(read: ir.Offsets, run: IndexRange) -> Instant:
 def _last(
     read: ir.Offsets, run: IndexRange, window: ir.Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
 ) -> Instant:
-    """Return the last such instant; of those beyond the trace at which all operands are constant, one."""
+    """Return the last such instant, at most one beyond the trace at which all operands are constant."""
     if read.last is None:
         return domain.length - 1
     last = run.last + read.last
@@ -243,7 +243,7 @@ class Step:
 
     Attributes:
         node: formula, or a computation specific to a back end.
-        run: instants.
+        run: instants at which it is computed.
         args: step numbers of the operands; None for an operand that is not needed at any instant.
         number: step number.
     """
@@ -264,8 +264,8 @@ class Schedule:
     """Ordered steps.
 
     Attributes:
-        domain: of the trace.
-        steps: operands first.
+        domain: trace that the steps read.
+        steps: steps in order, operands first.
         roots: step numbers of the requested formulas.
     """
 

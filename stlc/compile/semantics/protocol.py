@@ -58,13 +58,13 @@ class Associative:
     __slots__ = ()
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """The operand."""
+        """Return the operands, unchanged."""
         return (x,)
 
     def merge(self: Semantics, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """The extremum of both."""
+        """Return the extremum of both."""
         return (self.pair(a[0], b[0], pick, ops),)
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:  # noqa: ARG002
-        """The extremum so far."""
+        """Return the extremum so far."""
         return parts[0]

@@ -18,7 +18,7 @@ import numpy as np
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Reach, columns, looks_at_ends, reach, uses_end
+from stlc.compile.ir.support import Reach, columns, depends_on_ends, reach, uses_end
 from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
 from stlc.compile.schedule.schedule import IndexRange, TraceDomain, reads, spanning, within
 
@@ -155,7 +155,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     """Samples before and after its instant that a formula reads where they exist; inf: all."""
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
-    if on_clock or any(map(looks_at_ends, numbers(body))):
+    if on_clock or any(map(depends_on_ends, numbers(body))):
         return math.inf, math.inf
     back = any(isinstance(node, ir.Windowed) and node.back and node.window.hi is None for node in nodes(body))
     return math.inf if back else past, math.inf if uses_end(body) else future
