@@ -27,14 +27,14 @@ from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.feasibility import viable
 from stlc.controller.guard.guard import GUARD_VERSION, Guard
 from stlc.controller.guard.margins import MarginRequest, parse_margins
-from stlc.controller.training.run import SPEC, SYSTEM, Run
+from stlc.controller.training.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenarios.scenario import DISTURBED
 from stlc.provenance import sha256
 from stlc.registry import closest
-from stlc.rundir import RunDir
+from stlc.rundir import SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -137,7 +137,7 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _judged(self) -> dict[str, Any]:
         """Robustness of the last horizon of the episode, truncated if the episode is shorter."""
         driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
-        columns = {name: driven[:, i, None] for i, name in enumerate(self.task.names)}
+        columns = {name: driven[:, i, None] for i, name in enumerate(self.task.system.names)}
         margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")
         each = np.clip([float(np.broadcast_to(margin, (1, 1))[0, 0]) for margin in margins], -MOST, MOST)
         rho = float(self.task.graph.overall(torch.as_tensor(each)[None]))

@@ -31,6 +31,13 @@ RUNS = Path("runs")
 LATEST = "latest"
 RECORD = "run.json"
 ROWS = "train.jsonl"
+SPEC = "spec.stl"
+SYSTEM = "system.yaml"
+TRACE = "trace.npz"
+SCENE = "scene.npz"
+UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
+"""Trace and scene of the first seed without guard, stored beside the guarded ones."""
+SIMULATION = "eval/simulate.json"
 
 _KINDS: Mapping[str, type] = {
     **dict.fromkeys(("status", "spec", "spec_path", "system", "system_path", "device", "started"), str),

@@ -85,7 +85,7 @@ def test_dense_rewards_sum_to_the_robustness_of_the_episode() -> None:
         actions.append(action)
     assert len(actions) == env.task.horizon
     verdict = stlc.Monitor(stlc.load(ROOT / "specs" / "ship_safe.stl")).check(
-        {name: np.array(states)[:, i] for i, name in enumerate(env.task.names)}
+        {name: np.array(states)[:, i] for i, name in enumerate(env.task.system.names)}
     )
     rho = float(verdict.robustness)
     assert info["rho"] == pytest.approx(rho, abs=1e-9)

@@ -39,9 +39,9 @@ from stlc.controller.sketch import (
     violations,
 )
 from stlc.files import write_atomic
-from stlc.rundir import RunDir
+from stlc.rundir import SIMULATION, RunDir
 from stlc.view.animation import Animation, clear_artists, frames_in, save_animation, save_still
-from stlc.view.run_animation import RESULT, RecordedScene, animation_of, recorded_scene
+from stlc.view.run_animation import RecordedScene, animation_of, recorded_scene
 from stlc.view.style import INK, MUTED
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -142,7 +142,7 @@ _TOLD = {"without": "unsafe without the guard", "guarded": "with it", "lost": "c
 
 def unsafe_in(run: RunDir) -> list[Unsafe]:
     """Unsafe ships of each seed in the newest deployment."""
-    document = json.loads((run.path / RESULT).read_text(encoding="utf-8"))
+    document = json.loads((run.path / SIMULATION).read_text(encoding="utf-8"))
     found = []
     for seed in document["seeds"]:
         each = {

@@ -527,7 +527,7 @@ def plans(place: Place) -> Pins:
         u = controls(task.system, 8, generator)
         judged = task.judge(x, u)
         found = {
-            "names": list(task.names),
+            "names": list(task.system.names),
             "states": x.tolist(),
             "rho": judged.rho.tolist(),
             "safe": judged.safe.tolist(),

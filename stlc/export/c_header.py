@@ -201,7 +201,7 @@ def squashed(task: Task) -> list[str]:
 def command(task: Task) -> list[str]:
     """Statements that fill `command` from the state `x` and the first action `u` of a plan."""
     names, given = task.system.control_names, commands(task.system.decl)
-    places = {name: f"x[{i}]" for i, name in enumerate(task.names)}
+    places = {name: f"x[{i}]" for i, name in enumerate(task.system.names)}
     places |= {name: f"u[{i}]" for i, name in enumerate(names)}
     return _assigned("command", [given.get(name, ir.Signal(name)) for name in names], places)
 
@@ -226,9 +226,9 @@ def cost(task: Task) -> list[str]:
     Raises:
         Untranslatable: a goal has no margin at one sample.
     """
-    at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.names)}
-    at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.names)}
-    at |= {"k": "(double)k", "t": f"(k * {literal(task.dt)})", "sat": "1.0", "rho": "rho"}
+    at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.system.names)}
+    at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.system.names)}
+    at |= {"k": "(double)k", "t": f"(k * {literal(task.system.dt)})", "sat": "1.0", "rho": "rho"}
     at |= {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
     return [line for term in cost_terms(task) for line in _term(term, at)]
 
@@ -300,21 +300,21 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
-    states, inputs = _places("x", task.names), _places("u", names)
+    states, inputs = _places("x", task.system.names), _places("u", names)
     moved, reflected = state_images(task), list(control_images(task).values())
-    images = [moved.get(name, ir.Signal(name)) for name in task.names]
+    images = [moved.get(name, ir.Signal(name)) for name in task.system.names]
     given = commands(task.system.decl)
     commanded = [given.get(name, ir.Signal(name)) for name in names]
     return {
         "NAME": c_comment(task.system.decl.name),
         "SPEC": c_comment(task.compiled.name),
-        "STATES": len(task.names),
+        "STATES": len(task.system.names),
         **_added(task),
-        "NAMES": ", ".join(map(c_string, task.names)),
+        "NAMES": ", ".join(map(c_string, task.system.names)),
         "INPUTS": ", ".join(c_string(control.name) for control in controls),
         "CONTROLS": len(controls),
         "STEPS": task.horizon,
-        "DT": literal(task.dt),
+        "DT": literal(task.system.dt),
         "RULES": len(task.rules),
         "RULE_NAMES": ", ".join(c_string(rule.name) for rule in task.rules),
         "SAFETY": len(task.compiled.safety),
@@ -370,7 +370,7 @@ def _added(task: Task) -> dict[str, object]:
             [f"x[{place + i}] = {literal(each.initial)};" for i, each in enumerate(system.timers)]
         ),
         "ADVANCE": _block(
-            _assigned("later", [timer.update for timer in system.timers], _places("x", task.names))
+            _assigned("later", [timer.update for timer in system.timers], _places("x", task.system.names))
         ),
     }
 

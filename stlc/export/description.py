@@ -27,7 +27,7 @@ def observation(task: Task) -> list[ir.Num]:
 
 def state_images(task: Task) -> dict[str, ir.Num]:
     """Return the mirror images of states, by name; states without an image are absent."""
-    names = set(task.names)
+    names = set(task.system.names)
     return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
 
 

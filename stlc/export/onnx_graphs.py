@@ -184,7 +184,7 @@ def _folded(
     if network.mirror is None:
         return state, None
     moved = assigned(state_images(task), state)
-    side = task.names[network.mirror.side]
+    side = task.system.names[network.mirror.side]
     swapped = ONNX_OPS.gt(moved[side], state[side])
     folded = {name: ONNX_OPS.where(swapped, moved[name], state[name]) for name in moved}
     return {**state, **folded}, swapped
@@ -339,7 +339,7 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
     moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
     once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
     once |= {name + START: column[:1] for name, column in states.items()}
-    timed = {"k": moments, "t": moments * task.dt} | dict(states)
+    timed = {"k": moments, "t": moments * task.system.dt} | dict(states)
     parts = [rho.sheet.constant([[0.0]])]
     for term in cost_terms(task):
         rows = term.samples
@@ -409,8 +409,8 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
     Raises:
         Untranslatable: a part of the task has no ONNX form.
     """
-    state = Sheet().input("state", (BATCH, len(task.names)))
-    plans = proposed(task, network, columns_of(state, task.names))
+    state = Sheet().input("state", (BATCH, len(task.system.names)))
+    plans = proposed(task, network, columns_of(state, task.system.names))
     table = _table(task, state, plans)
     return _shown(_picked(table, _best(table["rank"]))) | _added(task, state)
 
@@ -426,9 +426,9 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
         Untranslatable: a part of the task has no ONNX form.
     """
     sheet = Sheet()
-    state = sheet.input("state", (BATCH, len(task.names)))
+    state = sheet.input("state", (BATCH, len(task.system.names)))
     begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
-    fresh = proposed(task, network, columns_of(state, task.names))
+    fresh = proposed(task, network, columns_of(state, task.system.names))
     count = fresh.shape[1]
     table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
     best = _best(table["rank"].T[:count].T)
@@ -444,7 +444,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     """`rank`, `plan` and verdicts of several plans (batch, count, T, m) of every agent: (batch, count, …)."""
-    names = task.names
+    names = task.system.names
     count, steps, controls = plans.shape[1:]
     each = state.T.reshaped(len(names), BATCH, 1).spread(len(names), BATCH, count, like=state.T)
     starts = dict(zip(names, each.reshaped(len(names), BATCH).rows(), strict=True))
@@ -490,9 +490,9 @@ def _added(task: Task, state: Value) -> dict[str, Value]:
     """Parameters and timers one step later."""
     if not task.system.added:
         return {}
-    now = columns_of(state, task.names)
+    now = columns_of(state, task.system.names)
     later = now | assigned({timer.name: timer.update for timer in task.system.timers}, now)
-    like = now[task.names[0]]
+    like = now[task.system.names[0]]
     rows = [later[column.name].spread(1, BATCH, like=like) for column in task.system.added]
     return {"added": joined(rows).T}
 
@@ -509,11 +509,11 @@ def judging(task: Task) -> dict[str, Value]:
     found = judged(task, start, plans)
     like = next(iter(start.values()))
     rows = task.horizon + 1
-    wide = [found.states[name].spread(rows, BATCH, like=like) for name in task.names]
+    wide = [found.states[name].spread(rows, BATCH, like=like) for name in task.system.names]
     outputs = {"rho": found.rho, "safe": found.safe, "cost": found.cost}
     outputs = {name: value.reshaped(BATCH) for name, value in outputs.items()}
     outputs["requirements"] = joined(found.each).T
-    states = joined(wide).reshaped(len(task.names), rows, BATCH)
+    states = joined(wide).reshaped(len(task.system.names), rows, BATCH)
     outputs["states"] = states.transposed(2, 1, 0)
     return outputs
 
@@ -530,6 +530,6 @@ def falling(task: Task) -> dict[str, Value]:
 
 def _asked(task: Task) -> tuple[Mapping[str, Value], Value]:
     sheet = Sheet()
-    state = sheet.input("state", (BATCH, len(task.names)))
+    state = sheet.input("state", (BATCH, len(task.system.names)))
     plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.decl.controls)))
-    return columns_of(state, task.names), plans
+    return columns_of(state, task.system.names), plans

@@ -187,7 +187,7 @@ def _facts(run: Run) -> dict[str, object]:
         ],
         "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],
-        "dt": task.dt,
+        "dt": task.system.dt,
         "horizon": task.horizon,
         "backup": asdict(grid),
     }

@@ -161,7 +161,7 @@ class Guarding(nn.Module):
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         head = heads.reshape(-1, *heads.shape[2:])
         ends = self._task.system.rollout_columns(starts, head)
-        reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.names], 1)
+        reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.system.names], 1)
         tail = finite(self.deciding(reached)[0], self._task)
         plans = torch.cat((head, tail[:, : self._task.horizon - length]), 1)
         judged = judged_openly(self._task, starts, plans)

@@ -152,13 +152,13 @@ def _facts(run: Run) -> dict[str, object]:
     return {
         "spec": task.compiled.name,
         "system": task.system.decl.name,
-        "states": list(task.names),
+        "states": list(task.system.names),
         "controls": [
             {"name": each.name, "low": each.low, "high": each.high} for each in task.system.decl.controls
         ],
         "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],
-        "dt": task.dt,
+        "dt": task.system.dt,
         "horizon": task.horizon,
         "outputs": ["plan", "rho", "safe", "requirements"],
         "backup_outputs": ["plan", "rho", "safe", "requirements", "source", "t0"],

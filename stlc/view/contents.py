@@ -14,7 +14,7 @@ from stlc.dynamics.scenarios.scenario import under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
-from stlc.rundir import RunDir
+from stlc.rundir import SIMULATION, TRACE, RunDir
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.trace import Trace, load_trace
@@ -149,14 +149,14 @@ def _usual(decl: SystemDecl, scenario: object) -> Record:
 
 def _simulation(run: RunDir) -> Record | None:
     try:
-        found = run.read_json("eval/simulate.json")
+        found = run.read_json(SIMULATION)
     except StlcError:
         return None
     return found if isinstance(found, Mapping) else None
 
 
 def _trace(run: RunDir) -> Trace | None:
-    path = run.path / "trace.npz"
+    path = run.path / TRACE
     if not path.exists():
         return None
     try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
 from stlc.escape import file_part, picture
-from stlc.rundir import RunDir
+from stlc.rundir import SCENE, SIMULATION, SYSTEM, TRACE, UNGUARDED, RunDir
 from stlc.trace import Trace, load_trace
 from stlc.view import bullet
 from stlc.view.animation import (
@@ -43,13 +43,7 @@ from stlc.view.verdicts import (
 if TYPE_CHECKING:
     from stlc.controller.world import WorldType
 
-SCENE = "scene.npz"
-TRACE = "trace.npz"
-SYSTEM = "system.yaml"
-RESULT = "eval/simulate.json"
 STILL = "scene.png"
-UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
-"""Trace and scene of the same seed without the guard."""
 PANEL = 5.8
 """Width of one run on a page, in inches."""
 
@@ -342,7 +336,7 @@ def _decisions_shown(trace: Trace) -> NDArray[np.int64] | None:
 def _scenario(run: RunDir) -> str | None:
     """The scenario of the newest deployment, if any."""
     try:
-        name = run.read_json(RESULT).get("scenario")
+        name = run.read_json(SIMULATION).get("scenario")
     except (StlcError, AttributeError):
         return None
     return None if name is None else str(name)

@@ -43,7 +43,7 @@ def test_values_lie_inside_of_the_range_and_on_both_sides_of_it(family: Family) 
     assert sum(low <= value <= high for value in family.values) >= 3
     assert list(family.values) == sorted(set(family.values))
     task = load(family.name)
-    drawn = task.sample(500, seed=0, dtype=torch.float64)[:, task.names.index(family.parameter)]
+    drawn = task.sample(500, seed=0, dtype=torch.float64)[:, task.system.names.index(family.parameter)]
     assert low <= float(drawn.min()) < float(drawn.max()) <= high
 
 
@@ -113,7 +113,7 @@ def test_from_training_to_the_page_and_again(
     (run,) = every_run(folder)
     policy = Run.open(run.path, overrides={"radius": "1.0m"}).policy
     states = policy.task.sample(20, seed=HELD_OUT_SEED, dtype=torch.float64)
-    assert set(states[:, policy.task.names.index("radius")].tolist()) == {1.0}
+    assert set(states[:, policy.task.system.names.index("radius")].tolist()) == {1.0}
     good = satisfied(policy.plan_judged(states)[1].rho)
     assert second["rows"][1]["accuracy"] == pytest.approx(float(good.double().mean()))
     page = (tmp_path / "results.md").read_text()

@@ -10,7 +10,7 @@ def states(task: Task, **columns: list[float]) -> torch.Tensor:
     known = {"x": -9.0, "v": 5.0, "sign": 1.0, "tau": 4.5, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}
     count = len(next(iter(columns.values())))
     table = {name: [value] * count for name, value in known.items()} | columns
-    return torch.tensor([table[name] for name in task.names], dtype=torch.float64).T.contiguous()
+    return torch.tensor([table[name] for name in task.system.names], dtype=torch.float64).T.contiguous()
 
 
 def test_who_can_still_brake_is_savable(car_task: Task) -> None:

@@ -76,7 +76,7 @@ def test_missions_without_end_are_driven_for_several_rounds(system: System) -> N
 
 def steered(task: Task, x: Tensor) -> Tensor:
     """Plans that go right until the first goal is met, then left."""
-    gone = x[:, task.names.index("there")] > 0.5
+    gone = x[:, task.system.names.index("there")] > 0.5
     speed = torch.where(gone, -5.0, 2.0).to(x.dtype)
     room = torch.where(gone, x[:, 0] > -1.0, x[:, 0] < 2.2)
     step = torch.arange(task.horizon)[None] < torch.where(room, 4, 0)[:, None]
@@ -103,7 +103,7 @@ def missions(task: Task, seed: int = 0) -> Missions:
 def test_states_come_from_missions_that_got_there(task: Task) -> None:
     supply = missions(task)
     states = torch.cat([supply.take(4096) for _ in range(24)])
-    named = dict(zip(task.names, states.unbind(1), strict=True))
+    named = dict(zip(task.system.names, states.unbind(1), strict=True))
     assert bool(task.alive(states).all())
     assert states.dtype == torch.float32
     assert set(named["there"].tolist()) == {0.0, 1.0}, "no lost mission is handed out"
@@ -118,8 +118,8 @@ def test_missions_end_and_begin_anew(task: Task) -> None:
     supply = missions(task)
     for _ in range(60):
         supply.take(1024)
-    assert supply.pool.shape == (POOL, len(task.names))
-    clock = supply.pool[:, task.names.index("clock")]
+    assert supply.pool.shape == (POOL, len(task.system.names))
+    clock = supply.pool[:, task.system.names.index("clock")]
     assert float(clock.max()) <= (task.compiled.mission or 0) + task.horizon + 1
     assert torch.equal(clock, supply.age.clamp(max=float(clock.max())))
 
@@ -143,7 +143,7 @@ def test_followed_plans_carry_missions_on(task: Task) -> None:
     supply.follow(state, torch.full((1, 8, 1), 5.0))
     (row,) = (supply.pool != before).any(1).nonzero()[:, 0].tolist()
     assert float(supply.pool[row, 0]) > 1.9
-    assert float(supply.pool[row, task.names.index("clock")]) in (1, 2, 3, 4)
+    assert float(supply.pool[row, task.system.names.index("clock")]) in (1, 2, 3, 4)
 
 
 def test_training_with_memory_resumes_bit_for_bit(task: Task) -> None:
@@ -176,11 +176,11 @@ def test_only_memory_needs_missions(system: System) -> None:
 def test_held_out_states_are_visited_ones(task: Task) -> None:
     policy = BestOfKPolicy(task, PlanNetwork(task, hidden=(8,), plans=2))
     states = visited(task, policy, 500, seed=3)
-    assert states.shape == (500, len(task.names))
+    assert states.shape == (500, len(task.system.names))
     assert states.dtype == torch.float64
     assert bool(task.alive(states).all())
     assert torch.equal(states, visited(task, policy, 500, seed=3))
-    assert len(states[:, task.names.index("clock")].unique()) > 3
+    assert len(states[:, task.system.names.index("clock")].unique()) > 3
 
 
 def test_kernel_and_torch_agree_on_memory(task: Task) -> None:
@@ -189,7 +189,7 @@ def test_kernel_and_torch_agree_on_memory(task: Task) -> None:
     plans = 10.0 * torch.rand(2000, task.horizon, 1, generator=generator, dtype=torch.float64) - 5.0
     judged = task.judge(states, plans)
     columns = task.system.rollout_columns(states, plans)
-    for name in task.names:
+    for name in task.system.names:
         torch.testing.assert_close(judged.columns[name], columns[name], msg=name)
     torch.testing.assert_close(judged.requirements, task.graph.per_requirement_columns(columns, ops=TORCH))
 
@@ -208,10 +208,10 @@ def deployed(task: Task, seeds: int = 6) -> DeploymentRecording:
 
 def test_deployment_carries_memory_from_the_true_states(task: Task) -> None:
     recording = deployed(task)
-    columns = {name: recording.states[..., i].T for i, name in enumerate(task.names)}
+    columns = {name: recording.states[..., i].T for i, name in enumerate(task.system.names)}
     true = {name: columns[name] for name in ("x", "y")}
     again = augmented(task.compiled.timers, true)
-    for name in task.names:
+    for name in task.system.names:
         np.testing.assert_array_equal(columns[name], again[name], err_msg=name)
         assert not (np.signbit(columns[name]) & (columns[name] == 0)).any(), "0 is written without a sign"
 
@@ -220,7 +220,7 @@ def test_what_was_driven_is_judged_as_it_was_written(task: Task) -> None:
     recording = deployed(task)
     executed = judge_executed(task, recording)
     monitor = Monitor(parse(Source("line.stl", MISSION)), dt=0.1, horizon=0.8)
-    signals = {name: recording.states[..., i] for i, name in enumerate(task.names)}
+    signals = {name: recording.states[..., i] for i, name in enumerate(task.system.names)}
     verdict = monitor.check(signals)
     for judgement in verdict.requirements:
         held = executed.rules[judgement.name].all(0)
@@ -235,7 +235,7 @@ def test_what_was_driven_is_judged_as_it_was_written(task: Task) -> None:
 def row(task: Task, **values: float) -> Tensor:
     """One state, everything else as at the start."""
     start = {"x": 0.0, "y": 3.0, **{timer.name: timer.initial for timer in task.compiled.timers}}
-    return torch.tensor([[{**start, **values}[name] for name in task.names]], dtype=torch.float64)
+    return torch.tensor([[{**start, **values}[name] for name in task.system.names]], dtype=torch.float64)
 
 
 def test_the_goal_that_is_due_first_pulls(task: Task) -> None:

@@ -28,7 +28,9 @@ def test_paper_loss_is_the_hinge_on_smooth_robustness_plus_gated_performance(car
     assert torch.allclose(outcome.stl, hinge, atol=1e-9)
     good = car_task.robustness(x) >= -1e-6
     assert torch.equal(outcome.satisfied, good)
-    v, tau, sign, position = (x[:, :, car_task.names.index(name)] for name in ("v", "tau", "sign", "x"))
+    v, tau, sign, position = (
+        x[:, :, car_task.system.names.index(name)] for name in ("v", "tau", "sign", "x")
+    )
     moving = 0.1 * (5 - v).clamp(min=0) * ((sign == 0) | (tau > 4))
     there = 0.1 * (-1 - position).clamp(min=0)
     stopping = (sign == 0) & (position >= -1) & (position <= 0) & (tau < 1)

@@ -72,7 +72,7 @@ def task() -> Task:
 
 
 def test_every_trajectory_draws_its_own(task: Task) -> None:
-    assert task.names == ("x", "y", "r", "c[0]", "c[1]", "far")
+    assert task.system.names == ("x", "y", "r", "c[0]", "c[1]", "far")
     _, _, r, c0, c1, far = task.sample(3000, seed=0, dtype=torch.float64).unbind(1)
     assert 0.5 <= float(r.min()) < 0.51
     assert 1.49 < float(r.max()) <= 1.5
@@ -115,7 +115,7 @@ def test_kernel_and_torch_agree(task: Task, seed: int) -> None:
 
 def test_a_value_given_at_compile_time_is_a_constant() -> None:
     task = task_of(r="0.8")
-    assert "r" not in task.names
+    assert "r" not in task.system.names
     x0 = torch.tensor([[-3.0, 0, -1, 0, 0.001]], dtype=torch.float64)
     each = task.requirement_robustness(task.rollout(x0, torch.zeros(1, 10, 2, dtype=torch.float64)))
     assert float(each[0, 0]) == pytest.approx(1.2)
@@ -125,7 +125,7 @@ def test_a_parameter_that_the_system_carries_is_the_systems() -> None:
     carried = SYSTEM.replace("control:", "param: {r: {unit: m, range: [0.5, 1.5]}}\ncontrol:")
     spec = parse(Source("around.stl", SPEC))
     task = Task.of(spec, system(carried))
-    assert task.names == ("x", "y", "r", "c[0]", "c[1]", "far")
+    assert task.system.names == ("x", "y", "r", "c[0]", "c[1]", "far")
     assert task.plain.names == ("x", "y", "r")
     assert [each.column.name for each in task.compiled.parameters] == ["c[0]", "c[1]", "far"]
     fixed = Task.of(spec, system(carried, r="0.7"), overrides={"r": "0.7"})

@@ -17,7 +17,7 @@ class Reached(Policy):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
-        self.speed = task.names.index("v")
+        self.speed = task.system.names.index("v")
 
     def candidates(self, x0: Tensor) -> Tensor:
         return (0.1 * x0[:, self.speed, None] + 0.2 * torch.arange(self.task.horizon))[:, None, :, None]

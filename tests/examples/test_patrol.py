@@ -40,7 +40,7 @@ def test_the_mission_is_longer_than_the_horizon(task: Task) -> None:
     assert task.compiled.mission == 250
     assert task.horizon == 50
     assert task.system.decl.test.steps >= 250
-    assert task.names == ("x", "y", "psi", "v", "clock", "stay_at_a", "visit_b", "return_to_dock")
+    assert task.system.names == ("x", "y", "psi", "v", "clock", "stay_at_a", "visit_b", "return_to_dock")
 
 
 PLACES = {"a": (-4.0, 2.0), "b": (4.0, 3.0), "dock": (0.0, -4.0)}
@@ -72,7 +72,7 @@ def test_a_trained_policy_fulfils_the_mission(task: Task, tmp_path: Path, guard:
     assert found.metrics["executed"].mean >= share
     states = found.recording.states
     monitor = Monitor(parse(read_source(SPEC)), dt=0.1, horizon=5)
-    verdict = monitor.check({name: states[..., i] for i, name in enumerate(task.names)})
+    verdict = monitor.check({name: states[..., i] for i, name in enumerate(task.system.names)})
     good = np.logical_and.reduce([judgement.holds.all(0) for judgement in verdict.requirements])
     assert good.shape == (100,)
     assert float(good.mean()) >= share

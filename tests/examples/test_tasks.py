@@ -63,10 +63,10 @@ def test_a_known_plan_satisfies_the_task(name: str) -> None:
     spec = parse(read_source(TASKS / f"{name}.stl"))
     horizon = Fraction(found.system.decl.horizon) * found.system.decl.dt
     monitor = Monitor(spec, dt=found.system.decl.dt, horizon=horizon)
-    driven = {column: values[None] for column, values in zip(found.names, path.T, strict=True)}
+    driven = {column: values[None] for column, values in zip(found.system.names, path.T, strict=True)}
     assert np.all(monitor.check(driven).robustness >= -TOLERANCE)
     still = found.rollout(x0[None], torch.zeros_like(controls)[None])[0].numpy()
-    driven = {column: values[None] for column, values in zip(found.names, still.T, strict=True)}
+    driven = {column: values[None] for column, values in zip(found.system.names, still.T, strict=True)}
     assert np.all(monitor.check(driven).robustness < 0.0)
 
 

@@ -32,7 +32,7 @@ def test_promises_deepen_as_the_task_says() -> None:
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
     wanted = run.task.promises.deepened(run.task.judge(x, plans).columns)
     sheet = Sheet()
-    start = columns_of(sheet.input("state", (BATCH, len(run.task.names))), run.task.names)
+    start = columns_of(sheet.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
     given = sheet.input("plan", (BATCH, run.task.horizon, 1))
     found = deepened(run.task, judged(run.task, start, given).states)
     said = computed({"deepened": found}, {"state": x.numpy(), "plan": plans.numpy()})["deepened"]

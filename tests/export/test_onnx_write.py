@@ -55,7 +55,7 @@ def test_the_files_say_what_they_are(tmp_path: Path) -> None:
         {"name": "u", "unit": "m/s^2", "low": -10.0, "high": 10.0, "added": "", "initial": None}
     ]
     assert beside["states"][1]["unit"] == "m/s"
-    assert beside["dt"] == run.task.dt
+    assert beside["dt"] == run.task.system.dt
     assert [each.name for each in model.graph.input] == ["state"]
     assert [each.name for each in model.graph.output] == ["plan", "rho", "safe", "cost", "requirements"]
 

@@ -87,7 +87,7 @@ def _changed(text: str, changes: Changes) -> str:
 
 def apart(benchmark: Benchmark, task: Task, count: int = COUNT) -> tuple[float, float, float]:
     """How far states, robustness and robustness of phi_safe are from the reference, at most."""
-    assert task.names == benchmark.columns
+    assert task.system.names == benchmark.columns
     x0, u = benchmark.cases(1, count)
     wanted = benchmark.rollout(x0, u)
     got = task.rollout(torch.tensor(x0), torch.tensor(u)).numpy()
@@ -110,7 +110,7 @@ def kernel_apart(benchmark: Benchmark, task: Task) -> tuple[float, float]:
     assert task.native is not None
     rho, columns = task.native.judge(x0, u, columns=True)
     wanted = task.rollout(x0, u)
-    states = torch.stack([columns[name].t() for name in task.names], 2)
+    states = torch.stack([columns[name].t() for name in task.system.names], 2)
     each = task.requirement_robustness(wanted)
     return float((states - wanted).abs().max()), float((rho - each).abs().max())
 

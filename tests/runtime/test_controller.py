@@ -87,7 +87,7 @@ def test_one_agent_a_batch_and_names_are_one_question() -> None:
         controller.reset()
         alone = controller.decide(state)
         controller.reset()
-        named = controller.decide(dict(zip(run.task.names, state, strict=True)))
+        named = controller.decide(dict(zip(run.task.system.names, state, strict=True)))
         assert alone.rule == named.rule == batch.rule[row] == "policy"
         for each in (alone, named):
             np.testing.assert_allclose(each.plan, batch.plan[row], rtol=0.0, atol=1e-6)

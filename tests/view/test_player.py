@@ -10,11 +10,12 @@ from html import unescape
 import numpy as np
 import pytest
 
+from stlc.rundir import UNGUARDED
 from stlc.trace import load_trace, save_trace
 from stlc.view import player
 from stlc.view.contents import read_contents
 from stlc.view.report import render_report, write_report
-from stlc.view.run_animation import UNGUARDED, WITH, WITHOUT, run_panels
+from stlc.view.run_animation import WITH, WITHOUT, run_panels
 
 WORLD = """
 from stlc.controller.sketch import violations

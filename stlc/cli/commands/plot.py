@@ -84,7 +84,7 @@ def plot(
 def _find(what: str, runs: Path) -> Path:
     """Find the trace called `what`, or that of the run called `what`."""
     from stlc.files import find_trace
-    from stlc.rundir import RunDir
+    from stlc.rundir import TRACE, RunDir
 
     try:
         if not Path(what).is_dir():
@@ -96,11 +96,11 @@ def _find(what: str, runs: Path) -> Path:
             raise missing from None
     else:
         folder = RunDir.open(what, runs)
-    path = folder.path / "trace.npz"
+    path = folder.path / TRACE
     if not path.is_file():
         advice = (f"record one: stlc simulate {folder.name}",)
         raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
-    return Path(folder.shown) / "trace.npz"
+    return Path(folder.shown) / TRACE
 
 
 def _target(output: Path | None, trace: Path) -> Path:

@@ -172,7 +172,7 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     """W604 if an unbounded mission is simulated for longer than the policy was validated."""
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
-    seconds = steps * run.task.dt
+    seconds = steps * run.task.system.dt
     if not isinstance(judged, int | float) or seconds <= judged:
         return ()
     message = f"{seconds:g} s are driven, and training judged the policy on missions of {judged:g} s"
@@ -300,8 +300,9 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
     """Write trace, scene and record into the run's folder; return the record."""
     from stlc.controller.deployment.disturbance import errors_of
-    from stlc.controller.evaluation.archive import RESULT, SCENE, save_scene, save_trace_of, save_unguarded
+    from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
+    from stlc.rundir import SCENE, SIMULATION
 
     last = list(found.values())[-1]
     save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
@@ -326,7 +327,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
     }
     made: Any = as_json(found, order.setting, facts)
     document: Simulation = made
-    run.dir.write_json(RESULT, document)
+    run.dir.write_json(SIMULATION, document)
     return document
 
 

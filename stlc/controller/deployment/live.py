@@ -38,7 +38,7 @@ class LiveMonitor:
         """Append the next step of the deployment."""
         self.moment = moment
         states = moment.x.numpy(force=True)
-        self._margins.push(dict(zip(self.task.names, states.T, strict=True)))
+        self._margins.push(dict(zip(self.task.system.names, states.T, strict=True)))
         if moment.decision is not None:
             self.counts += np.bincount(moment.decision.source.numpy(force=True), minlength=len(SOURCES))
 
@@ -50,7 +50,7 @@ class LiveMonitor:
     @property
     def time(self) -> float:
         """Time of the present sample in seconds."""
-        return (self.moment.step if self.moment else 0) * self.task.dt
+        return (self.moment.step if self.moment else 0) * self.task.system.dt
 
     def decided(self, row: int) -> str | None:
         """Source of an agent's decision: `policy`, `backup T0=2`, …; None at the end."""

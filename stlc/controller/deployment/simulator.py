@@ -281,7 +281,7 @@ def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None
     broken = torch.nonzero(~torch.isfinite(action).all(1)).squeeze(1).tolist()
     if not broken:
         return
-    state = zip(guard.task.names, x[broken[0]].tolist(), strict=True)
+    state = zip(guard.task.system.names, x[broken[0]].tolist(), strict=True)
     note = "its state: " + ", ".join(f"{name} = {value:.6g}" for name, value in state)
     help_ = ("`--backup` lets the backup policy act where the policy cannot",) if guard.backup is None else ()
     message = f"the policy's plan at step {step} is not a number, for {len(broken)} of {len(x)} agents"

@@ -13,10 +13,11 @@ import torch
 
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.training.run import SPEC, SYSTEM, read_library
+from stlc.controller.training.run import read_library
 from stlc.files import atomic_path, read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
+from stlc.rundir import SPEC, SYSTEM, TRACE, UNGUARDED
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, save_trace
 from stlc.version import __version__
@@ -28,12 +29,6 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.training.run import Run
     from stlc.dynamics.model.system import System
-
-TRACE = "trace.npz"
-SCENE = "scene.npz"
-UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
-"""Trace and scene of the first seed without guard, stored beside the guarded ones."""
-RESULT = "eval/simulate.json"
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
@@ -49,8 +44,8 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
     rows = np.arange(len(recording.states))
     return Trace(
         signature=system.signature,
-        dt=run.task.dt,
-        data=dict(zip(run.task.names, states, strict=True)),
+        dt=run.task.system.dt,
+        data=dict(zip(run.task.system.names, states, strict=True)),
         extras={
             **{f"action.{name}": action for name, action in actions},
             "decision": recording.source,
@@ -133,7 +128,7 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
         run=run.dir.name,
         seed=setting.seeds[0],
         horizon=run.task.horizon,
-        dt=run.task.dt,
+        dt=run.task.system.dt,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         stlc_version=__version__,
     )
@@ -143,7 +138,7 @@ def _set_in(spec: str, run: Run) -> dict[str, str]:
     """Specification constants changed by the run, its scenario or the deployment."""
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()
-    return {name: text for name, text in changed if name in own and name not in run.task.names}
+    return {name: text for name, text in changed if name in own and name not in run.task.system.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:

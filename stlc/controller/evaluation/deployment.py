@@ -120,7 +120,7 @@ def judged(
     """
     executed = judge_executed(guard.task, recording)
     runs = (
-        judge_runs_by_plans(executed.rules, executed.viable, guard.task.dt)
+        judge_runs_by_plans(executed.rules, executed.viable, guard.task.system.dt)
         if rules is None
         else judge_runs(rules, guard.task, recording, executed.viable)
     )

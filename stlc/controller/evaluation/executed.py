@@ -65,7 +65,9 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 
     `viable`: (rows,), starts with a known safe plan; a search finds them if not given.
     """
-    columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
+    columns = dict(
+        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
+    )
     starts = max(recording.steps + 1 - task.horizon, 0)
     rules = {rule.name: _held(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)

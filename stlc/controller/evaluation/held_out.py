@@ -131,7 +131,7 @@ def score(
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
-        endless=None if task.compiled.recurring is None else mission_steps(task) * task.dt,
+        endless=None if task.compiled.recurring is None else mission_steps(task) * task.system.dt,
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
         feasible=_feasible(known, searched, failing),
         states=states,
@@ -163,7 +163,7 @@ def _judged(policy: Policy, states: Tensor, enough: Stop) -> tuple[Tensor, Tenso
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
     """Mark failing states for which exploration finds a plan; mission starts are tried first."""
-    clocks = [task.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
+    clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
     first = failing[age.argsort(stable=True)[:EXPLORED]]
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 2)
@@ -187,7 +187,7 @@ def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
 
 def save_states(path: Path, task: Task, result: Score) -> None:
     """Save the states and their verdicts for pictures of where a policy fails."""
-    meta = {"names": list(task.names), "requirements": [rule.name for rule in task.rules]}
+    meta = {"names": list(task.system.names), "requirements": [rule.name for rule in task.rules]}
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,

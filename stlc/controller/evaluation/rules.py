@@ -296,7 +296,7 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
         overrides=rules.overrides,
     )
     columns = np.moveaxis(recording.states, -1, 0)
-    return monitor.check(dict(zip(task.names, columns, strict=True)))
+    return monitor.check(dict(zip(task.system.names, columns, strict=True)))
 
 
 def _lost(

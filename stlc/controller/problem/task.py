@@ -132,16 +132,6 @@ class Task:
         return cls(compiled, system)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """State columns: the system's, then the timers."""
-        return self.system.names
-
-    @property
-    def dt(self) -> float:
-        """Time step in seconds."""
-        return self.system.dt
-
-    @property
     def horizon(self) -> int:
         """Steps of a plan."""
         return self.system.horizon
@@ -180,7 +170,7 @@ class Task:
         whole = u.new_zeros((len(u), self.horizon, u.shape[2]))
         whole[:, : u.shape[1]] = u
         _, columns = self.native.judge(x0, whole, columns=True)
-        return torch.stack([columns[name][: u.shape[1] + 1].t() for name in self.names], 2)
+        return torch.stack([columns[name][: u.shape[1] + 1].t() for name in self.system.names], 2)
 
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
         """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4); `smoothing` is the paper's k (Eq. 7)."""
@@ -261,7 +251,7 @@ class Task:
         each = torch.cat([each for each, _ in parts])
         if not states:
             return each, {}
-        return each, {name: torch.cat([part[name] for _, part in parts], 1) for name in self.names}
+        return each, {name: torch.cat([part[name] for _, part in parts], 1) for name in self.system.names}
 
     def _judged_by_torch(self, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
         columns = self.system.rollout_columns(x0, u, HARD)
@@ -271,7 +261,9 @@ class Task:
     def _values_of_a_row(self) -> int:
         """Approximate number of values that torch holds per judged plan: all subformulas."""
         parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
-        return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
+        return (self.horizon + 1) * (
+            2 * len(self.system.names) + 2 * len(self.system.control_names) + 4 * parts
+        )
 
     def cost(self, judged: PlanVerdicts) -> Tensor:
         """Cost to choose among satisfying plans, without gradient: (batch,).
@@ -318,7 +310,7 @@ class Task:
 
     def alive(self, x: Tensor) -> Tensor:
         """States from which the mission can still satisfy every requirement: (B, n) -> (B,) booleans."""
-        env = {name: column[None] for name, column in zip(self.names, x.unbind(1), strict=True)}
+        env = {name: column[None] for name, column in zip(self.system.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
 

@@ -13,13 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from stlc.compile.analysis.ranges import bounds
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard
 from stlc.controller.guard.feasibility import ENOUGH, solve
@@ -110,9 +113,9 @@ def _motion(step: TrainingStep) -> StlcError | None:
     if row is None:
         return None
     when = int(bad[row].any(1).nonzero()[0])
-    name = step.task.names[int(bad[row, when].nonzero()[0])]
+    name = step.task.system.names[int(bad[row, when].nonzero()[0])]
     what = "NaN" if bool(states[row, when].isnan().any()) else "infinity"
-    then = f"{when} step{'s' * (when > 1)} ({when * step.task.dt:.3g} s) after a start"
+    then = f"{when} step{'s' * (when > 1)} ({when * step.task.system.dt:.3g} s) after a start"
     return SystemFileError(
         Diagnostic(
             "S302",
@@ -355,7 +358,7 @@ def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
     step, system = task.system.exact_step, task.system
     low, high = system.control_low.tolist(), system.control_high.tolist()
     controls = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
-    here = {name: (value, value) for name, value in zip(task.names, x, strict=True)}
+    here = {name: (value, value) for name, value in zip(task.system.names, x, strict=True)}
     reached: list[Mapping[str, Bounds]] = [here]
     for _ in range(task.horizon):
         facts = {**here, **controls}
@@ -373,59 +376,36 @@ def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
 
 
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
-    """Upper bound on the robustness of a formula at time 0; inf where the bounds are undecided."""
-    return _Most(reached).at(formula, 0)
+    """Upper bound on the robustness of a formula at time 0; inf where the bounds are undecided.
 
+    Formulas are in negation normal form and thus monotone in their predicates: the bound is the robustness
+    under the upper bounds of the predicates over time.
+    """
+    columns = {"": np.zeros((len(reached), 1))}
 
-class _Most:
-    """Upper bounds on robustness over the reachable sets."""
-
-    def __init__(self, reached: Sequence[Mapping[str, Bounds]]) -> None:
-        self._reached = reached
-        self._known: dict[tuple[ir.Formula, int], float] = {}
-
-    def at(self, formula: ir.Formula, now: int) -> float:
-        """Upper bound at one instant; inf beyond the last one."""
-        if now < 0 or now >= len(self._reached):
-            return math.inf
-        key = formula, now
-        if key not in self._known:
-            self._known[key] = self._of(formula, now)
-        return self._known[key]
-
-    def _of(self, formula: ir.Formula, now: int) -> float:
-        match formula:
-            case ir.Truth(value):
-                return math.inf if value else -math.inf
+    def bounded(node: ir.Formula) -> ir.Formula:
+        match node:
             case ir.Predicate():
-                return self._atom(formula, now)
-            case ir.BoolOp(op, items):
-                return (min if op == "and" else max)(self.at(item, now) for item in items)
-            case ir.Temporal(op, window, body):
-                values = [self.at(body, k) for k in self._instants(window, now)]
-                return (min if op == "always" else max)(values, default=math.inf)
-            case ir.Until("until", window, _, right):
-                return max((self.at(right, k) for k in self._instants(window, now)), default=math.inf)
-            case ir.Shift(steps, body):
-                return self.at(body, now + steps)
+                name = str(len(columns))
+                columns[name] = np.array([[_upper(node, facts)] for facts in reached])
+                return ir.Predicate(ir.Signal(name))
             case ir.Freeze(_, body):
-                return self.at(body, now)
-            case _:
-                return math.inf
+                return bounded(body)
+        return map_children(node, formulas=bounded)
 
-    def _atom(self, atom: ir.Predicate, now: int) -> float:
-        facts = self._reached[now]
-        if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
-            return math.inf
-        reach = bounds(atom.num, facts)
-        if reach is None or any(map(math.isnan, reach)):
-            return math.inf
-        most = reach[1] if atom.sign > 0 else -reach[0]
-        return math.copysign(math.inf, most + TOLERANCE) if atom.guard else most
+    (most,) = evaluate([bounded(formula)], columns, ops=NUMPY, end="upper")
+    return float(most.max())
 
-    def _instants(self, window: ir.Window, now: int) -> range:
-        last = len(self._reached) - 1 if window.hi is None else now + window.hi
-        return range(now + window.lo, last + 1)
+
+def _upper(atom: ir.Predicate, facts: Mapping[str, Bounds]) -> float:
+    """Upper bound on the robustness of a predicate under bounds on the states of its instant."""
+    if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
+        return math.inf
+    reach = bounds(atom.num, facts)
+    if reach is None or any(map(math.isnan, reach)):
+        return math.inf
+    most = reach[1] if atom.sign > 0 else -reach[0]
+    return math.copysign(math.inf, most + TOLERANCE) if atom.guard else most
 
 
 SAMPLES = 1024
@@ -449,13 +429,13 @@ def check_mirror(task: Task) -> None:
     shape = (SAMPLES, task.horizon, len(low))
     u = low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
     image, there = mirror.states(x0), mirror.plans(u)
-    _compare(task, task.names, mirror.states(image), x0, "the image of the image of a state")
+    _compare(task, task.system.names, mirror.states(image), x0, "the image of the image of a state")
     _compare(task, task.system.control_names, mirror.plans(there), u, "the image of the image of a control")
     one, two = task.judge(x0, u), task.judge(image, there)
     names = tuple(f"`{rule.name}`" for rule in task.rules)
     last = torch.stack([column[-1] for column in one.columns.values()], -1)
     moved = torch.stack([column[-1] for column in two.columns.values()], -1)
-    _compare(task, task.names, moved, mirror.states(last), "where the image of a state gets to")
+    _compare(task, task.system.names, moved, mirror.states(last), "where the image of a state gets to")
     there_true, here_true = (satisfied(each.requirements).double() for each in (two, one))
     _compare(task, names, there_true, here_true, "whether an image satisfies a requirement")
 

@@ -136,11 +136,11 @@ class Exploration:
         read = frozenset[str]().union(*(columns(piece) for piece in self.pieces))
         kinds = {timer.name: timer.kind for timer in system.timers}
         moving = system.exact_step.next.keys()
-        free = [name for name in task.names if name in moving and name not in kinds]
-        self._fine = [task.names.index(name) for name in free if name in read]
-        self._coarse = [task.names.index(name) for name in free if name not in read]
+        free = [name for name in task.system.names if name in moving and name not in kinds]
+        self._fine = [task.system.names.index(name) for name in free if name in read]
+        self._coarse = [task.system.names.index(name) for name in free if name not in read]
         counts = [timer for timer in system.timers if timer.kind in ("timer", "latch")]
-        self._counts = [task.names.index(timer.name) for timer in counts]
+        self._counts = [task.system.names.index(timer.name) for timer in counts]
         self._cells = np.array([max((timer.high - timer.low) / COUNTED, 1.0) for timer in counts])
 
     def plan(
@@ -270,7 +270,7 @@ class Exploration:
         """Bounds on the robustness of every piece over all continuations: (rows, samples, n) -> (rows, k)."""
         if not len(states):
             return np.empty((0, len(self.pieces)))
-        env = dict(zip(self.task.names, np.moveaxis(states, (0, 1, 2), (2, 1, 0)), strict=True))
+        env = dict(zip(self.task.system.names, np.moveaxis(states, (0, 1, 2), (2, 1, 0)), strict=True))
         stop = None if end == "strict" else self.task.horizon + 1
         found = evaluate(self.pieces, env, ops=NUMPY, end=end, stop=stop)
         return np.stack([np.broadcast_to(each[0], len(states)) for each in found], 1)

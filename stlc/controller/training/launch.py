@@ -10,11 +10,11 @@ from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import train
-from stlc.controller.training.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
+from stlc.controller.training.run import Run, save_library, spec_hash, system_hash
 from stlc.dynamics.robots.functions import function_files
 from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
-from stlc.rundir import RUNS, RunDir, now
+from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now
 from stlc.version import __version__
 
 if TYPE_CHECKING:

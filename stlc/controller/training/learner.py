@@ -76,7 +76,7 @@ class Trainer(Learner):
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.lr, fused=True)
         self.buffer = ReplayBuffer.empty(
-            len(task.names), task.horizon, len(task.system.control_names), device
+            len(task.system.names), task.horizon, len(task.system.control_names), device
         )
         self.searches = self.method.searches
         if self.searches:
@@ -86,7 +86,7 @@ class Trainer(Learner):
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy = 0.0
-        self.learnt = torch.empty(0, len(task.names), device=device)
+        self.learnt = torch.empty(0, len(task.system.names), device=device)
 
     def advance(self) -> float:
         """Make one gradient step and return its loss; NaN and no step if loss or gradient is not finite."""

@@ -20,7 +20,7 @@ from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.provenance import sha256
 from stlc.registry import METHODS
-from stlc.rundir import RUNS, RunDir
+from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import PlanVerdicts
     from stlc.rundir import Status
 
-SPEC = "spec.stl"
-SYSTEM = "system.yaml"
 LIB = "lib"
 INDEX = "index.json"
 CONFIG = "config.resolved.yaml"

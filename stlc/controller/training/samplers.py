@@ -58,7 +58,7 @@ class Draws:
         self._task = task
         self._generator = generator
         self._device = device
-        self.block = torch.empty(0, len(task.names), device=device)
+        self.block = torch.empty(0, len(task.system.names), device=device)
 
     def take(self, n: int) -> Tensor:
         """Return `n` fresh states, (n, dim), float32."""
@@ -140,7 +140,7 @@ class Missions:
     def __init__(self, task: Task, generator: torch.Generator, device: torch.device, plan: Planner) -> None:
         self._task, self._plan = task, plan
         self._generator, self._device = generator, device
-        self.block = torch.empty(0, len(task.names), device=device)
+        self.block = torch.empty(0, len(task.system.names), device=device)
         self.pool = self.block
         self.age = torch.empty(0, device=device)
 
@@ -204,7 +204,9 @@ class Missions:
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
         """Predicted states after `steps`, one number per row: (n, dim)."""
-        return torch.stack([judged.columns[name].gather(0, steps[None])[0] for name in self._task.names], 1)
+        return torch.stack(
+            [judged.columns[name].gather(0, steps[None])[0] for name in self._task.system.names], 1
+        )
 
     def _starts(self, n: int) -> Tensor:
         return self._task.sample(n, generator=self._generator, device=self._device)
@@ -241,7 +243,7 @@ def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never)
         if enough():
             break
         _, judged = policy.plan_judged(x)
-        x = torch.stack([judged.columns[name][stride] for name in task.names], 1)
+        x = torch.stack([judged.columns[name][stride] for name in task.system.names], 1)
         x = x[task.alive(x)]
         seen.append(x)
     states = torch.cat(seen)

@@ -122,7 +122,7 @@ def test_some_agents_decide_anew(car_task: Task) -> None:
 
 def test_the_option_that_can_be_planned_for_is_preferred(car_task: Task) -> None:
     """To brake is right before a line, and a free road asks for nothing else."""
-    guard, columns = Guard(car_task, Rule(car_task, -10.0), "none"), list(car_task.names)
+    guard, columns = Guard(car_task, Rule(car_task, -10.0), "none"), list(car_task.system.names)
     x = car_task.sample(400, seed=7).double()
     fine = x[guard.decide(x).rho >= 0.0][:3]
     hit = fine.clone()
@@ -137,7 +137,7 @@ def test_what_was_begun_speaks_for_the_option_that_it_belongs_to(car_task: Task)
     brake, go = (Guard(car_task, Rule(car_task, action), "none") for action in (-10.0, 10.0))
     rows = torch.nonzero((brake.decide(x).rho >= 0.0) & (go.decide(x).rho < 0.0)).squeeze(1)[:3]
     x, easy = x[rows], x[rows].clone()
-    columns = list(car_task.names)
+    columns = list(car_task.system.names)
     for name, value in {"x": 1.0, "sign": 1.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}.items():
         easy[:, columns.index(name)] = value
     options = torch.stack((x, easy), 1)
@@ -154,7 +154,7 @@ def test_what_was_begun_speaks_for_the_option_that_it_belongs_to(car_task: Task)
 def test_a_begun_plan_goes_on_while_it_holds_and_is_no_worse(car_task: Task) -> None:
     """A policy that would wait at every step is overruled by what was begun."""
     state = {"x": -1.3, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}
-    x = torch.tensor([[state[name] for name in car_task.names]], dtype=F64)
+    x = torch.tensor([[state[name] for name in car_task.system.names]], dtype=F64)
 
     class Later(Policy):
         """Waits for half a second, then moves up to the line."""
@@ -172,6 +172,6 @@ def test_a_begun_plan_goes_on_while_it_holds_and_is_no_worse(car_task: Task) -> 
         fresh = car_task.system.step(fresh, guard.decide(fresh).action)
         decision = guard.decide(x, begun)
         x, begun = car_task.system.step(x, decision.action), decision.later()
-    at = car_task.names.index("x")
+    at = car_task.system.names.index("x")
     assert float(fresh[0, at]) == pytest.approx(-1.3)
     assert float(x[0, at]) > -1.0

@@ -313,7 +313,7 @@ def test_a_scenario_brings_a_backup_and_preferences_of_its_own() -> None:
     assert grid_of(fragile).lengths == (1, 3)
     assert len(grid_of(usual).values[0]) == usual.system.decl.backup.bins
     x, u = usual.sample(1, seed=0, dtype=torch.float64), torch.full((1, 4, 1), 0.5, dtype=torch.float64)
-    y = usual.rollout(x, u)[0, :, usual.names.index("y")]
+    y = usual.rollout(x, u)[0, :, usual.system.names.index("y")]
     assert float(usual.cost(usual.judge(x, u))) == 0.0
     assert float(fragile.cost(fragile.judge(x, u))) == pytest.approx(2.0 * float((y - 1.0).mean()) + 0.25)
     assert fragile.system.decl.learnt != usual.system.decl.learnt  # only where it is laid over

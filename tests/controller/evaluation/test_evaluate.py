@@ -218,8 +218,10 @@ def test_a_policy_that_gives_no_number_is_told(car_task: Task) -> None:
 
 def test_executed_verdicts_are_those_of_the_monitor(car_task: Task, recorded: DeploymentRecording) -> None:
     executed = judge_executed(car_task, recorded)
-    signals = {name: recorded.states[..., i] for i, name in enumerate(car_task.names)}
-    monitor = Monitor(car_task.compiled.spec, dt=car_task.dt, horizon=car_task.horizon * car_task.dt)
+    signals = {name: recorded.states[..., i] for i, name in enumerate(car_task.system.names)}
+    monitor = Monitor(
+        car_task.compiled.spec, dt=car_task.system.dt, horizon=car_task.horizon * car_task.system.dt
+    )
     verdict = monitor.check(signals)
     assert {judgement.name for judgement in verdict} == set(executed.rules)
     for judgement in verdict:

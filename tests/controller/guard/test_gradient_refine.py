@@ -144,5 +144,5 @@ def test_states_that_are_no_numbers_leave_plans_that_are(car_task: Task) -> None
 
 
 def test_nobody_gets_no_plans(car_task: Task) -> None:
-    x, places = torch.zeros(0, len(car_task.names)), torch.zeros(0, 2, car_task.horizon, 1)
+    x, places = torch.zeros(0, len(car_task.system.names)), torch.zeros(0, 2, car_task.horizon, 1)
     assert made(car_task).rise(x, places).shape == (0, KEPT, car_task.horizon, 1)

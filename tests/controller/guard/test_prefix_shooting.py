@@ -127,7 +127,7 @@ QUEUE = {"x": -6.0, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": 4.0, "v_lead": 0.0,
 
 
 def at(task: Task, state: Mapping[str, float]) -> torch.Tensor:
-    return torch.tensor([[state[name] for name in task.names]], dtype=F64)
+    return torch.tensor([[state[name] for name in task.system.names]], dtype=F64)
 
 
 def test_flat_robustness_does_not_make_a_car_brake_for_ever(car_task: Task) -> None:
@@ -155,7 +155,7 @@ def test_a_safe_plan_that_was_begun_is_not_lost(car_task: Task) -> None:
 
 def test_an_unavoidable_collision_is_met_braking(car_task: Task) -> None:
     state = {"x": -8.0, "v": 8.0, "sign": 1.0, "tau": 5.0, "dx": 2.0, "v_lead": 0.0, "yielding": 0.0}
-    x = torch.tensor([[state[name] for name in car_task.names]], dtype=F64)
+    x = torch.tensor([[state[name] for name in car_task.system.names]], dtype=F64)
     plan = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
     found = paper_search(car_task, Constant(car_task, 10.0), grid(lengths=(1, 2, 3))).search(x, plan)
     assert int(found.source[0]) == 2

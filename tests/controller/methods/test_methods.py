@@ -64,7 +64,7 @@ def feedback(task, gain):
 class Climber(Learner):
     def __init__(self, task, config, **rest):
         super().__init__(task, config, **rest)
-        self.gain = torch.zeros(len(task.names), len(task.system.control_names))
+        self.gain = torch.zeros(len(task.system.names), len(task.system.control_names))
 
     @property
     def policy(self):

@@ -38,7 +38,7 @@ def test_kernel_and_torch_agree(
     near_tie = apart > tolerance  # a switch within rounding of its edge may fall to either side in float32
     assert near_tie.double().mean() <= (0.0 if dtype == torch.float64 else 0.03)
     assert fast.rho.dtype == slow.rho.dtype == dtype
-    for name in car_task.names:
+    for name in car_task.system.names:
         gap = (fast.columns[name] - slow.columns[name]).abs().amax(0)
         assert gap[~near_tie].max() <= tolerance
     assert torch.allclose(car_task.cost(fast)[~near_tie], car_task.cost(slow)[~near_tie], atol=1e-4)

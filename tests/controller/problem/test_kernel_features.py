@@ -80,11 +80,11 @@ def gradients_agree(task: Task, seed: int) -> None:
     assert task.gradient is not None
     still = _stands_still(task.system.rollout_columns(x0, u, Hard()))
     by_each = torch.rand(ROWS, len(task.rules), generator=generator, dtype=torch.float64) * ~still[:, None]
-    by_states = torch.rand(len(task.names), ROWS, generator=generator, dtype=torch.float64)
+    by_states = torch.rand(len(task.system.names), ROWS, generator=generator, dtype=torch.float64)
 
     def gradient(each: torch.Tensor, states: dict[str, torch.Tensor], plan: torch.Tensor) -> torch.Tensor:
         total = (by_each * torch.where(torch.isfinite(each), each, 0.0)).sum()
-        for name, weights in zip(task.names, by_states, strict=True):
+        for name, weights in zip(task.system.names, by_states, strict=True):
             total = total + (weights * states[name][1:].square()).sum()
         return torch.autograd.grad(total, plan)[0]
 

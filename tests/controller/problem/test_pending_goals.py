@@ -46,7 +46,7 @@ def task(tmp_path: Path) -> Task:
 
 def columns(task: Task, x: list[float], clock: int = 0, there: float = 0.0) -> dict[str, Tensor]:
     """Columns of one path, one step of the mission a sample."""
-    found = {name: torch.zeros(len(x), 1) for name in task.names}
+    found = {name: torch.zeros(len(x), 1) for name in task.system.names}
     found["x"] = torch.tensor(x)[:, None].requires_grad_()
     found["clock"] = clock + torch.arange(len(x), dtype=torch.float32)[:, None]
     found["there"] = torch.full((len(x), 1), there)
@@ -113,11 +113,11 @@ class Leaver(Policy):
 
 def test_a_guard_carries_on_with_a_plan_that_keeps_a_promise(task: Task) -> None:
     guard = Guard(task, Leaver(task), "none")
-    x = torch.zeros(1, len(task.names), dtype=torch.float64)
-    x[0, task.names.index("x")], x[0, task.names.index("there")] = 2.05, 1.0
-    for name in task.names:
+    x = torch.zeros(1, len(task.system.names), dtype=torch.float64)
+    x[0, task.system.names.index("x")], x[0, task.system.names.index("there")] = 2.05, 1.0
+    for name in task.system.names:
         if name.startswith("either"):
-            x[0, task.names.index(name)] = 1.0
+            x[0, task.system.names.index(name)] = 1.0
     begun = guard.decide(x)
     inward = torch.full_like(begun.plan, 1.0)
     carried = guard.decide(x, replace(begun, plan=inward))

@@ -69,7 +69,7 @@ def test_plans_of_any_length_are_rolled_out_as_the_system_says(car_task: Task, s
     length = car_task.horizon if steps is None else steps
     u = low + (high - low) * torch.rand((20, length, 1), dtype=torch.float64)
     found = car_task.rollout(x0, u)
-    assert found.shape == (20, length + 1, len(car_task.names))
+    assert found.shape == (20, length + 1, len(car_task.system.names))
     torch.testing.assert_close(found, car_task.system.rollout(x0, u), rtol=1e-12, atol=1e-12)
     car_task.rollout(x0, u.requires_grad_())
     if length:
