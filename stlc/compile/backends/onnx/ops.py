@@ -7,7 +7,7 @@ float64. Where the runtime has a function in float32 only (`atan`), one Newton s
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeAlias, cast, final
 
@@ -18,29 +18,42 @@ from stlc.compile.schedule.schedule import Pick
 Number: TypeAlias = Value | float
 
 
+def _like(*numbers: Number) -> Value:
+    return next(number for number in numbers if isinstance(number, Value))
+
+
+def _two(op: str, a: Number, b: Number, kind: Kind | None = None) -> Value:
+    like = _like(a, b)
+    return like.beside(a).apply(op, b, kind=kind)
+
+
+def _unary(op: str) -> Callable[[OnnxOps, Value], Value]:
+    return lambda _, x: x.apply(op)
+
+
+def _binary(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
+    return lambda _, a, b: _two(op, a, b)
+
+
+def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
+    return lambda _, a, b: _two(op, a, b, "bool")
+
+
 @final
 class OnnxOps:
     """`stlc.compile.backends.array.namespace.Ops` over symbolic values. Extrema propagate NaN."""
 
     name = "onnx"
 
+    # operators of ONNX, elementwise
+    add, sub, mul, div, pow = map(_binary, ("Add", "Sub", "Mul", "Div", "Pow"))
+    abs, sign, floor, ceil, round = map(_unary, ("Abs", "Sign", "Floor", "Ceil", "Round"))
+    sqrt, exp, log, sin, cos = map(_unary, ("Sqrt", "Exp", "Log", "Sin", "Cos"))
+    minimum, maximum = map(_binary, ("Min", "Max"))
+    gt, ge = map(_comparison, ("Greater", "GreaterOrEqual"))
+    both, either = map(_binary, ("And", "Or"))
+
     # ----------------------------------------------------------------- arithmetic
-
-    def add(self, a: Number, b: Number) -> Value:
-        """`a + b`."""
-        return _two("Add", a, b)
-
-    def sub(self, a: Number, b: Number) -> Value:
-        """`a - b`."""
-        return _two("Sub", a, b)
-
-    def mul(self, a: Number, b: Number) -> Value:
-        """`a * b`."""
-        return _two("Mul", a, b)
-
-    def div(self, a: Number, b: Number) -> Value:
-        """`a / b`."""
-        return _two("Div", a, b)
 
     def axpy(self, a: Number, b: Value, factor: float) -> Value:
         """`a + factor * b`."""
@@ -55,51 +68,15 @@ class OnnxOps:
         """`x * x`."""
         return x * x
 
-    def pow(self, a: Number, b: Number) -> Value:
-        """`a ^ b`."""
-        return _two("Pow", a, b)
-
     def mod(self, a: Number, b: Number) -> Value:
         """Floored modulo: the sign of `b`."""
         like = _like(a, b)
         divisor = like.beside(b)
-        (rest,) = like.sheet.emit(
-            "Mod", (like.beside(a), divisor), [_shape(like, a, b)], like.kind, {"fmod": 1}
-        )
+        dividend = like.beside(a)
+        shape = dividend.broadcast(divisor)
+        (rest,) = like.sheet.emit("Mod", (dividend, divisor), [shape], like.kind, {"fmod": 1})
         other = (rest * divisor).apply("Less", 0.0, kind="bool")
         return self.where(other, rest + divisor, rest)
-
-    def abs(self, x: Value) -> Value:
-        """Absolute value."""
-        return x.apply("Abs")
-
-    def sign(self, x: Value) -> Value:
-        """-1, 0 or 1."""
-        return x.apply("Sign")
-
-    def floor(self, x: Value) -> Value:
-        """Largest integer at most `x`."""
-        return x.apply("Floor")
-
-    def ceil(self, x: Value) -> Value:
-        """Smallest integer at least `x`."""
-        return x.apply("Ceil")
-
-    def round(self, x: Value) -> Value:
-        """Nearest integer, halves to even."""
-        return x.apply("Round")
-
-    def sqrt(self, x: Value) -> Value:
-        """Square root."""
-        return x.apply("Sqrt")
-
-    def exp(self, x: Value) -> Value:
-        """Exponential."""
-        return x.apply("Exp")
-
-    def log(self, x: Value) -> Value:
-        """Natural logarithm."""
-        return x.apply("Log")
 
     def norm(self, *components: Number) -> Value:
         """Euclidean length."""
@@ -111,14 +88,6 @@ class OnnxOps:
         return total.apply("Sqrt")
 
     # ------------------------------------------------------------------ angles
-
-    def sin(self, x: Value) -> Value:
-        """Sine."""
-        return x.apply("Sin")
-
-    def cos(self, x: Value) -> Value:
-        """Cosine."""
-        return x.apply("Cos")
 
     def tan(self, x: Value) -> Value:
         """Tangent."""
@@ -151,22 +120,6 @@ class OnnxOps:
 
     # ------------------------------------------------------------------- truth
 
-    def gt(self, a: Number, b: Number) -> Value:
-        """`a > b`."""
-        return _two("Greater", a, b, truth=True)
-
-    def ge(self, a: Number, b: Number) -> Value:
-        """`a >= b`."""
-        return _two("GreaterOrEqual", a, b, truth=True)
-
-    def both(self, a: Value, b: Value) -> Value:
-        """Conjunction."""
-        return a.apply("And", b)
-
-    def either(self, a: Value, b: Value) -> Value:
-        """Disjunction."""
-        return a.apply("Or", b)
-
     def number(self, mask: Value, like: Value) -> Value:
         """1 where `mask`, else 0."""
         return mask.cast(like.kind)
@@ -189,14 +142,6 @@ class OnnxOps:
         return x if high is None else x.apply("Min", high)
 
     # -------------------------------------------------------------- along time
-
-    def minimum(self, a: Number, b: Number) -> Value:
-        """Elementwise minimum."""
-        return _two("Min", a, b)
-
-    def maximum(self, a: Number, b: Number) -> Value:
-        """Elementwise maximum."""
-        return _two("Max", a, b)
 
     def join(self, items: Sequence[Value], pick: Pick) -> Value:
         """Exact extremum of one or more arrays."""
@@ -257,20 +202,6 @@ class OnnxOps:
     def quiet(self) -> AbstractContextManager[object]:
         """Empty context: nothing is computed while recording."""
         return nullcontext()
-
-
-def _like(*numbers: Number) -> Value:
-    return next(number for number in numbers if isinstance(number, Value))
-
-
-def _shape(like: Value, *numbers: Number) -> tuple[int, ...]:
-    first, *rest = (like.beside(number) for number in numbers)
-    return first.broadcast(*rest)
-
-
-def _two(op: str, a: Number, b: Number, *, truth: bool = False) -> Value:
-    like = _like(a, b)
-    return like.beside(a).apply(op, b, kind="bool" if truth else None)
 
 
 def _negative(x: Value) -> Value:
