@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from torch import nn
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.unrolled import Columns, require_numbers, written
-from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS
+from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE

@@ -45,15 +45,10 @@ class Deciding(nn.Module):
         flat = plans.reshape(-1, steps, controls)
         judged = judged_openly(self._task, starts, flat)
         score = rank(judged.rho, self._task.cost(judged), judged.safe).view(-1, count)
-        best = score.argmax(1, keepdim=True)
-        plan = plans.gather(1, best[:, :, None, None].expand(-1, 1, steps, controls))[:, 0]
-        each = judged.requirements.view(-1, count, judged.requirements.shape[1])
-        return (
-            plan,
-            judged.rho.view(-1, count).gather(1, best)[:, 0],
-            judged.safe.view(-1, count).gather(1, best)[:, 0],
-            each.gather(1, best[:, :, None].expand(-1, 1, each.shape[2]))[:, 0],
-        )
+        rows = (flat, judged.rho, judged.safe, judged.requirements)
+        split = [row.reshape(-1, count, *row.shape[1:]) for row in rows]
+        plan, rho, safe, each = _picked(split, score.argmax(1))
+        return plan, rho, safe, each
 
 
 def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
@@ -79,12 +74,16 @@ def unmoved() -> Iterator[None]:
 
 def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
     """The controller as an exported program for any number of agents; states are float64."""
-    module = Deciding(task, network).eval()
-    x = task.sample(3, seed=0, dtype=torch.float64)
+    return _exported(Deciding(task, network), task.sample(3, seed=0, dtype=torch.float64))
+
+
+def _exported(module: nn.Module, *inputs: Tensor) -> ExportedProgram:
+    module.eval()
     with torch.no_grad(), unmoved():
-        module(x)  # cached constants are created here, not while exporting
+        module(*inputs)  # cached constants are created here, not while exporting
         batch = torch.export.Dim("batch", min=1)
-        return torch.export.export(module, (x,), strict=False, dynamic_shapes=({0: batch},))
+        shapes = tuple({0: batch} for _ in inputs)
+        return torch.export.export(module, inputs, strict=False, dynamic_shapes=shapes)
 
 
 # --------------------------------------------------------------------------------------- backup policy
@@ -141,7 +140,8 @@ class Guarding(nn.Module):
             pick = best(allowed, (tried.rho, -tried.cost))
             if tried.falls is not None:
                 pick = torch.where(done, pick, _safest(tried, tried.falls))
-            here = (*_picked(tried, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
+            rows = (tried.plans, tried.rho, tried.safe, tried.each)
+            here = (*_picked(rows, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
             found = here if not found else _earlier(decided, found, here)
             decided = decided | done
         return found
@@ -179,12 +179,10 @@ def _safest(tried: _Tried, falls: Tensor) -> Tensor:
     return best(longest, (tried.rho, depth, -tried.cost))
 
 
-def _picked(tried: _Tried, pick: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    def at(values: Tensor) -> Tensor:
-        index = pick.view(-1, *[1] * (values.dim() - 1)).expand(-1, 1, *values.shape[2:])
-        return values.gather(1, index)[:, 0]
-
-    return at(tried.plans), at(tried.rho), at(tried.safe), at(tried.each)
+def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
+    """The picked entry of every row: (rows, choices, …) each, (rows,) -> (rows, …) each."""
+    rows = torch.arange(len(pick))
+    return [value[rows, pick] for value in values]
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -197,11 +195,6 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
 
 def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
     """The backup policy as an exported program for any number of states; they and the plans are float64."""
-    module = Guarding(task, network).eval()
     x = task.sample(2, seed=0, dtype=torch.float64)
     plan = torch.zeros(2, task.horizon, len(task.system.decl.controls), dtype=torch.float64)
-    with torch.no_grad(), unmoved():
-        module(x, plan)  # cached constants are created here, not while exporting
-        batch = torch.export.Dim("batch", min=1)
-        shapes = ({0: batch}, {0: batch})
-        return torch.export.export(module, (x, plan), strict=False, dynamic_shapes=shapes)
+    return _exported(Guarding(task, network), x, plan)

@@ -10,8 +10,8 @@ from helpers.sheets import columns_on, computed
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.backends.array.unrolled import written
 from stlc.compile.backends.numbers import Untranslatable
+from stlc.compile.backends.onnx.ops import written
 from stlc.compile.backends.onnx.sheet import Sheet
 from stlc.compile.ir import nodes as ir
 

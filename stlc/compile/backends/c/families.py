@@ -77,32 +77,26 @@ def _blank(leaf: Entry) -> ir.Num:
 
 
 def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int) -> Family:
-    constants: dict[tuple[str, ...], str] = {}
-    columns: dict[tuple[str, ...], str] = {}
-    values: dict[str, tuple[float, ...]] = {}
+    constants: dict[str, tuple[float, ...]] = {}
+    columns: dict[str, tuple[str, ...]] = {}
+    names: dict[tuple[str, ...], str] = {}
     stands: list[ir.Num] = []
-    entries = zip(*(_entries(formulas[member]) for member in members), strict=True)
-    for rows in entries:
-        first = rows[0]
-        if isinstance(first, ir.Const):
-            numbers = tuple(row.value for row in rows if isinstance(row, ir.Const))
-            key = tuple(value.hex() for value in numbers)
-            if len(set(key)) > 1:
-                name = constants.setdefault(key, f"t{number}_{len(constants)}")
-                values[name] = numbers
-                stands.append(ir.FrozenVar(f"{LISTED}{name}"))
-                continue
+    for rows in zip(*(_entries(formulas[member]) for member in members), strict=True):
+        first, key = rows[0], tuple(map(repr, rows))
+        if len(set(key)) == 1:
+            stands.append(first)
+        elif isinstance(first, ir.Const):
+            name = names.setdefault(key, f"t{number}_{len(constants)}")
+            constants[name] = tuple(row.value for row in rows if isinstance(row, ir.Const))
+            stands.append(ir.FrozenVar(f"{LISTED}{name}"))
         else:
-            key = tuple(row.name for row in rows if not isinstance(row, ir.Const))
-            if len(set(key)) > 1:
-                name = columns.setdefault(key, f"c{number}_{len(columns)}")
-                stands.append(replace(first, name=f"{LISTED}{name}"))
-                continue
-        stands.append(first)
+            entries = tuple(row.name for row in rows if not isinstance(row, ir.Const))
+            name = names.setdefault(entries, f"c{number}_{len(columns)}")
+            columns[name] = entries
+            stands.append(replace(first, name=f"{LISTED}{name}"))
     left = iter(stands)
     shape = _changed(formulas[members[0]], lambda _: next(left))
-    table = FamilyTable(len(members), values, {name: key for key, name in columns.items()})
-    return Family(tuple(members), shape, table)
+    return Family(tuple(members), shape, FamilyTable(len(members), constants, columns))
 
 
 def _entries(formula: ir.Formula) -> list[Entry]:
