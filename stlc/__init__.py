@@ -76,7 +76,7 @@ def __dir__() -> list[str]:
 
 
 def load(path: Path | str) -> ast.Spec:
-    """Read and parse a specification; it keeps its path, from which the system it names is found.
+    """Read and parse a specification; the path is kept to find the system that the specification names.
 
     Raises:
         UsageError: there is no such file.
@@ -89,7 +89,7 @@ def load(path: Path | str) -> ast.Spec:
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:
-    """Parse the text of a specification; `name` stands for it in messages. Raises SpecError."""
+    """Parse the text of a specification, called `name` in messages. Raises SpecError."""
     from stlc.grammar.parse.parser import parse as parse_source
     from stlc.source import Source
 
@@ -99,8 +99,7 @@ def parse(text: str, name: str = "<text>") -> ast.Spec:
 class _CallablePackage(ModuleType):
     """The package `stlc.compile`, which is also the function of that name.
 
-    The name is used twice on purpose, as a package and as a function for notebooks. Python looks up
-    `__call__` in the class, so the package object gets a callable class.
+    Python looks up `__call__` in the class, so the package object gets a callable class.
     """
 
     def __call__(self, spec: ast.Spec, system: System) -> Task:

@@ -35,12 +35,12 @@ class Diagnostic:
     Attributes:
         code: an entry of `CODES`; codes that start with W are warnings.
         message: one terse headline, in the user's terms.
-        span: the place; None when there is no text to point at.
+        span: place in the text; None if there is no text.
         label: text beside the carets.
         labels: secondary places.
-        help: what to do, one entry a line.
-        note: why, one entry a line.
-        fix: edits that would repair it.
+        help: advice, a line per entry.
+        note: reasons, a line per entry.
+        fix: edits that repair the finding.
     """
 
     code: str
@@ -58,7 +58,7 @@ class Diagnostic:
         return "warning" if self.code.startswith("W") else "error"
 
     def with_note(self, text: str) -> Diagnostic:
-        """Copy with one more note."""
+        """A copy with one more note."""
         return replace(self, note=(*self.note, text))
 
 
@@ -233,7 +233,7 @@ CODES: dict[str, str] = {
     "S207": "a world that fails while it runs",
     "S208": "a function from outside that cannot be loaded, or that fails",
     "S209": "a file that a system file extends, and that cannot be read",
-    "S210": "a specification of drives that cannot be read",
+    "S210": "a specification of closed-loop runs that cannot be read",
     "S211": "a world that cannot draw the start of one agent again",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
@@ -241,7 +241,7 @@ CODES: dict[str, str] = {
     "S304": "a mirror that is not a symmetry",
     "W601": "an acceptance rate of initial states below 1 %",
     "W602": "plans of a plant that is unstable",
-    "W604": "a mission without end that is driven for longer than it was judged",
+    "W604": "an unbounded mission that is simulated for longer than it was validated",
     # runs
     "R101": "no run, or a run folder that is damaged",
     "R102": "a checkpoint of another specification or system",

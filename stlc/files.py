@@ -80,7 +80,7 @@ def _decode(name: str, data: bytes) -> Source:
 
 
 def _is_binary_mesh(data: bytes) -> bool:
-    """80 bytes of header, a count of triangles, 50 bytes for each."""
+    """True for binary stereolithography: 80 bytes of header, the number of triangles, 50 bytes for each."""
     return len(data) >= 84 and b"\0" in data and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
 
 
@@ -165,7 +165,7 @@ def reported(action: str) -> Iterator[None]:
 def find_system(name: str, spec_path: Path | None = None) -> Path:
     """The system file called `name`: as given, beside the spec, in `systems`, in `examples`, or installed.
 
-    The suffix `.yaml` may be left out. Raises UsageError (U102) with the places looked at.
+    The suffix `.yaml` may be omitted. Raises UsageError (U102) with the searched places.
     """
     folders = [Path()]
     if spec_path is not None:
@@ -199,7 +199,7 @@ def _straight(path: Path) -> Path:
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:
     """The trace called `name`: as given, then in the newest run below `runs`.
 
-    Raises UsageError (U102) with the places looked at.
+    Raises UsageError (U102) with the searched places.
     """
     folders = [Path(), runs / "latest"]
     for folder in folders:
@@ -239,9 +239,9 @@ def _shown(path: Path) -> str:
 
 
 def beside(home: Path, name: str) -> Path:
-    """A file that a text in the folder `home` names: where it says, else under its last name in that folder.
+    """The file that a text in the folder `home` refers to: at the given path, else in `home` itself.
 
-    A run's folder keeps such files in one place, whatever folder they came from.
+    The folder of a run holds copies of such files, without their subfolders.
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there

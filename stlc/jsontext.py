@@ -21,7 +21,7 @@ def plain(value: object) -> Json:
     """`value` as JSON data.
 
     Numbers that are not finite become the texts "inf", "-inf" and "nan"; mappings, dataclasses,
-    sequences, sets, arrays and array scalars are taken apart; paths become text.
+    sequences, sets, arrays and array scalars are converted recursively; paths become texts.
 
     Raises:
         TypeError: `value` contains an object that is not data.

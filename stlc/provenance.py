@@ -15,13 +15,13 @@ PACKAGES = ("stlc", "torch", "numpy", "lark", "safetensors", "typer")
 
 
 def sha256(data: bytes | str) -> str:
-    """The hexadecimal SHA-256 of `data`; a text is taken as UTF-8."""
+    """The hexadecimal SHA-256 of bytes, or of a text in UTF-8."""
     return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on; nothing is imported for it."""
+    """Versions of Python and of the packages that results depend on, from their metadata."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

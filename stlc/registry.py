@@ -66,7 +66,7 @@ class Registry(Generic[T]):
     """A table of plugins of one kind, filled by a decorator.
 
     Args:
-        kind: what one entry is, in the singular and in the user's terms: "integrator".
+        kind: noun for an entry in messages, such as "integrator".
     """
 
     def __init__(self, kind: str) -> None:
@@ -74,7 +74,7 @@ class Registry(Generic[T]):
         self._entries: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[U], U]:
-        """A decorator that enters what it decorates as `name`. Raises ValueError if the name is taken."""
+        """A decorator that registers an entry as `name`. Raises ValueError if the name is taken."""
 
         def enter(entry: U) -> U:
             if name in self._entries:
@@ -85,7 +85,7 @@ class Registry(Generic[T]):
         return enter
 
     def get(self, name: str) -> T:
-        """The entry `name`. Raises UsageError (U101) that names the nearest entry and all others."""
+        """The entry `name`. Raises UsageError (U101) with the nearest name and all names."""
         if name in self._entries:
             return self._entries[name]
         if name not in self:
@@ -101,7 +101,7 @@ class Registry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in the order in which they were entered."""
+        """Names in the order of registration."""
         return tuple(self._entries)
 
     def __contains__(self, name: object) -> bool:
@@ -117,13 +117,13 @@ class Registry(Generic[T]):
 class PackageRegistry(Registry[T]):
     """A table whose entries are the modules of a package: a plugin is one file, `NAME.py`.
 
-    The names are known without an import. Modules whose names begin with `_` are no entries.
+    Listing the names imports no module. Modules whose names begin with `_` are no entries.
 
     Args:
-        kind: what one entry is, in the singular and in the user's terms.
-        package: the dotted name of the package.
-        attribute: the name under which a module holds its entry.
-        default: the entry that is taken where none is named; first of the names.
+        kind: noun for an entry in messages.
+        package: dotted name of the package.
+        attribute: name of the entry in its module.
+        default: name of the default entry, the first of the names.
     """
 
     def __init__(self, kind: str, package: str, attribute: str, *, default: str) -> None:
@@ -132,7 +132,7 @@ class PackageRegistry(Registry[T]):
         self._package, self._attribute = package, attribute
 
     def get(self, name: str) -> T:
-        """The entry `name`, its module imported. Raises UsageError (U101) as `Registry.get` does."""
+        """The entry `name`; its module is imported. Raises UsageError (U101) as `Registry.get`."""
         if name not in self._entries and name in self:
             self._entries[name] = getattr(import_module(f"{self._package}.{name}"), self._attribute)
         return super().get(name)
@@ -149,9 +149,9 @@ class PackageRegistry(Registry[T]):
 METHODS: PackageRegistry[Any] = PackageRegistry(
     "method", "stlc.controller.methods", "METHOD", default="guided"
 )
-"""Methods, `stlc.controller.methods.Method` each, named by `--method` and `train: {method: …}`."""
+"""Training methods (`stlc.controller.methods.Method`) of `--method` and `train: {method: …}`."""
 
 SEMANTICS: PackageRegistry[Any] = PackageRegistry(
     "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"
 )
-"""Robustness semantics, `stlc.compile.semantics.protocol.Semantics` each."""
+"""Robustness semantics (`stlc.compile.semantics.protocol.Semantics`)."""

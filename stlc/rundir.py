@@ -54,7 +54,7 @@ class RunDir:
     """The folder of one run.
 
     Attributes:
-        path: of the folder.
+        path: path of the folder.
     """
 
     path: Path
@@ -67,8 +67,8 @@ class RunDir:
 
         Args:
             root: folder of all runs.
-            spec_name: of the specification.
-            words: a name for the run; drawn if None.
+            spec_name: name of the specification.
+            words: name of the run; random words if None.
 
         Raises:
             UsageError: U101, `words` cannot be part of a folder's name.
@@ -85,7 +85,7 @@ class RunDir:
 
     @classmethod
     def newest(cls, root: Path = RUNS) -> RunDir:
-        """The run that `latest` points to; without that link the one that was started last.
+        """The run that `latest` points to; without that link the most recently changed run.
 
         Raises:
             UsageError: R101, there is no run below `root`.
@@ -103,8 +103,8 @@ class RunDir:
     def open(cls, where: Path | str, root: Path = RUNS) -> RunDir:
         """The run called `where`.
 
-        That is a folder (or a file in one), `latest`, a spec's name or file (its newest run), a run's
-        number, its words, or both, with or without `SPEC/` before it.
+        Names are a folder or a file in it, `latest`, the name or file of a specification (its newest run),
+        and the number of a run, its words, or both, with or without `SPEC/` before it.
 
         Raises:
             UsageError: R101, there is no such run, or several fit.
@@ -121,7 +121,7 @@ class RunDir:
         return _by_name(str(where), root).checked()
 
     def checked(self) -> RunDir:
-        """This run, if its record can be read. Raises RunError (R101) otherwise."""
+        """This run, after a check that its record can be read. Raises RunError (R101)."""
         self.record()
         return self
 
@@ -142,7 +142,7 @@ class RunDir:
     # ------------------------------------------------------------------ whole files
 
     def write_json(self, name: str, value: object) -> None:
-        """Write `value` as the file `name`. Raises MissingError (R201) where that fails."""
+        """Write `value` as the JSON file `name`. Raises MissingError (R201) if that fails."""
         write_atomic(self.path / name, dumps(value, indent=2) + "\n")
 
     def read_json(self, name: str) -> Any:
@@ -221,7 +221,7 @@ class RunDir:
         return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
-        """Keep only the `wanted` rows; a resumed run drops those past its checkpoint."""
+        """Remove all rows but the `wanted` ones: a resumed run drops the rows after its checkpoint."""
         kept = [row for row in self.rows(name) if wanted(row)]
         write_atomic(self.path / name, "".join(dumps(row) + "\n" for row in kept))
 
@@ -254,7 +254,7 @@ def remove_run(run: RunDir) -> None:
 
 
 def now() -> str:
-    """The time in UTC, as run records and traces have it."""
+    """The current time in UTC, in the format of run records and traces."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -397,5 +397,5 @@ _ANIMALS = """
 
 
 def draw_words() -> str:
-    """Two words, such as `quiet-heron`. Independent of every seed of an experiment."""
+    """Two random words, such as `quiet-heron`, independent of all seeds of an experiment."""
     return f"{secrets.choice(_ADJECTIVES.split())}-{secrets.choice(_ANIMALS.split())}"

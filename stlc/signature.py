@@ -17,13 +17,13 @@ class Column:
 
     Attributes:
         name: as written in specifications and system files.
-        unit: physical unit of the numbers that are stored.
-        kind: what the numbers mean; bool is 0/1, enum one of `labels`.
-        role: of the column; `timer` columns are appended by the compiler.
-        low: nominal lower end of its range, in its unit (None: unknown).
+        unit: physical unit of the stored numbers.
+        kind: type of the signal; a bool is stored as 0 or 1, an enum as a value of `labels`.
+        role: role of the signal; `timer` columns are appended by the compiler.
+        low: nominal lower end of the range in this unit; None if unknown.
         high: nominal upper end.
         labels: (label, value) pairs of an enum.
-        fact: the range is enforced (clamp, bool, enum), not only nominal.
+        fact: whether the range is enforced (clamp, bool, enum), not only nominal.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Ordered columns. Timers that the compiler adds stand last."""
+    """Ordered columns; timers added by the compiler come last."""
 
     columns: tuple[Column, ...]
 
@@ -60,9 +60,9 @@ class Signature:
         raise KeyError(name)
 
     def index(self, name: str) -> int:
-        """Position of column `name`. Raises ValueError if there is none."""
+        """Position of the column `name`. Raises ValueError if there is none."""
         return self.names.index(name)
 
     def extended(self, *columns: Column) -> Signature:
-        """Signature with `columns` appended."""
+        """A signature with `columns` appended."""
         return Signature((*self.columns, *columns))

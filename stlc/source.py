@@ -9,7 +9,7 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class Source:
-    """A text and the name under which messages show it (a path as the user gave it)."""
+    """A text and its name in messages, a path as the user gave it."""
 
     name: str
     text: str = field(repr=False)

@@ -41,7 +41,7 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 
 
 def undoing(undo: Callable[[int], object]) -> int:
-    """Register `undo` for a forced exit, as `leaving` does; return its number."""
+    """Register `undo` for a forced exit until the process ends; return its key."""
     key = next(_numbers)
     _undone[key] = undo
     return key
@@ -64,7 +64,7 @@ def arm() -> None:
 
 
 def age() -> float:
-    """Seconds since the command began; 0 if stlc is used as a library."""
+    """Seconds since the command started; 0 if stlc is used as a library."""
     return time.perf_counter() - _armed[0] if _armed else 0.0
 
 

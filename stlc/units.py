@@ -29,9 +29,9 @@ class Unit:
 
     Attributes:
         dims: exponents of m, kg, s, A and K.
-        ratio: how many SI units one of it is, exactly (pi to double precision).
-        text: as written; "" for an undeclared unit, in contrast to `1`.
-        offset: its zero in SI units, exactly; 0 for all but scales like `degC`.
+        ratio: size of the unit in SI units, exactly (pi to double precision).
+        text: unit as written; "" for an undeclared unit, in contrast to `1`.
+        offset: zero point of the scale in SI units, exactly; 0 except for scales such as `degC`.
     """
 
     dims: Dims = _NONE
@@ -57,13 +57,13 @@ class Unit:
 
     @property
     def interval(self) -> Unit:
-        """The unit of differences: kelvin for `degC`, any other unit itself."""
+        """The unit of differences: kelvin for `degC`, the unit itself for others."""
         if not self.offset:
             return self
         return Unit(self.dims, self.ratio, _si_text(self.dims) if self.ratio == 1 else f"Δ{self.text}")
 
     def of_si(self, value: float) -> float:
-        """A number in SI units as one in this unit."""
+        """A number in SI units, converted to this unit."""
         return (value - float(self.offset)) / self.scale
 
     def __mul__(self, other: Unit) -> Unit:
@@ -73,7 +73,7 @@ class Unit:
         return _product(((self, 1), (other, -1)))
 
     def __pow__(self, power: int | Fraction) -> Unit:
-        """The unit to a power. Raises ValueError where an exponent would not be whole."""
+        """The unit to a power. Raises ValueError if an exponent would not be whole."""
         power = Fraction(power)
         if abs(power) > _MAX_POWER:
             raise ValueError(f"[{self}] to the power {power} is out of bounds")
@@ -159,10 +159,10 @@ SYMBOLS = _symbols()
 
 
 def parse_unit(text: str) -> Unit:
-    """The unit that `text` writes: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
+    """Parse a unit: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
 
     Raises:
-        ValueError: it is not a unit; the message has the reason.
+        ValueError: the text is not a unit; the message has the reason.
     """
     cleaned = text.strip()
     if not cleaned:
@@ -185,7 +185,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def written_unit(text: str) -> Unit:
-    """The unit of a text that may be empty. Raises ValueError as `parse_unit`."""
+    """Parse a unit; an empty text is the dimensionless unit. Raises ValueError as `parse_unit`."""
     return parse_unit(text) if text else DIMENSIONLESS
 
 
@@ -212,7 +212,7 @@ def same_dims(a: Unit, b: Unit) -> bool:
 
 
 def _factors(text: str) -> list[tuple[str, int]]:
-    """(symbol, power) pairs; every `/` divides by the one factor behind it."""
+    """(symbol, power) pairs of a unit; each `/` divides by the next factor only."""
     factors: list[tuple[str, int]] = []
     position, sign = 0, 1
     while True:
@@ -240,7 +240,7 @@ def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
 
 
 def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
-    """The product of units to whole powers; its text keeps the symbols that were written."""
+    """The product of units to whole powers, with the symbols of their texts."""
     dims, ratio = _NONE, Fraction(1)
     powers: dict[str, int] = {}
     parts = [(unit.interval, power) for unit, power in parts]

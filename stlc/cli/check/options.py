@@ -29,15 +29,15 @@ Files = Annotated[
 When = Annotated[
     str | None, typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts.")
 ]
-Ending = Annotated[End, typer.Option(help="Too short a trace: bounds, an error, cut windows.")]
+Ending = Annotated[End, typer.Option(help="If the trace is too short: bounds, an error, or cut windows.")]
 Robustness = Annotated[
     str,
     typer.Option(
-        metavar="NAME", help=f"Robustness that is told: {', '.join(SEMANTICS.names)}. Verdicts are exact."
+        metavar="NAME", help=f"Reported robustness: {', '.join(SEMANTICS.names)}. Verdicts are exact."
     ),
 ]
 Tolerance = Annotated[
-    float, typer.Option(help="Robustness from minus this on is satisfied; 0: `>` is not `>=`.")
+    float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
 ]
 Out = Annotated[
     Path | None,
@@ -47,9 +47,10 @@ Out = Annotated[
     ),
 ]
 Junit = Annotated[Path | None, typer.Option(metavar="FILE", help="Write the verdicts there, as JUnit XML.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Processes; 0: one a core.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")]
 Chunk = Annotated[
-    int, typer.Option(min=0, metavar="SAMPLES", help="Read in pieces of this size; 0: if it has to be.")
+    int,
+    typer.Option(min=0, metavar="SAMPLES", help="Read in chunks of this size; 0: only if the file is large."),
 ]
 
 
@@ -69,13 +70,15 @@ class Traces:
     ] = None
     resample: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Put the signals on a grid: bool, int, enum held, real linear."),
+        typer.Option(
+            metavar="TIME", help="Resample to this time step: bool, int and enum are held, real is linear."
+        ),
     ] = None
     max_gap: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="In longer gaps signals are unknown; three steps with --resample, else no gap may be.",
+            help="In longer gaps signals are unknown; default: three steps with --resample, else no gap.",
         ),
     ] = None
     dt: Annotated[

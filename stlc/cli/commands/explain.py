@@ -39,11 +39,11 @@ def explain(
         typer.Argument(metavar="CODE|SPEC|TRACE|RUN", help="A code, precedence, .stl file, trace or run."),
     ] = None,
     at: Annotated[
-        str | None, typer.Option(metavar="K|TIME", help="Of a trace: judge at this sample or time.")
+        str | None, typer.Option(metavar="K|TIME", help="For a trace: judge at this sample or time.")
     ] = None,
     guarantee: Annotated[
         bool,
-        typer.Option("--guarantee", help="Of a run: how likely its backup meets a plan that works."),
+        typer.Option("--guarantee", help="For a run: probability that its backup finds a plan that works."),
     ] = False,
     reading: given.Traces = given.TRACES,
     json: JsonOption = False,
@@ -151,8 +151,8 @@ class Example:
 
     Attributes:
         language: `stl`, `yaml`, `csv` or `console`.
-        notes: `wrong`, `right`, and other words after the language.
-        body: the text.
+        notes: words after the language, such as `wrong` and `right`.
+        body: text of the block.
     """
 
     language: str

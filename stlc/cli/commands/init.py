@@ -59,7 +59,9 @@ def init(
     ] = None,
     from_: Annotated[
         str | None,
-        typer.Option("--from", metavar="SYSTEM", help="Of --spec: a system whose states are the signals."),
+        typer.Option(
+            "--from", metavar="SYSTEM", help="With --spec: a system whose states become the signals."
+        ),
     ] = None,
     system: Annotated[
         str | None, typer.Option("--system", metavar="NAME", help="Write this system file only.")
@@ -122,7 +124,7 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """The next command: training for the first specification of plans."""
+    """The next command: training for the first specification that does not judge closed-loop runs."""
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}
     for path in files:
@@ -212,9 +214,9 @@ def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
     """The text of a new specification.
 
     Args:
-        name: of the specification.
-        system: its states become the signals.
-        reference: the path of that system as the specification writes it.
+        name: name of the specification.
+        system: system whose states become the signals.
+        reference: path of that system in the specification.
     """
     if system is None:
         signals, predicate = "signal x [m] in [-5, 5]", "x < 4 m"

@@ -82,7 +82,7 @@ def plot(
 
 
 def _find(what: str, runs: Path) -> Path:
-    """Find the trace called `what`, or that of the run called `what`."""
+    """The trace file called `what`, or the trace of the run called `what`."""
     from stlc.files import find_trace
     from stlc.rundir import TRACE, RunDir
 
@@ -127,7 +127,7 @@ def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
-    """One trace of a file, or all of them."""
+    """A recording reduced to the wanted trace; unchanged without one."""
     if wanted is None:
         return trace
     _require_trace(trace.traces, wanted)

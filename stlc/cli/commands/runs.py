@@ -98,7 +98,7 @@ def rm(
     names: Annotated[
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
     ],
-    force: Annotated[bool, typer.Option("--force", help="Also those that are still going.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Also runs that are in progress.")] = False,
     runs: RunsOption = RUNS,
 ) -> Answer[documents.RemovedRuns]:
     """Remove the folders of runs.

@@ -99,8 +99,12 @@ def simulate(
     ceiling: Annotated[int, typer.Option(min=0, help="Visited states to check for a feasible plan.")] = 0,
     margin: MarginOption = None,
     seeds: SeedsOption = "0..9",
-    steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
-    agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
+    ] = None,
+    agents: Annotated[
+        int | None, typer.Option(min=1, help="Agents in each run; by default the system's.")
+    ] = None,
     record: RecordOption = None,
     fail_under: FailUnderOption = None,
     scenario: ScenarioOption = None,
@@ -175,8 +179,10 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     seconds = steps * run.task.system.dt
     if not isinstance(judged, int | float) or seconds <= judged:
         return ()
-    message = f"{seconds:g} s are driven, and training judged the policy on missions of {judged:g} s"
-    note = "what is required has no end: nothing is known of it beyond that but what is driven now"
+    message = (
+        f"the simulation lasts {seconds:g} s, and training validated the policy on missions of {judged:g} s"
+    )
+    note = "the requirements have no end: beyond that time nothing is known but this simulation"
     return (Diagnostic("W604", message, note=(note,)),)
 
 

@@ -48,7 +48,7 @@ def check(
     steps: Annotated[
         int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
     ] = 32,
-    seed: Annotated[int, typer.Option(min=0, help="Of the states and controls.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the states and controls.")] = 0,
     set_: SetOption = None,
 ) -> Answer[documents.SystemFacts]:
     """Validate a system file with random rollouts.

@@ -28,5 +28,5 @@ PROGRAM = Program(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `stlc` and return its exit code; the arguments are by default those of the process."""
+    """Run `stlc` with these arguments (default: those of the process) and return its exit code."""
     return PROGRAM.run(argv)

@@ -26,7 +26,7 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
-    """The requirements of the named specification, or of the one stored in a named trace."""
+    """The requirements of a specification on the command line, or of one stored in a trace there."""
     names: dict[str, None] = {}
     for path in _named(context):
         with suppress(Exception):  # no diagnostics during completion
@@ -53,7 +53,7 @@ def _named(context: typer.Context) -> Iterator[Path]:
 
 
 def _specification(path: Path) -> str:
-    """The text of a specification, or the one in a trace."""
+    """The text of a specification file, or of the specification stored in a trace."""
     if path.suffix in (".stl", ".stlc"):
         return path.read_text(encoding="utf-8")
     from stlc.files import find_trace

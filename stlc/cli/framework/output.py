@@ -119,14 +119,14 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
 @contextmanager
 def noticing() -> Iterator[None]:
     """Show notices about the machine (`stlc.diagnostics.notice`), each once."""
-    said: set[str] = set()
+    shown: set[str] = set()
     others = warnings.showwarning
 
     def show(message: Warning | str, *rest: Any, **options: Any) -> None:
         if not isinstance(message, Notice):
             others(message, *rest, **options)
-        elif str(message) not in said:
-            said.add(str(message))
+        elif str(message) not in shown:
+            shown.add(str(message))
             show_diagnostics([message.finding])
 
     with warnings.catch_warnings():
@@ -249,11 +249,11 @@ class Pulse:
         silence = self.IN_TERMINAL if terminal else self.IN_LOG
         while not ended.wait(min(0.5, silence)):
             with self._lock, suppress(OSError, ValueError, IndexError):
-                what, begun = self._doing[-1]
+                what, started = self._doing[-1]
                 now = time.monotonic()
                 if not what or now - self._last < silence:
                     continue
-                text = f"{what}, {now - begun:.0f} s"
+                text = f"{what}, {now - started:.0f} s"
                 stream.write(f"\r\x1b[K{text}" if terminal else f"{text}\n")
                 stream.flush()
                 self._shown = terminal

@@ -31,16 +31,16 @@ LINES = 10
 HALF = 10
 """Half the width of a bar; its right half is a positive margin."""
 NARROW = 4
-"""The same in a narrow terminal."""
+"""Half the width of a bar in a narrow terminal."""
 FIRST = ("agent", "decided by", "plan", "least margin")
-"""Columns of every agent before its states."""
+"""Headers of the columns before the states of an agent."""
 
 
 class LiveView:
     """Shows a deployment: redrawn in place on a terminal, ten lines elsewhere.
 
     Args:
-        oversight: live monitor of the deployment.
+        monitor: live monitor of the deployment.
         title: name of the deployment.
         console: for messages.
         clock: function that returns seconds.
@@ -48,13 +48,13 @@ class LiveView:
 
     def __init__(
         self,
-        oversight: LiveMonitor,
+        monitor: LiveMonitor,
         title: str,
         console: Console,
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.oversight, self.title, self.console = oversight, title, console
+        self.monitor, self.title, self.console = monitor, title, console
         self._clock = clock
         self._drawn_at = -1e9
         self._scales: dict[str, float] = {}
@@ -75,9 +75,9 @@ class LiveView:
         if self._live is not None:
             self._live.stop()
 
-    def tell(self) -> None:
+    def update(self) -> None:
         """Update the view after a step of the deployment."""
-        moment = self.oversight.moment
+        moment = self.monitor.moment
         assert moment is not None
         if moment.planned:
             self._seconds = moment.seconds
@@ -93,9 +93,9 @@ class LiveView:
 
     def line(self) -> str:
         """The present state on one line."""
-        worst = min(self.oversight.margins.items(), key=lambda each: float(each[1].high.min()))
+        worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
         name, agent = worst[0], int(worst[1].high.argmin())
-        violated = np.any([margin.violated > 0 for margin in self.oversight.margins.values()], axis=0)
+        violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
         parts = (
             self._counter(),
             f"guard acted in {self._acted()}",
@@ -116,36 +116,36 @@ class LiveView:
         return Group(*lines)
 
     def _counter(self) -> str:
-        moment = self.oversight.moment
+        moment = self.monitor.moment
         assert moment is not None
-        step = f"step {moment.step:,} / {moment.steps:,}   t = {self.oversight.time:.6g} s"
+        step = f"step {moment.step:,} / {moment.steps:,}   t = {self.monitor.time:.6g} s"
         return f"{step}   all decided in {1e3 * self._seconds:.1f} ms"
 
     def _decisions(self) -> str:
-        total = max(int(self.oversight.counts.sum()), 1)
-        shares = zip(SOURCES, self.oversight.counts.tolist(), strict=True)
+        total = max(int(self.monitor.counts.sum()), 1)
+        shares = zip(SOURCES, self.monitor.counts.tolist(), strict=True)
         return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
 
     def _acted(self) -> str:
-        acted, total = int(self.oversight.counts[1:].sum()), int(self.oversight.counts.sum())
+        acted, total = int(self.monitor.counts[1:].sum()), int(self.monitor.counts.sum())
         return f"{acted:,} of {total:,}"
 
     def _agent(self, row: int) -> str:
-        seed, agent = divmod(row, self.oversight.setting.agents)
-        several = len(self.oversight.setting.seeds) > 1
-        return f"agent {agent}" + (f", seed {self.oversight.setting.seeds[seed]}" if several else "")
+        seed, agent = divmod(row, self.monitor.setting.agents)
+        several = len(self.monitor.setting.seeds) > 1
+        return f"agent {agent}" + (f", seed {self.monitor.setting.seeds[seed]}" if several else "")
 
     def _bars(self, width: int) -> list[Text]:
         """A line for each requirement: the margin of the worst agent; bars shrink before names do."""
-        margins = self.oversight.margins
-        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.oversight.task.rules}
-        told = {name: self._told(margin, units.get(name, "")) for name, margin in margins.items()}
-        wide = [max(len(parts[k]) for parts in told.values()) for k in range(3)]
+        margins = self.monitor.margins
+        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.monitor.task.rules}
+        texts = {name: self._texts(margin, units.get(name, "")) for name, margin in margins.items()}
+        wide = [max(len(parts[k]) for parts in texts.values()) for k in range(3)]
         label = max(map(len, margins))
         room = width - label - sum(wide) - len("      │      ")
         half = min(max(room // 2, NARROW), HALF)
         found = []
-        for name, (value, agent, violated) in told.items():
+        for name, (value, agent, violated) in texts.items():
             high = float(margins[name].high.min())
             text = Text(f"  {name:<{label}}  ")
             text.append(self._bar(name, high, half), style="red" if high < -TOLERANCE else "green")
@@ -155,8 +155,8 @@ class LiveView:
             found.append(text)
         return found
 
-    def _told(self, margin: Margin, unit: str) -> tuple[str, str, str]:
-        """Texts of a requirement: its least margin with unit, the agent, and the number of violations."""
+    def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
+        """Texts of a requirement: least margin with unit, its agent, and number of violations."""
         row = int(margin.high.argmin())
         open_ = margin.low[row] < margin.high[row]
         count = int((margin.violated > 0).sum())
@@ -177,19 +177,19 @@ class LiveView:
 
     def _agents(self, width: int, most: int) -> list[Text]:
         """A line for each agent of the first seed; only the worst ones if not all fit."""
-        oversight, moment = self.oversight, self.oversight.moment
+        monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
-        agents = range(oversight.setting.agents)
-        least = _least(oversight.margins)
+        agents = range(monitor.setting.agents)
+        least = _least(monitor.margins)
         rows = sorted(sorted(agents, key=lambda row: float(least[row]))[:most])
         states = moment.x[: len(agents)].tolist()
-        names = oversight.task.system.signature.columns
+        names = monitor.task.system.signature.columns
         decision = moment.decision
         cells = []
         for row in rows:
             rho = "" if decision is None else _signed(float(decision.rho[row]))
-            name, margin = _worst(oversight.margins, row)
-            first = (str(row), oversight.decided(row) or "", rho, f"{name} {_signed(margin)}")
+            name, margin = _worst(monitor.margins, row)
+            first = (str(row), monitor.decided(row) or "", rho, f"{name} {_signed(margin)}")
             cells.append([*first, *map(_shown, names, states[row])])
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
         lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]

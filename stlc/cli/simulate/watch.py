@@ -43,35 +43,35 @@ class Watching:
             return
         from stlc.controller.deployment.live import LiveMonitor
 
-        oversight = LiveMonitor(task, setting)
+        monitor = LiveMonitor(task, setting)
         with ExitStack() as stack:
             listeners: list[Callable[[], None]] = []
             if self.margins is not None:
                 lines = stack.enter_context(_lines(self.margins))
-                listeners.append(lambda: _write(oversight, lines))
+                listeners.append(lambda: _write(monitor, lines))
             if self.live:
                 from stlc.cli.framework.output import console
                 from stlc.cli.simulate.live import LiveView
 
-                view = LiveView(oversight, self.title, console(stderr=True))
+                view = LiveView(monitor, self.title, console(stderr=True))
                 stack.callback(view.stop)
                 view.start()
-                listeners.append(view.tell)
+                listeners.append(view.update)
             else:
-                told = stack.enter_context(_bar(self.title))
-                listeners.append(lambda: told(_present(oversight)))
+                update = stack.enter_context(_bar(self.title))
+                listeners.append(lambda: update(_present(monitor)))
 
             def watch(moment: SimulationStep) -> None:
-                oversight.push(moment)
+                monitor.push(moment)
                 for listener in listeners:
                     listener()
 
             yield watch
 
 
-def _present(oversight: LiveMonitor) -> SimulationStep:
-    assert oversight.moment is not None
-    return oversight.moment
+def _present(monitor: LiveMonitor) -> SimulationStep:
+    assert monitor.moment is not None
+    return monitor.moment
 
 
 def require_writable(where: str | None) -> None:
@@ -95,13 +95,13 @@ def _opened(where: str) -> TextIO:
         return Path(where).open("w", encoding="utf-8")
 
 
-def _write(oversight: LiveMonitor, stream: TextIO) -> None:
+def _write(monitor: LiveMonitor, stream: TextIO) -> None:
     """Write one JSON object per agent, a line each."""
     from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps
 
     with tolerate_closed(stream):
-        stream.writelines(dumps(record) + "\n" for record in oversight.records())
+        stream.writelines(dumps(record) + "\n" for record in monitor.records())
         stream.flush()
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -111,82 +112,76 @@ class Many:
 
 def train_many(many: Many) -> Answer[TrainedRuns]:
     """Train all runs; the text is a table, the exit code the greatest of all runs."""
+    from stlc.controller.parallel import executor
+
+    cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
+    started = "begins" if many.cluster is None else "is sent"
+    processes = executor(many.jobs, many.cluster, cores=cores, gpus=gpus)
     found: dict[str, JobResult] = {}
-    sent = "begins" if many.cluster is None else "is sent"
     try:
-        for back in _backs(many, lambda job: say(f"{job.name} {sent}")):
-            found[back.job.name] = back
-            for line in _line(back).splitlines():
+        jobs = [many.job(part) for part in many.parts]
+        for ended in processes.run(jobs, lambda job: say(f"{job.name} {started}")):
+            found[ended.job.name] = ended
+            for line in _line(ended).splitlines():
                 say(line)
     except (KeyboardInterrupt, SystemExit):
         say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
         raise
-    ordered = {part: found[many.name(part)] for part in many.parts}
-    code = max((back.code if back.code >= 0 else ENDED) for back in ordered.values())
-    jobs = [_record(part, back) for part, back in ordered.items()]
-    return Answer({"runs": jobs}, lambda: emit(_table(many, ordered)), code)
+    records = [_record(part, found[many.name(part)]) for part in many.parts]
+    code = max((each["exit_code"] if each["exit_code"] >= 0 else ENDED) for each in records)
+    return Answer({"runs": records}, lambda: emit(_table(records, several=len(many.specs) > 1)), code)
 
 
-def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
-    """Results of the runs as they end, from local processes or a cluster."""
-    from stlc.controller.parallel import executor
+def _record(part: Part, ended: JobResult) -> TrainedJob:
+    seed = {} if part.seed is None else {"seed": part.seed}
+    why = {"why": ended.why} if ended.result.get("accuracy") is None else {}
+    made: Any = {"spec": str(part.spec), **seed, "exit_code": ended.code, **why, **ended.result}
+    record: TrainedJob = made
+    return record
 
-    cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
-    jobs = [many.job(part) for part in many.parts]
-    return executor(many.jobs, many.cluster, cores=cores, gpus=gpus).run(jobs, begun)
+
+def _line(ended: JobResult) -> str:
+    """The message at the end of a run."""
+    accuracy = ended.result.get("accuracy")
+    if accuracy is None:
+        return f"{ended.job.name} broke off with exit code {ended.code}\n{ended.why}".rstrip()
+    return f"{ended.job.name} done: accuracy {accuracy:.4f}  {ended.result['run']}"
 
 
-def _table(many: Many, ordered: Mapping[Part, JobResult]) -> str:
+def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
     """A line for every run, and one for the mean of each specification."""
     rows: list[tuple[str, ...]] = []
-    several = len(many.specs) > 1
-    for spec in many.specs:
-        own = {part: back for part, back in ordered.items() if part.spec == spec}
-        lines = [*(_cells(part, back) for part, back in own.items()), *_mean(list(own.values()))]
-        rows += [(str(spec), *line) if several else line for line in lines]
+    for spec, group in groupby(records, key=lambda record: record["spec"]):
+        own = list(group)
+        lines = [*map(_cells, own), *_mean(own)]
+        rows += [(spec, *line) if several else line for line in lines]
     return table(rows, header=("specification", *HEADER) if several else HEADER, indent="")
 
 
-def _line(back: JobResult) -> str:
-    """The message at the end of a run."""
-    accuracy = back.result.get("accuracy")
-    if accuracy is None:
-        return f"{back.job.name} broke off with exit code {back.code}\n{back.why}".rstrip()
-    return f"{back.job.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
-
-
-def _cells(part: Part, back: JobResult) -> tuple[str, ...]:
-    result, seed = back.result, "" if part.seed is None else str(part.seed)
-    if result.get("accuracy") is None:
-        return (seed, "", f"exit code {back.code}")
-    low, high = result["interval"]
-    shares = result["requirements"]
+def _cells(record: TrainedJob) -> tuple[str, ...]:
+    seed = str(record.get("seed", ""))
+    if record.get("accuracy") is None:
+        return (seed, "", f"exit code {record['exit_code']}")
+    low, high = record["interval"]
+    shares, feasible = record["requirements"], record["feasible"]
     worst = min(shares, key=shares.__getitem__)
     return (
-        *(seed, f"{result['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{result['feasible']:.4f}"),
-        *(_share(result), f"{worst} {shares[worst]:.4f}", f"{result['seconds']:.0f} s", result["run"]),
+        *(seed, f"{record['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{feasible:.4f}"),
+        *(_share(record["accuracy"], feasible), f"{worst} {shares[worst]:.4f}"),
+        *(f"{record['seconds']:.0f} s", record["run"]),
     )
 
 
-def _share(result: Mapping[str, Any]) -> str:
-    return f"{100 * result['accuracy'] / result['feasible']:.1f} %" if result["feasible"] else ""
+def _share(accuracy: float, feasible: float) -> str:
+    return f"{100 * accuracy / feasible:.1f} %" if feasible else ""
 
 
-def _mean(backs: Sequence[JobResult]) -> list[tuple[str, ...]]:
+def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
     """The row of means, if several runs succeeded."""
-    results = [back.result for back in backs if back.result.get("accuracy") is not None]
-    if len(results) < 2:
+    finished = [record for record in records if record.get("accuracy") is not None]
+    if len(finished) < 2:
         return []
-    accuracies = [float(result["accuracy"]) for result in results]
+    accuracies = [record["accuracy"] for record in finished]
     spread = f"{min(accuracies):.4f} to {max(accuracies):.4f}"
-    feasible = fmean(float(result["feasible"]) for result in results)
-    mean = {"accuracy": fmean(accuracies), "feasible": feasible}
-    return [("mean", f"{mean['accuracy']:.4f}", spread, f"{feasible:.4f}", _share(mean))]
-
-
-def _record(part: Part, back: JobResult) -> TrainedJob:
-    seed = {} if part.seed is None else {"seed": part.seed}
-    why = {"why": back.why} if back.result.get("accuracy") is None else {}
-    made: Any = {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}
-    job: TrainedJob = made
-    return job
+    accuracy, feasible = fmean(accuracies), fmean(record["feasible"] for record in finished)
+    return [("mean", f"{accuracy:.4f}", spread, f"{feasible:.4f}", _share(accuracy, feasible))]

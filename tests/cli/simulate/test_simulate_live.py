@@ -72,18 +72,18 @@ def shown(
         no_color=True,
         legacy_windows=False,
     )
-    oversight, ticks = LiveMonitor(task, setting), iter(range(10_000))
-    view = LiveView(oversight, "dot · a title", console, clock=lambda: float(next(ticks)))
+    monitor, ticks = LiveMonitor(task, setting), iter(range(10_000))
+    view = LiveView(monitor, "dot · a title", console, clock=lambda: float(next(ticks)))
 
     def watch(moment: object) -> None:
-        oversight.push(moment)  # type: ignore[arg-type]
-        view.tell()
+        monitor.push(moment)  # type: ignore[arg-type]
+        view.update()
 
     view.start()
     made = world_type(task.system.decl)
     simulate(Guard(task, Away(task), guard), made, setting, Recorder(6), watch)
     view.stop()
-    assert oversight.counts.sum() == seeds * 6 * steps
+    assert monitor.counts.sum() == seeds * 6 * steps
     return stream.getvalue()
 
 
