@@ -34,7 +34,19 @@ _OF_MODULE = re.compile(r"(?<![\w.])`?([^\W\d]\w*)`?\s*\.\s*\Z")
 _UNIT_PREFIX = re.compile(r"(?:[A-Za-zµ°Ω%][\w/^*·.°]*)?\Z")
 _SILENT = re.compile(r"""[^"\n]*(?:"[^"\n]*"[^"\n]*)*(?:(?:\#|//).*|"[^"\n]*)""")
 _PLAIN_WORDS = RESERVED | {*PRAGMAS, "as", "fn", "from"}
-_OPERATORS = {"AND": ("and",), "OR": ("or", "xor"), "IFF": ("iff",), "IMPLIES": ("implies",)}
+_TERMINALS = {
+    **{
+        "AND": ("and",),
+        "OR": ("or", "xor"),
+        "IFF": ("iff",),
+        "IMPLIES": ("implies",),
+        "_NOT_IN": ("not in",),
+    },
+    **{"QUANTIFIER": ("forall", "exists"), "ROLE": tuple(ROLES)},
+    "UNARY": tuple(dict.fromkeys(UNARY_TEMPORAL.values())),
+    "BINARY": tuple(dict.fromkeys(BINARY_TEMPORAL.values())),
+}
+"""Words of a terminal of the grammar, in the spelling that the language prefers."""
 _KINDS: dict[str, OfferKind] = {
     **{"signal": "Variable", "param": "Variable", "const": "Constant", "member": "EnumMember"}
 }
@@ -115,7 +127,7 @@ def _units_at(piece: str, text: str) -> str | None:
 
 
 def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
-    """Tokens that the parser accepts next."""
+    """Offers for the tokens that the parser accepts next."""
     yield from _keywords(accepted)
     if "UNIT" in accepted:
         yield from _units()
@@ -143,28 +155,15 @@ def _preferred() -> set[str]:
 
 
 def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
-    """Terminals that are words."""
-    words: list[str] = []
+    """Offers for the accepted terminals that are words."""
     for terminal in accepted:
-        words.extend(_OPERATORS.get(terminal, ()))
-        if terminal == "UNARY":
-            words.extend(dict.fromkeys(UNARY_TEMPORAL.values()))
-        elif terminal == "BINARY":
-            words.extend(dict.fromkeys(BINARY_TEMPORAL.values()))
-        elif terminal == "QUANTIFIER":
-            words.extend(("forall", "exists"))
-        elif terminal == "ROLE":
-            words.extend(ROLES)
-        elif terminal == "_NOT_IN":
-            words.append("not in")
-        elif terminal.startswith("_") and terminal[1:].lower() in _PLAIN_WORDS:
-            words.append(terminal[1:].lower())
-    for word in words:
-        yield Offer(word, "Keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
+        plain = terminal[1:].lower() if terminal.startswith("_") else ""
+        for word in _TERMINALS.get(terminal, (plain,) if plain in _PLAIN_WORDS else ()):
+            yield Offer(word, "Keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:
-    """Value symbols in scope, nearest first."""
+    """Offers for the symbols in scope that stand for values, nearest first."""
     for symbol in inside(document.spec, offset):
         yield Offer(own_name(symbol.name), "Reference", about(document, symbol), order=1)
     for symbol in document.names.values.values():

@@ -25,6 +25,9 @@ from stlc.grammar.words import (
 
 _TYPES = ("real", "int", "bool", "formula")
 _CONSTANTS = ("true", "false", "inf")
+_TEMPORAL = (*UNARY_TEMPORAL, *BINARY_TEMPORAL)
+_WORDS = (*sorted(RESERVED - {*DECLARATIONS, *_TEMPORAL, *_CONSTANTS}), "from", "as")
+"""Reserved words without a pattern of their own."""
 _NAME = r"`[^`\n]+`|[^\W\d]\w*"
 
 
@@ -51,15 +54,17 @@ def _repository() -> dict[str, Any]:
         "pragma": {"patterns": _pragmas()},
         "tag": _of("storage.modifier.tag", r"(?<!\w)@\s*[A-Za-z_]\w*"),
         "quoted": _of("variable.other", r"`[^`\n]+`"),
-        "temporal": _of("keyword.operator.temporal", rf"\b{_any(_temporal())}_?(?!\w)"),
+        "temporal": _of("keyword.operator.temporal", rf"\b{_any(_TEMPORAL)}_?(?!\w)"),
         "role": _of("storage.modifier.role", rf"\b{_any(ROLES)}(?=\s+signal\b)"),
         "constant": _of("constant.language", _words(_CONSTANTS)),
         "time": _of("variable.language", _words(BUILT_IN)),
-        "keyword": _of("keyword.operator.word", _words(_logic())),
+        "keyword": _of("keyword.operator.word", _words(_WORDS)),
         "number": _numbers(),
         "unit": _captures(rf"(\[)\s*({_unit()}|[%1])\s*(\])", {"2": "keyword.other.unit"}),
         "region": _of("support.class.region", rf"{_words(REGIONS)}(?=\s*\()"),
-        "function": _of("support.function", rf"{_words(_functions())}(?=\s*\()"),
+        "function": _of(
+            "support.function", rf"{_words({*callable_names(), *FUNCTIONS} - {*REGIONS})}(?=\s*\()"
+        ),
         "type": _captures(rf"(:|->)\s*({_any(_TYPES)})\b", {"2": "support.type"}),
         "operator": _of("keyword.operator", r"<->|<=>|->|=>|<=|>=|==|!=|\.\.|&&?|\|\|?|[-+*/%^<>=!~]"),
     }
@@ -112,20 +117,6 @@ def _unit() -> str:
     """A product of powers of units, without blanks."""
     one = f"(?:{PATTERNS['UNITS']}|[%1](?=/)){PATTERNS['EXPONENT']}?"
     return rf"{one}(?:[*/·]{PATTERNS['UNITS']}{PATTERNS['EXPONENT']}?)*"
-
-
-def _temporal() -> list[str]:
-    return [*UNARY_TEMPORAL, *BINARY_TEMPORAL]
-
-
-def _logic() -> list[str]:
-    """Reserved words without a pattern of their own."""
-    other = {*DECLARATIONS, *_temporal(), *_CONSTANTS}
-    return [*sorted(RESERVED - other), "from", "as"]
-
-
-def _functions() -> set[str]:
-    return {*callable_names(), *FUNCTIONS} - {*REGIONS}
 
 
 def _any(words: Iterable[str]) -> str:

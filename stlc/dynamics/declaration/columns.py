@@ -198,7 +198,7 @@ def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
 
 
 def name_columns(names: Names, about: str) -> None:
-    """Declare the columns, and members of enums, as names for expressions."""
+    """Declare the columns, and the members of their enums, as names for expressions."""
     known = column_entries(names.columns, about=about)
     names.entries |= {name: entry for name, entry in known.items() if name not in names.entries}
     names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
@@ -365,7 +365,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """The column; without a written range it gets that of its distribution."""
+    """The column, with the range of its distribution where none is written."""
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])

@@ -154,21 +154,15 @@ def describe(decl: SystemDecl) -> str:
     grid = f"dt = {float(decl.dt):g} s, T = {decl.horizon} steps = {seconds:g} s, {kind}{substeps}"
     flow = {assign.name: assign.text for assign in decl.flow}
     rate = "{}' =" if decl.discrete else "d{}/dt ="
+    jumps = [
+        (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
+        for jump in decl.jumps
+    ]
     blocks = (
         ("states", [_state(column, flow.get(column.name), rate) for column in decl.signature.columns]),
         ("controls", [_control(decl, index) for index in range(len(decl.controls))]),
         ("feedback beneath the plans", _feedback(decl)),
-        (
-            "jumps",
-            [
-                (
-                    jump.name,
-                    f"when {jump.text}",
-                    ", ".join(f"{reset.name} := {reset.text}" for reset in jump.resets),
-                )
-                for jump in decl.jumps
-            ],
-        ),
+        ("jumps", jumps),
         ("initial situations", _situations(decl.init.mixture)),
         ("kept where", [(text,) for text in decl.init.where_text]),
         ("scenarios", [(scenario.name, scenario.doc) for scenario in decl.scenarios]),

@@ -71,7 +71,7 @@ def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ..
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """Prefixes that the backup policy tries."""
+    """The section `backup`: prefixes that the backup policy tries."""
 
     bins: int = key(integer(2), "values of a control, evenly over its range", 5)
     levels: Mapping[str, tuple[float, ...]] = key(_levels, "values by control, in place of `bins`", {})
@@ -82,7 +82,7 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """Read the section `backup`, or that of a scenario; prefixes end at the horizon."""
+    """Read the section `backup`, or that of a scenario; lengths beyond the horizon are dropped."""
     backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
     if lengths is not None and 0 < horizon < max(backup.lengths):
@@ -98,7 +98,7 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 
 @reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """Trigger condition: a state formula, or `rise(…)`, `fall(…)` of one."""
+    """Read a trigger condition: a state formula, or `rise(…)`, `fall(…)` of one."""
     expr = cx.here.parse(node, label)
     match expr:
         case None:
@@ -111,7 +111,7 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 
 @reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """Step of the deployment; 0 is its start."""
+    """Read a step of the deployment, as a time or in steps; 0 is the start."""
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 
@@ -200,7 +200,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
 
 @reads(items_of({"type": "string"}))
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
-    """Read names of constants; a vector has one."""
+    """Read names of constants; a vector has one name for all components."""
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
     items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]
     for item in items:
@@ -211,7 +211,7 @@ def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TestDecl:
-    """Deployment: number of steps and agents, replanning period, and events."""
+    """The section `test`: number of steps and agents, replanning period, and events of a deployment."""
 
     __test__ = False
 
@@ -247,7 +247,7 @@ class ErrorsDecl:
 
 @reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
-    """Constants and their changed values, as text."""
+    """Read constants and their changed values, as text."""
     found: dict[str, str] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -265,7 +265,7 @@ def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @reads(mapping_of(VECTOR))
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
-    """Terms added to derivatives (or next values), in the unit of the state per second."""
+    """Read terms added to derivatives (or next values), in the unit of the state per second."""
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
         columns = states_of(entry, label, cx)
@@ -277,7 +277,7 @@ def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
-    """Named overlay of a deployment."""
+    """An entry of `scenario`: a named overlay of a deployment."""
 
     name: str
     doc: str = key(LINE, "one line for people", "")

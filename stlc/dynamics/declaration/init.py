@@ -50,7 +50,7 @@ class GridDecl:
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """Initial states from a file: each column an array of that name, all samples of all traces."""
+    """Initial states from a file that holds an array for each column; all samples of all traces are used."""
 
     path: Path
     names: tuple[str, ...]
@@ -165,7 +165,7 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
 
 
 def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
-    """Read situations; not all weights may be 0."""
+    """Read situations, of which at least one must have a positive weight."""
     situations = [_situation(item, outer) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
         outer.cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
@@ -205,7 +205,7 @@ class _Draws:
 
     @property
     def drawing(self) -> Context:
-        """Context for expressions that may draw, and read names with a value."""
+        """Context for expressions that may draw, and that read only names with a value."""
         return self.cx.drawing(self.locals, self.ready)
 
     def require_all(self, called: str, node: Node) -> None:
@@ -218,7 +218,7 @@ class _Draws:
             self.cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
 
     def read(self, keys: SituationKeys | InitKeys) -> None:
-        """`let`, `draw` and `also`, in the order of their dependencies."""
+        """Read `let`, `draw` and `also`, in the order of their dependencies."""
         reader = self.cx.reader
         before = len(reader.findings)
         for entry in reader.entries(keys.let, "`let`"):
@@ -279,7 +279,7 @@ class _Draws:
 
 
 def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
-    """Situation whose states come from a grid or a file, except for those that it draws."""
+    """Read initial states from a grid or a file; `draw` gives the states that are not in it."""
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [

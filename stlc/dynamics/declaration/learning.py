@@ -106,7 +106,7 @@ def _at_start(number: Number) -> Number:
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveDecl:
-    """The paper's loss (Eq. 8-10): a hinge on the robustness, plus performance terms."""
+    """The section `objective`: loss of the paper (Eq. 8-10), a robustness hinge plus performance terms."""
 
     gamma: float = key(number(), "robustness at which the hinge ends", 0.5)
     smoothing: float = key(number(1e-9), "scale of the smooth robustness", 500.0)
@@ -250,7 +250,7 @@ INTEGERS = Kind(_integers, {"anyOf": [_WHOLE, {"type": "array", "items": _WHOLE}
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecl:
-    """Network, its inputs, mirror symmetry of the system, and inner feedback."""
+    """The section `policy`: network and inputs, mirror symmetry of the system, inner feedback."""
 
     type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
     hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))
@@ -271,7 +271,7 @@ class PolicyDecl:
 
 @dataclass(frozen=True, slots=True)
 class TrainDecl:
-    """Training defaults of this system; None leaves the choice to the method."""
+    """The section `train`: defaults of this system; None leaves the choice to the method."""
 
     budget: float | None = key(
         Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION), "time for training"

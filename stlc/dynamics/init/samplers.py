@@ -365,7 +365,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Indices below `count`, (rows,): equally often, in random order."""
+    """Indices below `count`, (rows,), each equally often, in random order."""
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)
     orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]

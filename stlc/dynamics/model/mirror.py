@@ -28,7 +28,7 @@ class Mirror:
     """The symmetry that `policy: {mirror: …}` declares; it is its own inverse.
 
     Attributes:
-        side: index of the state whose value distinguishes a state from its image; the larger one is kept.
+        side: index of the column that tells a state from its image; the larger value is the representative.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Mirror:
         return moved
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """States or their images, whichever are on the kept side, (B, n), and a mask (B,) of images."""
+        """Representatives of states and their images, (B, n), and a mask (B,) of those that are images."""
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
         return torch.where(swapped[..., None], image, x), swapped

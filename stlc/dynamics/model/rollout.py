@@ -94,7 +94,7 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """A stage with compiled programs."""
+    """Stage of a rollout with compiled programs."""
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
@@ -117,7 +117,7 @@ class _StageRunner:
             self._loop(columns)
 
     def _loop(self, columns: _Columns) -> None:
-        """Step the components that depend on their own past."""
+        """Step the components that depend on their own past, one sample at a time."""
         stage = self.stage
         env, timed = columns.sliced(self.outside)
         kept = (*stage.stepped.values(), *stage.lets)

@@ -44,9 +44,9 @@ class RolloutStage:
 
 def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
     """Stages of a step, ordered so that each reads only states and numbers of earlier ones."""
-    numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
+    numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
-    reads |= {name: frozenset((_next(name),)) for name in step.next}
+    reads |= {name: frozenset((f"{name}'",)) for name in step.next}
     level: dict[str, int] = {}
     groups: list[list[list[str]]] = []
     for group in _components(reads):
@@ -65,7 +65,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 
 
 class _StageWriter:
-    """Builder of the stage of one dependency level."""
+    """Builder of the stage that computes one dependency level."""
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
         self.numbers = numbers
@@ -85,10 +85,10 @@ class _StageWriter:
             if name in self.numbers:
                 self.early[name] = self.numbers[name]
             else:
-                self.follows[name] = _next(name)
+                self.follows[name] = f"{name}'"
             return
         inside = frozenset(group)
-        states = {name: _next(name) for name in group if name not in self.numbers}
+        states = {name: f"{name}'" for name in group if name not in self.numbers}
         body = {name: num for name, num in self.numbers.items() if name in inside}
         increment = _increment(states, body)
         if increment is not None:
@@ -118,11 +118,6 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
         level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
     depth = max(level.values(), default=-1) + 1
     return tuple({name: numbers[name] for name in numbers if level[name] == at} for at in range(depth))
-
-
-def _next(name: str) -> str:
-    """Name of the next value of a state."""
-    return f"{name}'"
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:

@@ -18,7 +18,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.declaration.decl import SystemDecl, describe
+from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.declaration.motion import Assign
@@ -137,10 +137,6 @@ class System:
         observe = self.decl.policy.observe
         return len(observe) + len(self.added) if observe else len(self.names)
 
-    def describe(self) -> str:
-        """States, controls, flow, jumps and initial situations, as a table of text."""
-        return describe(self.decl)
-
     # -------------------------------------------------------------------- motion
 
     def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
@@ -150,7 +146,7 @@ class System:
         return torch.stack([moved[name] for name in self.names], 1)
 
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """Append parameters, drawn, and timers at mission start to states: (B, n - added) -> (B, n)."""
+        """Append drawn parameters, and timers at mission start, to states: (B, n - added) -> (B, n)."""
         if not self.added:
             return states
         table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
@@ -166,7 +162,7 @@ class System:
         return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
 
     def added_later(self, x: Tensor) -> Tensor:
-        """Parameters and timers one step later, whatever moved the state: (B, n) -> (B, added)."""
+        """Parameters and timers one step later, independent of the control: (B, n) -> (B, added)."""
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
@@ -212,27 +208,27 @@ class System:
             )
         start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
-        moving = {name: column for name, column in start.items() if name not in self._keeper.next}
+        moving = {name: column for name, column in start.items() if name not in self._timer_step.next}
         columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], switch)
-        return columns | self._kept(start, columns, u.shape[1])
+        return columns | self._timers_over_time(start, columns, u.shape[1])
 
     def _later(self, before: Columns) -> Columns:
         with torch.no_grad():
-            after = self._keeper.step(before, {}, HARD)
+            after = self._timer_step.step(before, {}, HARD)
         return {timer.name: after[timer.name] for timer in self.timers}
 
-    def _kept(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """Timers over time, computed from the states over time."""
+    def _timers_over_time(self, start: Columns, columns: Columns, steps: int) -> Columns:
+        """Timers over time, from the timers at the start and the states over time."""
         if not self.timers:
             return {}
         with torch.no_grad():
             seen = {name: column[:-1].detach() for name, column in columns.items()}
-            begun = {timer.name: start[timer.name] for timer in self.timers}
-            kept = self._keeper.rollout(begun, seen, steps, HARD)
-        return {timer.name: kept[timer.name] for timer in self.timers}
+            first = {timer.name: start[timer.name] for timer in self.timers}
+            later = self._timer_step.rollout(first, seen, steps, HARD)
+        return {timer.name: later[timer.name] for timer in self.timers}
 
     @cached_property
-    def _keeper(self) -> Stepper:
+    def _timer_step(self) -> Stepper:
         """Compiled dynamics of the timers."""
         return Stepper(ModelStep((), {timer.name: timer.update for timer in self.timers}))
 
@@ -339,7 +335,7 @@ class System:
         rho: Tensor,
         switch: Switch,
     ) -> Tensor:
-        """Mean over time of a program's output, (B,)."""
+        """Mean over time of the output `cost` of a program, (B,)."""
         if program is None:
             return torch.zeros_like(sat)
         like = next(iter(columns.values()))

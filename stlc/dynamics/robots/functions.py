@@ -108,7 +108,7 @@ class Bound:
     result: int | None
 
     def __call__(self, *components: Array) -> Sequence[Array]:
-        """All components of the result. Raises SystemFileError (S208) where the function fails."""
+        """Call the function; return all components. Raises SystemFileError (S208) where it fails."""
         given = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
         wanted = given if self.decl.library is None else self.decl.library == "torch"
         torch: Any = importlib.import_module("torch") if given or wanted else None

@@ -219,7 +219,7 @@ class _UsedNumbers:
 
 
 class PerturbedSystem(System):
-    """True dynamics of some agents, each with its own factors; all are stepped in one batch.
+    """True dynamics of several agents, each with factors of its own; all are stepped in one batch.
 
     Args:
         factored: the dynamics, with a factor at every uncertain number.

@@ -19,26 +19,28 @@ from stlc.registry import closest
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
 """Standard scenarios that the documentation measures."""
 _STANDARD = re.compile(r"(mismatch|disturb|noise)(?:-(\d{1,3}(?:\.\d{1,3})?))?")
-_USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
+_ERRORS = {
+    "mismatch": (
+        *(10.0, "actuators and numbers of the dynamics are {:g} % more or less than the model says"),
+        ("actuator_gain", "parameters"),
+    ),
+    "disturb": (10.0, "noise on what actuators give, {:g} % of half their range", ("actuator_noise",)),
+    "noise": (0.5, "noise on what agents see, {:g} % of the range of each state", ("sensor_noise",)),
+}
+"""Standard scenario -> percentage unless given, description, and the errors that it sets."""
 
 
 def standard(name: str) -> ScenarioDecl | None:
     """A standard scenario such as `mismatch-20`; None for other names."""
     found = _STANDARD.fullmatch(name)
-    percent = float(found[2] or _USUAL[found[1]]) if found else 0.0
-    if found is None or not 0.0 < percent <= 100.0:
+    if found is None:
         return None
-    match found[1]:
-        case "mismatch":
-            doc = f"actuators and numbers of the dynamics are {percent:g} % more or less than the model says"
-            errors = ErrorsDecl(actuator_gain=percent / 100, parameters=percent / 100)
-        case "disturb":
-            doc = f"noise on what actuators give, {percent:g} % of half their range"
-            errors = ErrorsDecl(actuator_noise=percent / 100)
-        case _:
-            doc = f"noise on what agents see, {percent:g} % of the range of each state"
-            errors = ErrorsDecl(sensor_noise=percent / 100)
-    return ScenarioDecl(name, doc, "ood", errors=errors)
+    usual, doc, errors = _ERRORS[found[1]]
+    percent = float(found[2] or usual)
+    if not 0.0 < percent <= 100.0:
+        return None
+    shares = ErrorsDecl(**dict.fromkeys(errors, percent / 100))
+    return ScenarioDecl(name, doc.format(percent), "ood", errors=shares)
 
 
 def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:

@@ -113,19 +113,13 @@ class Names:
         """Declare a name; False, with a finding, if it is taken or not an identifier."""
         first = self.places.get(key.text)
         if first is not None:
-            reader.report(
-                "E102",
-                f"`{key.text}` is declared twice",
-                key.span,
-                "rename one of the two",
-                label=f"{what} here",
-                labels=(Label(first, "declared first"),),
-            )
+            message, advice = f"`{key.text}` is declared twice", "rename one of the two"
+            labels = (Label(first, "declared first"),)
+            reader.report("E102", message, key.span, advice, label=f"{what} here", labels=labels)
             return False
         if not key.text.isidentifier() or key.text == "dt":
-            reader.report(
-                "S103", f"`{key.text}` cannot be the name of a {what}", key.span, "choose another name"
-            )
+            message = f"`{key.text}` cannot be the name of a {what}"
+            reader.report("S103", message, key.span, "choose another name")
             return False
         self.places[key.text] = key.span
         return True

@@ -54,7 +54,7 @@ class Reader:
     # ------------------------------------------------------------------ collections
 
     def entries(self, node: Node | None, where: str) -> tuple[Entry, ...]:
-        """Entries of a mapping with free keys; none for a missing or null node."""
+        """Read the entries of a mapping with free keys; none for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Mapping):
@@ -65,7 +65,7 @@ class Reader:
     def fields(
         self, node: Node | None, where: str, known: Collection[str], required: Iterable[str] = ()
     ) -> dict[str, Node]:
-        """Values by key of a mapping with fixed keys."""
+        """Read the values of a mapping with fixed keys, by key; unknown and missing keys are reported."""
         found: dict[str, Node] = {}
         for entry in self.entries(node, where):
             if entry.key.text in known:
@@ -91,7 +91,7 @@ class Reader:
         )
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
-        """Items of a sequence; none for a missing or null node."""
+        """Read the items of a sequence; none for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Sequence):
@@ -134,12 +134,12 @@ class Reader:
         self.report("S103", f"{where} must be {wanted}, this is {_kind(node)}", first_line(node.span), *help_)
 
     def text(self, node: Node | None, where: str) -> str | None:
-        """A text."""
+        """Read a text."""
         found = node.text if isinstance(node, Scalar) and not node.is_null else None
         return self._valid(node, where, "a text", found)
 
     def name(self, node: Node | None, where: str) -> str | None:
-        """A text that can be a name: printable and not too long."""
+        """Read a text that can be a name: printable and not too long."""
         text = self.text(node, where)
         return text if isinstance(node, Scalar) and text is not None and self.nameable(node, where) else None
 
@@ -160,7 +160,7 @@ class Reader:
         return value
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
-        """An integer between `low` and `high`."""
+        """Read an integer between `low` and `high`."""
         value = as_int(node) if isinstance(node, Scalar) else None
         above = value is not None and value > high
         bounds = f"between {low} and {high}" if above else f"of at least {low}"
@@ -168,18 +168,18 @@ class Reader:
         return self._valid(node, where, f"a whole number {bounds}", value)
 
     def number(self, node: Node | None, where: str, *, low: float = 0.0) -> float | None:
-        """A finite number of at least `low`."""
+        """Read a finite number of at least `low`."""
         value = as_float(node) if isinstance(node, Scalar) else None
         value = value if value is not None and value >= low else None
         return self._valid(node, where, f"a number of at least {low:g}", value)
 
     def flag(self, node: Node | None, where: str) -> bool | None:
-        """`true` or `false`."""
+        """Read `true` or `false`."""
         value = as_bool(node) if isinstance(node, Scalar) else None
         return self._valid(node, where, "`true` or `false`", value)
 
     def option(self, node: Node | None, where: str, options: Collection[str]) -> str | None:
-        """One of a few words."""
+        """Read one of a few words."""
         word = self.text(node, where)
         if node is None or word is None or word in options:
             return word

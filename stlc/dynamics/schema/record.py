@@ -181,7 +181,7 @@ def word(options: Iterable[str]) -> Kind:
 
 @reads(EXPRESSION)
 def fraction(cx: Context, node: Node, label: str) -> float | None:
-    """A number between 0 and 1, or a percentage."""
+    """Read a share: a number between 0 and 1, or a percentage."""
     share = cx.here.constant(node, label, DIMENSIONLESS)
     if share is not None and not 0.0 <= share <= 1.0:
         cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
@@ -280,7 +280,7 @@ def _shown(default: Any) -> str:
 
 
 def _values(kind: Kind) -> str:
-    """The accepted values of a kind, in a few words."""
+    """Accepted values of a kind, in a few words."""
     schema = kind.schema
     if "enum" in schema:
         return ", ".join(f"`{option}`" for option in schema["enum"])

@@ -126,19 +126,19 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 
 
 def as_bool(node: Scalar) -> bool | None:
-    """`true` or `false`, else None."""
+    """Truth value of `true` or `false`; None for other texts."""
     if node.style != "plain":
         return None
     return True if node.text in _TRUE else False if node.text in _FALSE else None
 
 
 def as_int(node: Scalar) -> int | None:
-    """A decimal integer, else None."""
+    """Value of a decimal integer; None for other texts."""
     return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
 
 
 def as_float(node: Scalar) -> float | None:
-    """A finite decimal number, else None (`.nan` and `.inf` are refused)."""
+    """Value of a finite decimal number; None for other texts, `.nan` and `.inf` among them."""
     value = float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else math.inf
     return value if math.isfinite(value) else None
 
@@ -147,7 +147,7 @@ def as_float(node: Scalar) -> float | None:
 
 
 def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
-    """The one document of `source`, which must be a mapping.
+    """Read the only document of a text, which must be a mapping.
 
     Duplicate keys are appended to `sink` as S102; the first one counts. Raises SystemFileError (S100) where
     there is no such document, or it is not safe to read.
@@ -167,7 +167,7 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
 
 
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
-    """The one node of `source`, of any kind; None when there is no document.
+    """Read the only document of a text, of any kind; None when there is none.
 
     PyYAML's C parser, if available, is ten times faster. Errors are reported by the Python parser, whose
     messages and locations are better.
