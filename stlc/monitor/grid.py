@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir.discretize import Grid
@@ -14,6 +15,9 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.trace import Trace, as_fraction
+
+if TYPE_CHECKING:
+    from stlc.dynamics.declaration.decl import SystemDecl
 
 _SLACK = 1e-6
 
@@ -61,7 +65,7 @@ class Times:
 
 
 def _dividing(horizon: float, dt: float) -> str:
-    """Advice: the largest short number of seconds up to the step that divides the horizon."""
+    """Advice: a step of four digits, at most the given one, that divides the horizon."""
     least = math.ceil(horizon / dt)
     short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
     step = horizon / next(short, least)
@@ -69,39 +73,46 @@ def _dividing(horizon: float, dt: float) -> str:
 
 
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
-    """The arguments of a monitor. Raises UsageError (U101) where they are not positive times."""
+    """Return the arguments of a monitor as times. Raises UsageError (U101) where they are not positive."""
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
     return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
 
 
-def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
-    """Times and interface of a system file, its functions loaded. Raises UsageError or SystemFileError."""
+def _declared(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
     from stlc.dynamics.declaration.load import load_system_decl
-    from stlc.dynamics.robots.functions import load_functions
 
     decl = load_system_decl(find_system(name, Path(spec.source.name)), overrides)
-    interface = replace(decl.interface(), functions=load_functions(decl))
-    return Times(decl.dt, decl.dt * decl.horizon), interface
+    return Times(decl.dt, decl.dt * decl.horizon), decl
+
+
+def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
+    """Return times and interface of a system file, its functions loaded.
+
+    Raises:
+        UsageError: U102, there is no such file.
+        SystemFileError: the file is invalid.
+    """
+    from stlc.dynamics.robots.functions import load_functions
+
+    times, decl = _declared(name, spec, overrides)
+    return times, replace(decl.interface(), functions=load_functions(decl))
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
-    """Times of the system that the specification names; None without one, or without its file."""
-    from stlc.dynamics.declaration.load import load_system_decl
-
+    """Return the times of the system that the specification names; None without one, or without its file."""
     if spec.system is None:
         return None
     try:
-        path = find_system(spec.system, Path(spec.source.name))
+        find_system(spec.system, Path(spec.source.name))
     except UsageError:
         return None
-    decl = load_system_decl(path, overrides)
-    return Times(decl.dt, decl.dt * decl.horizon)
+    return _declared(spec.system, spec, overrides)[0]
 
 
 def recorded_times(trace: Trace, asked: Times) -> Times:
-    """Times of a trace. Raises TraceError (E602) where they contradict the monitor's time step."""
+    """Return the times of a trace. Raises TraceError (E602) where they contradict the monitor's time step."""
     dt = as_fraction(trace.dt)
     if asked.dt is not None and abs(asked.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(asked.dt):g} s"

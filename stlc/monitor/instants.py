@@ -21,7 +21,7 @@ from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
@@ -179,13 +179,3 @@ def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: G
             "`--end truncate` evaluates on what there is",
         ),
     )
-
-
-def require_length(
-    rules_and_starts: list[tuple[CompiledRequirement, range]], samples: int, grid: Grid
-) -> None:
-    """Raise TraceError (E306) where a requirement needs more samples than there are."""
-    findings = [check_length(rule, samples, starts, grid) for rule, starts in rules_and_starts]
-    found = [finding for finding in findings if finding is not None]
-    if found:
-        raise TraceError(*found)

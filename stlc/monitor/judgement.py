@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.pipeline import Compiled, CompiledRequirement
+from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.signals import Gap, Signals
 from stlc.monitor.values import Record
@@ -52,6 +53,10 @@ class Prepared:
         """Gaps in the needed signals."""
         return self.signals.gaps
 
+    def under(self, semantics: Semantics) -> Prepared:
+        """Return the same signals, to be evaluated in another semantics."""
+        return replace(self, record=replace(self.record, semantics=semantics))
+
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; its number where the time step is unknown."""
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
@@ -74,7 +79,7 @@ class Judgement:
         fails: certainly violated, (instants, traces).
         shape: of the signals before their time axis; () for a single trace.
         scope: traces that satisfy the assumptions, (traces,); None means all. Others are not counted.
-        told: `low` and `high` in the requested semantics; None: the exact ones.
+        reported: `low` and `high` in the requested semantics; None where that is the exact one.
     """
 
     rule: CompiledRequirement
@@ -85,12 +90,12 @@ class Judgement:
     fails: Bools = field(repr=False)
     shape: tuple[int, ...]
     scope: Bools | None = field(default=None, repr=False)
-    told: tuple[Floats, Floats] | None = field(default=None, repr=False)
+    reported: tuple[Floats, Floats] | None = field(default=None, repr=False)
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
         """Least and greatest robustness in the requested semantics, each (instants, traces)."""
-        return (self.low, self.high) if self.told is None else self.told
+        return (self.low, self.high) if self.reported is None else self.reported
 
     @property
     def name(self) -> str:
@@ -112,7 +117,7 @@ class Judgement:
         ]
 
     def counted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values (…, traces) of the traces within `scope`."""
+        """Return the values (…, traces) of the traces within `scope`."""
         return values if self.scope is None else values[..., self.scope]
 
     @property
@@ -223,7 +228,7 @@ class Verdict:
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """The verdict with only the traces in `scope` (traces,), which satisfy the assumptions, counted."""
+        """Return the verdict on the traces in `scope` (traces,) alone: those that satisfy the assumptions."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))

@@ -14,15 +14,15 @@ from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir.discretize import Grid, lacks
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
-from stlc.compile.semantics.semantics import TOLERANCE, Exact, Semantics, semantics_of
-from stlc.diagnostics import Diagnostic, SpecError, UsageError
+from stlc.compile.semantics.semantics import TOLERANCE, Semantics, semantics_of
+from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
 from stlc.monitor.instants import (
     At,
-    require_length,
+    check_length,
     rule_bounds,
     rule_known,
     rule_signal,
@@ -102,7 +102,7 @@ class Monitor:
         """Seconds of signal that a verdict at time 0 needs; windows to the end are clipped."""
         return float(self.compiled.reach * (self.compiled.grid.dt or 0))
 
-    # -------------------------------------------------------------------- judging
+    # ----------------------------------------------------------------- evaluation
 
     def check(
         self,
@@ -130,19 +130,22 @@ class Monitor:
                 "strict" the trace is too short (E306).
             UsageError: U101, an unknown requirement or semantics, or no such sample.
         """
-        told = semantics_of(semantics)
+        reported = semantics_of(semantics)
         ready = self._prepare(signals, require, plain=True)
         samples = ready.signals.samples
         starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
         if end == "strict":
-            require_length(list(zip(ready.rules, starts, strict=True)), samples, ready.compiled.grid)
+            checked = zip(ready.rules, starts, strict=True)
+            findings = [check_length(rule, samples, its, ready.compiled.grid) for rule, its in checked]
+            if any(findings):
+                raise TraceError(*filter(None, findings))
         judgements = [
             _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
             for rule, its in zip(ready.rules, starts, strict=True)
         ]
-        if not told.exact:
-            ready = replace(ready, record=replace(ready.record, semantics=told))
-            judgements = [_told(judgement, ready, end) for judgement in judgements]
+        if not reported.exact:
+            ready = ready.under(reported)
+            judgements = [_reported(judgement, ready, end) for judgement in judgements]
         return Verdict(tuple(judgements), ready).within(_scope(ready, tolerance))
 
     def robustness(
@@ -166,13 +169,7 @@ class Monitor:
         Returns:
             The shape of the signals, or with `at` that shape without the time axis.
         """
-        chosen = semantics_of(semantics, smoothing)
-        ready = self._prepare(signals, ())
-        ready = replace(ready, record=replace(ready.record, semantics=chosen))
-        rows = _rows(ready, end, at)
-        weighed = _weighed(ready.rules, rows)
-        whole = chosen.join(weighed, "min", ready.signals.ops)
-        return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
+        return _least(self._prepare(signals, ()).under(semantics_of(semantics, smoothing)), end, at)
 
     def requirement_robustness(
         self,
@@ -183,12 +180,10 @@ class Monitor:
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
         """Robustness of each requirement, before weight and scale; arguments as in `robustness`."""
-        chosen = semantics_of(semantics)
-        ready = self._prepare(signals, ())
-        ready = replace(ready, record=replace(ready.record, semantics=chosen))
-        laid = ready.signals.like_given if at is None else ready.signals.at_one
+        ready = self._prepare(signals, ()).under(semantics_of(semantics))
+        shaped = ready.signals.like_given if at is None else ready.signals.at_one
         rows = _rows(ready, end, at)
-        return {rule.name: laid(row) for rule, row in zip(ready.rules, rows, strict=True)}
+        return {rule.name: shaped(row) for rule, row in zip(ready.rules, rows, strict=True)}
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest robustness of the specification over all continuations of the signals.
@@ -196,12 +191,7 @@ class Monitor:
         Missing samples make the predicates that read them unknown. Shapes as in `robustness`.
         """
         ready = self._prepare(signals, ())
-        ends = []
-        for end in ("lower", "upper"):
-            rows = _rows(ready, end, at)
-            whole = Exact().join(_weighed(ready.rules, rows), "min", ready.signals.ops)
-            ends.append(ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole))
-        return ends[0], ends[1]
+        return _least(ready, "lower", at), _least(ready, "upper", at)
 
     def online(
         self,
@@ -301,15 +291,18 @@ def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
     return rules_at(ready.rules, ready.record, at, ready.horizon, end)
 
 
-def _weighed(rules: Sequence[CompiledRequirement], rows: Sequence[Array]) -> list[Array]:
-    return [
+def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
+    """The least `weight * robustness / scale` over the requirements, in the shape of the signals."""
+    weighed = [
         row if rule.weight == rule.scale else row * (rule.weight / rule.scale)
-        for rule, row in zip(rules, rows, strict=True)
+        for rule, row in zip(ready.rules, _rows(ready, end, at), strict=True)
     ]
+    whole = ready.record.semantics.join(weighed, "min", ready.signals.ops)
+    return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """Traces that the assumptions do not exclude: (traces,)."""
+    """True for traces that the assumptions do not exclude, (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
@@ -330,8 +323,8 @@ def _judge(
     return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
 
 
-def _told(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """The judgement with the robustness of another semantics.
+def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
+    """The judgement with the robustness of the semantics of `ready`.
 
     Where something is unknown, a semantics whose extrema are means keeps only the sign of the exact bounds.
     """
@@ -342,4 +335,4 @@ def _told(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", 
         known = rule_known(judgement.rule, ready.signals.samples, starts, ready.horizon)[:, None]
         low = np.where(known, low, np.where(judgement.low > 0.0, 0.0, -np.inf))
         high = np.where(known, high, np.where(judgement.high < 0.0, 0.0, np.inf))
-    return replace(judgement, told=(low, high))
+    return replace(judgement, reported=(low, high))

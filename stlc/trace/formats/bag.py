@@ -23,7 +23,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.files import is_stored
 from stlc.trace.formats.messages import MAX_BYTES, DamageError, Decode, Log, Room, mapped
 from stlc.trace.formats.registry import damage, needed, unreadable
-from stlc.trace.formats.ros import decoder
+from stlc.trace.formats.ros import Form, decoder
 from stlc.trace.recording import Recording
 
 _MAGIC = b"#ROSBAG V2.0\n"
@@ -46,15 +46,24 @@ def read(path: Path) -> Recording:
     return _read_ros1(path) if path.suffix.lower() == ".bag" and not path.is_dir() else _read_ros2(path)
 
 
-# --------------------------------------------------------------------------------- ROS 1
-
-
 @dataclass(frozen=True, slots=True)
-class _Connection:
-    """A topic, and the decoder of its messages; None where no decoder exists."""
+class _Topic:
+    """A topic, and the decoder of its messages; None where they cannot be decoded."""
 
-    topic: str
+    name: str
     decode: Decode | None
+
+    @staticmethod
+    def of(log: Log, name: str, definition: str, form: Form) -> _Topic:
+        """Return the topic of messages with a definition; the log notes why they cannot be decoded."""
+        try:
+            return _Topic(name, decoder(definition, form))
+        except DamageError as error:
+            log.unread[name] = str(error)
+            return _Topic(name, None)
+
+
+# --------------------------------------------------------------------------------- ROS 1
 
 
 def _read_ros1(path: Path) -> Recording:
@@ -63,16 +72,16 @@ def _read_ros1(path: Path) -> Recording:
     with mapped(path) as data, damage(path):
         if data[: len(_MAGIC)] != _MAGIC:
             raise DamageError("it does not begin like a bag of version 2.0")
-        connections: dict[int, _Connection] = {}
+        topics: dict[int, _Topic] = {}
         room = Room(path, len(data))
         for kind, fields, content in _records(data, len(_MAGIC)):
             if kind == _CHUNK:
                 how, size = fields[b"compression"].decode(), _word(fields[b"size"])
                 inner = room.unpacked(how, content, size)
                 for record in _records(inner, 0):
-                    _take(log, connections, *record)
+                    _take(log, topics, *record)
             else:
-                _take(log, connections, kind, fields, content)
+                _take(log, topics, kind, fields, content)
         return log.recording()
 
 
@@ -108,35 +117,20 @@ def _word(field: bytes) -> int:
     return value
 
 
-def _take(
-    log: Log,
-    connections: dict[int, _Connection],
-    kind: int,
-    fields: dict[bytes, bytes],
-    content: bytes,
-) -> None:
-    """Process a record inside or outside of a chunk."""
+def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, bytes], content: bytes) -> None:
+    """Process a record inside or outside of a chunk; `topics` are those of the connections so far."""
     if kind == _CONNECTION:
         number = _word(fields[b"conn"])
-        if number not in connections:
-            connections[number] = _connection(log, fields[b"topic"].decode(), content)
+        if number not in topics:
+            definition = dict(_fields(content))[b"message_definition"].decode("utf-8", "replace")
+            topics[number] = _Topic.of(log, fields[b"topic"].decode(), definition, "ros1")
     elif kind == _MESSAGE:
-        connection = connections.get(_word(fields[b"conn"]))
-        if connection is None:
+        topic = topics.get(_word(fields[b"conn"]))
+        if topic is None:
             raise DamageError("a message of an unknown connection")
-        if connection.decode is not None:
+        if topic.decode is not None:
             seconds, rest = struct.unpack("<II", fields[b"time"])
-            log.add(connection.topic, seconds * 10**9 + rest, connection.decode(content))
-
-
-def _connection(log: Log, topic: str, content: bytes) -> _Connection:
-    facts = dict(_fields(content))
-    text = facts[b"message_definition"].decode("utf-8", "replace")
-    try:
-        return _Connection(topic, decoder(text, "ros1"))
-    except DamageError as error:
-        log.unread[topic] = str(error)
-        return _Connection(topic, None)
+            log.add(topic.name, seconds * 10**9 + rest, topic.decode(content))
 
 
 # --------------------------------------------------------------------------------- ROS 2
@@ -192,15 +186,15 @@ def _add_database(log: Log, path: Path) -> None:
         topics = _topics(log, database)
         query = "SELECT topic_id, timestamp, data FROM messages"
         for number, time, content in database.execute(query):
-            decode = topics.get(number)
-            if decode is None:
+            topic = topics.get(number)
+            if topic is None or topic.decode is None:
                 continue
             if not isinstance(time, int) or not isinstance(content, bytes):
                 raise DamageError("a message without a time, or without content")
             room.left -= len(content) + 16
             if room.left < 0:
                 raise unreadable(path, "its messages are larger than its file")
-            log.add(decode.topic, time, decode.read(room.whole(content)))
+            log.add(topic.name, time, topic.decode(room.whole(content)))
 
 
 def _opened(path: Path) -> sqlite3.Connection:
@@ -221,29 +215,20 @@ def _opened(path: Path) -> sqlite3.Connection:
     return database
 
 
-@dataclass(frozen=True, slots=True)
-class _Read:
-    """A topic of a database, and the decoder of its messages."""
-
-    topic: str
-    read: Decode
-
-
-def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Read]:
-    """The decoders of topics, by number."""
+def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Topic]:
+    """The topics of a database, by number."""
     texts = _definitions(database)
-    topics: dict[int, _Read] = {}
-    for number, topic, kind, form in database.execute(
-        "SELECT id, name, type, serialization_format FROM topics"
-    ):
+    topics: dict[int, _Topic] = {}
+    query = "SELECT id, name, type, serialization_format FROM topics"
+    for number, name, kind, form in database.execute(query):
         if form != "cdr":
-            log.unread[str(topic)] = f"its messages are written as `{str(form)[:40]}`"
+            log.unread[str(name)] = f"its messages are written as `{str(form)[:40]}`"
             continue
-        try:
-            text = texts.get(kind) or _usual(str(kind))
-            topics[number] = _Read(str(topic), decoder(text, "cdr"))
-        except DamageError as error:
-            log.unread[str(topic)] = str(error)
+        text = texts.get(kind) or _usual(str(kind))
+        if text is None:
+            log.unread[str(name)] = f"`{str(kind)[:60]}` is defined neither in the bag nor by ROS itself"
+        else:
+            topics[number] = _Topic.of(log, str(name), text, "cdr")
     return topics
 
 
@@ -257,14 +242,13 @@ def _definitions(database: sqlite3.Connection) -> dict[str, str]:
     return {str(kind): str(text) for kind, encoding, text in rows if encoding == "ros2msg"}
 
 
-def _usual(kind: str) -> str:
-    """The definition of a message that comes with ROS 2. Raises DamageError where there is none."""
+def _usual(kind: str) -> str | None:
+    """The definition of a message that comes with ROS 2; None where there is none."""
     store = _usual_ones()
     try:
-        text, _ = store.generate_msgdef(kind, ros_version=2)
+        return str(store.generate_msgdef(kind, ros_version=2)[0])
     except Exception:  # the library's error for an unknown name
-        raise DamageError(f"`{kind[:60]}` is defined neither in the bag nor by ROS itself") from None
-    return str(text)
+        return None
 
 
 @cache
