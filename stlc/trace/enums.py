@@ -27,40 +27,37 @@ TRUTH: Words = {
 
 
 def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
-    """The recording with words converted to numbers.
+    """Return the recording with words converted to numbers.
 
     Args:
-        recording: whose arrays may be text.
-        words: name in the file -> the values of its words; empty for a signal that has numbers. Other
-            signals are not needed: those that hold words are set aside.
+        recording: its arrays may be texts.
+        words: name in the file -> number of each word; empty for a signal of numbers. Signals of words that
+            are not in this mapping are moved to the extras.
 
     Raises:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does
             not have.
     """
-    groups = tuple(
-        replace(
-            group,
-            arrays={
-                name: _numbers(recording.name, name, values, words[name]) if _is_odd(values) else values
-                for name, values in group.arrays.items()
-                if name in words or not _is_odd(values)
-            },
-            clock=_seconds(recording.name, group) if _is_odd(group.clock) else group.clock,
-        )
-        for group in recording.groups
-    )
-    aside = {
-        name: values
-        for group in recording.groups
-        for name, values in group.arrays.items()
-        if name not in words and _is_odd(values)
-    }
-    return replace(recording, groups=groups, extras={**recording.extras, **aside})
+    groups: list[ClockGroup] = []
+    extras = dict(recording.extras)
+    for group in recording.groups:
+        arrays = dict(group.arrays)
+        for name in [name for name, values in arrays.items() if _is_odd(values)]:
+            if name in words:
+                arrays[name] = _numbers(recording.name, name, arrays[name], words[name])
+            else:
+                extras[name] = arrays.pop(name)
+        clock = _seconds(recording.name, group) if _is_odd(group.clock) else group.clock
+        groups.append(replace(group, arrays=arrays, clock=clock))
+    return replace(recording, groups=tuple(groups), extras=extras)
 
 
 def wordless(recording: Recording) -> Recording:
-    """The recording with signals of words set aside. Raises TraceError (E603) where all signals are."""
+    """Return the recording with signals of words moved to the extras.
+
+    Raises:
+        TraceError: E603, all signals are words.
+    """
     signals = [values for group in recording.groups for values in group.arrays.values()]
     none_left = all(map(_is_odd, signals))
     return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})

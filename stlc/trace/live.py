@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class SampleStream:
     _signals: dict[str, str] = field(default_factory=dict)
 
     def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
-        """The samples of the lines; empty lines are skipped.
+        """Yield the samples of the lines; empty lines are skipped.
 
         Raises:
             TraceError: E601, a signal or clock that was named is missing; E603, a line that is not a sample,
@@ -105,7 +106,7 @@ class SampleStream:
     # ------------------------------------------------------------------------ names
 
     def _named(self, there: Iterable[str]) -> None:
-        """Find the clock and the signals among the names of the stream."""
+        """Determine the clock and the signals from the names in the stream."""
         known = list(there)
         names = dict(self.reading.names)
         self._clock = names.pop(CLOCK, None) or clock_among(known)
@@ -129,10 +130,10 @@ class SampleStream:
             raise self._bad(number, "has numbers where the columns are named", "E605")
         self._heads = names
         self._named(names)
-        said = dict(zip(names, units, strict=True))
-        self.units = {signal: said[name] for name, signal in self._signals.items()}
+        unit_of = dict(zip(names, units, strict=True))
+        self.units = {signal: unit_of[name] for name, signal in self._signals.items()}
         if self._clock is not None:
-            self._scale = clock_scale(f"the {self.name}", self._clock, said[self._clock])
+            self._scale = clock_scale(f"the {self.name}", self._clock, unit_of[self._clock])
 
     # ------------------------------------------------------------------------ values
 
@@ -154,10 +155,8 @@ class SampleStream:
             raise self._bad(number, "is not a JSON object")
         flat: dict[str, object] = {}
         for name, value in found.items():
-            if isinstance(value, list):
-                flat |= {f"{name}[{i}]": each for i, each in enumerate(value)}
-            else:
-                flat[name] = value
+            many = isinstance(value, list)
+            flat |= {f"{name}[{i}]": each for i, each in enumerate(value)} if many else {name: value}
         if not self._signals:
             self._named(flat)
         elif new := [name for name in flat if name not in self._signals and name != self._clock]:
@@ -166,13 +165,12 @@ class SampleStream:
 
     def _moment(self, values: Mapping[str, object], number: int) -> TimedSample:
         time = None if self._clock is None else self._seconds(values.get(self._clock), number)
-        sample: dict[str, float] = {}
-        for name, signal in self._signals.items():
-            if name in values:
-                value = self._number(signal, values[name], number)
-                if value is not None:
-                    sample[signal] = value
-        return TimedSample(time, sample)
+        found = {
+            signal: self._number(signal, values[name], number)
+            for name, signal in self._signals.items()
+            if name in values
+        }
+        return TimedSample(time, {signal: value for signal, value in found.items() if value is not None})
 
     def _seconds(self, value: object, number: int) -> float:
         found = _plain(value)
@@ -235,10 +233,10 @@ class Uniform:
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
-    """Samples on the grid that `stlc.trace.trace.trace_of` would use, as soon as they are known.
+    """Return samples on the grid that `stlc.trace.trace.trace_of` would use, each as soon as it is known.
 
-    Without a new grid their times have to be uniform. With one (`resample`, or a longest gap) a sample is
-    known when the next one of every signal has arrived, or none within the longest gap.
+    Without a new grid the times have to be uniform. On a new grid (`reading.resample` or `reading.max_gap`) a
+    sample is known when every signal has a later value, or had none for the longest gap.
 
     Raises:
         TraceError: E601, the times of the samples are unknown; E602, times that are not uniform, or that
@@ -253,12 +251,7 @@ def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Unif
     samples = gridded.samples(first, moments)
     head = next(samples, None)
     assert head is not None
-    return Uniform(gridded.t0, gridded.dt, _again(head, samples))
-
-
-def _again(first: Sample, rest: Iterator[Sample]) -> Iterator[Sample]:
-    yield first
-    yield from rest
+    return Uniform(gridded.t0, gridded.dt, chain([head], samples))
 
 
 def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, name: str) -> Uniform:
@@ -266,8 +259,8 @@ def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, n
         require_step(name, dt)
     second = next(rest, None)
     if first.time is None or second is None or second.time is None:
-        begun = [first] if second is None else [first, second]
-        return Uniform(first.time or 0.0, dt, (m.sample for part in (begun, rest) for m in part))
+        moments = chain([first] if second is None else [first, second], rest)
+        return Uniform(first.time or 0.0, dt, (moment.sample for moment in moments))
     step = snapped(second.time - first.time) if dt is None else dt
     if not step > 0:
         message = f"time in the {name} does not increase: {first.time:g} s, {second.time:g} s"
@@ -286,7 +279,7 @@ def _checked(
 ) -> Iterator[Sample]:
     assert first.time is not None
     yield first.sample
-    for number, moment in enumerate(_moments(second, rest), 1):
+    for number, moment in enumerate(chain([second], rest), 1):
         now, wanted = moment.time, first.time + number * step
         if now is None or not abs(now - wanted) <= TOLERANCE * step + _SLACK * abs(wanted):
             found = "no time" if now is None else f"{now:.6g} s"
@@ -295,11 +288,6 @@ def _checked(
                 Diagnostic("E602", message, help=_ways_out(now, wanted, step, measured=measured))
             )
         yield moment.sample
-
-
-def _moments(second: TimedSample, rest: Iterator[TimedSample]) -> Iterator[TimedSample]:
-    yield second
-    yield from rest
 
 
 def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) -> tuple[str, ...]:
@@ -366,7 +354,7 @@ class Gridded:
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
         """The samples on the grid, one by one; the first one comes when the step is known."""
         waiting: list[float] = []
-        for moment in _moments(first, rest):
+        for moment in chain([first], rest):
             now = self._take(moment)
             if self._spacing is None:
                 waiting.append(now)

@@ -6,27 +6,24 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.jsontext import loads
-from stlc.signature import Column, Signature
+from stlc.signature import Column, Kind, Role, Signature
 from stlc.trace.formats.registry import unreadable
 from stlc.units import DIMENSIONLESS, parse_unit
 
-_KINDS: dict[str, tuple[type, ...]] = {
-    "seed": (int,),
-    "horizon": (int,),
-    "dt": (int, float),
-    "origin": (int,),
-    "spec_library": (dict,),
-    "spec_set": (dict,),
-    "judge_library": (dict,),
-    "judge_set": (dict,),
+_TYPES: Mapping[str, tuple[type, ...]] = {
+    "str": (str,),
+    "int | None": (int, NoneType),
+    "float | None": (int, float, NoneType),
+    "Mapping[str, str]": (dict,),
 }
-_TEXTS = ("spec_library", "spec_set", "judge_library", "judge_set")
+"""Declared type of a field of the metadata -> types of its value in JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +107,7 @@ class TraceMeta:
 
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
-    """The metadata in the array `meta` of a trace, and the columns that it describes.
+    """Return the metadata in the array `meta` of a trace, and the columns that it describes.
 
     Raises:
         TraceError: E603, it is not a JSON text of the expected form.
@@ -121,42 +118,33 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
         raise unreadable(path, "`meta` is not a JSON text")
     try:
         written = loads(str(array))
-        return _meta_of(written), _columns_of(written)
+        return _meta_of(written), {n: _column(n, entry) for n, entry in written.get("signals", {}).items()}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise unreadable(path, f"`meta` is damaged ({str(error)[:80]})") from None
 
 
 def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
-    """The inverse of `read_meta`: a 0-d array that holds the JSON text."""
+    """Return metadata and columns as a 0-d array that holds a JSON text, the inverse of `read_meta`."""
     signals = {column.name: _written(column) for column in signature.columns}
     return np.array(json.dumps(asdict(meta) | {"signals": signals}))
 
 
 def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
-    known = {f.name: written[f.name] for f in fields(TraceMeta) if f.name in written}
-    for name, value in known.items():
-        optional = name in _KINDS and value is None and name not in _TEXTS
-        if not optional and (not isinstance(value, _KINDS.get(name, (str,))) or isinstance(value, bool)):
+    known: dict[str, Any] = {}
+    for declared in fields(TraceMeta):
+        if (name := declared.name) not in written:
+            continue
+        value = known[name] = written[name]
+        if not isinstance(value, _TYPES[str(declared.type)]) or isinstance(value, bool):
             raise ValueError(f"`{name}` is {value!r:.40}")
-    for name in _TEXTS:
-        if not all(isinstance(text, str) for text in known.get(name, {}).values()):
+        if isinstance(value, dict) and not all(isinstance(text, str) for text in value.values()):
             raise ValueError(f"`{name}` does not hold texts")
     return TraceMeta(**known)
 
 
-def _columns_of(written: Mapping[str, Any]) -> dict[str, Column]:
-    return {name: _column(name, entry) for name, entry in written.get("signals", {}).items()}
-
-
 def _column(name: str, entry: Mapping[str, Any]) -> Column:
     kind, role = entry.get("kind", "real"), entry.get("role", "state")
-    if kind not in ("real", "int", "bool", "enum") or role not in (
-        "input",
-        "output",
-        "state",
-        "env",
-        "timer",
-    ):
+    if kind not in get_args(Kind) or role not in get_args(Role):
         raise ValueError(f"`{name}` is {kind!r:.20} {role!r:.20}")
     labels = tuple((str(label), float(value)) for label, value in entry.get("labels", {}).items())
     unit = parse_unit(entry["unit"]) if entry.get("unit") else DIMENSIONLESS

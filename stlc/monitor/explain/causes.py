@@ -8,6 +8,7 @@ equal the robustness, one is chosen whose change alone changes the robustness, i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias, assert_never
@@ -61,7 +62,7 @@ class CauseNode:
         parts: causes among its operands; empty for a predicate.
         main: index of the part that decides.
         premise: it is the left side of an implication.
-        moves: its value follows changes of the value that decides; a frozen value may change along.
+        moves: its value changes with the value that decides; False where a frozen value changes, too.
     """
 
     formula: typed.Formula
@@ -139,7 +140,7 @@ class _Tied:
         return {**self.env, name: column}
 
     def coded(self, formula: ir.Formula) -> ir.Formula:
-        """The formula over the columns."""
+        """The formula with its predicates replaced by the columns of their values."""
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
@@ -148,7 +149,7 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """The robustness with a value raised."""
+        """The robustness of a formula at a sample with one value raised, or none."""
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
@@ -175,8 +176,8 @@ class CauseFinder:
     Attributes:
         record: columns of the one trace, (samples, 1), up to `end`.
         grid: of time.
-        cache: lowered formulas, or their negations.
-        known: upper bounds of lowered formulas, with their instants.
+        cache: (formula, wanted) -> the lowered formula, negated where it is not wanted.
+        known: lowered formula -> instants and its upper bounds there.
         tied: predicate values that replace those of the trace, one of them slightly raised.
         stop: final number of samples, where it exceeds the known ones.
     """
@@ -191,10 +192,10 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """The cause of `formula` not being `wanted`, and whether the value at the path's end decides alone.
+        """Return the cause of `formula` not being `wanted`, and whether one predicate value decides alone.
 
-        Where other values equal it, the path leads to one whose change alone changes the robustness, if
-        there is one among the first `MOST_TIED`.
+        Where several predicate values equal the robustness, the main path leads to one whose change alone
+        changes the robustness, if there is one among the first `MOST_TIED`.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)
@@ -240,7 +241,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """The cause of `formula` not being `wanted` at `sample`."""
+        """Return the cause of `formula` not being `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -324,8 +325,8 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """True if the formula is undecided because the trace was cut: its margin has no upper bound."""
-        return bool(np.isposinf(self._margins(formula, wanted, range(sample, sample + 1))[0]))
+        """True if the formula is undecided since the trace ends too early: its margin has no upper bound."""
+        return self._margin(formula, sample, wanted) == math.inf
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
         """Values that an evaluation of an enclosing formula has already stored."""
@@ -336,7 +337,7 @@ class CauseFinder:
         return None
 
     def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> CauseNode:
-        margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])
+        margin = self._margin(formula, sample, wanted)
         return CauseNode(formula, not wanted, sample, margin if wanted else -margin)
 
     def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> CauseNode:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import margin_unit
+from stlc.compile.ir.traverse import margin_unit, operands
 from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
@@ -40,7 +40,7 @@ class SignalValue:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Cause of the violation of one requirement by one trace in one window.
+    """Cause of a violation: one requirement, one trace, one window.
 
     Attributes:
         judgement: of the requirement.
@@ -51,11 +51,11 @@ class Cause:
         predicate: its text.
         span: of the predicate.
         readings: the signals that it reads, at that sample.
-        place: the part of the requirement to underline, and its label.
+        place: the part of the requirement to underline first, and its label.
         labels: the other parts to underline.
-        because: one line in words.
-        tree: the whole explanation.
-        alone: a change of the value that decides, towards the wanted side, raises the robustness.
+        because: the cause in words, on one line.
+        tree: the sub-formulas that explain the violation, down to predicates.
+        alone: raising the margin of `predicate` at `sample` alone raises the robustness.
     """
 
     judgement: Judgement
@@ -83,7 +83,7 @@ MOST = 500
 
 
 def explain(verdict: Verdict, name: str) -> Cause | None:
-    """The cause of a violated requirement; None where it is not violated.
+    """Return the cause of a violated requirement; None where it is not violated.
 
     Raises:
         UsageError: U101, there is no such requirement.
@@ -95,7 +95,7 @@ def explain(verdict: Verdict, name: str) -> Cause | None:
 
 
 def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
-    """The cause of a violation of one requirement by a trace in the window that begins at a sample.
+    """Return the cause of a violation by one trace in the window that begins at sample `start`.
 
     Raises:
         UsageError: U101, there is no such requirement.
@@ -105,7 +105,7 @@ def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
 
 
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
-    """The causes of violated requirements, by name; only the first `MOST`."""
+    """Return the causes of the first `MOST` violated requirements, by name."""
     definitions = _definitions(verdict.subject.compiled.spec)
     violated = [judgement for judgement in verdict if judgement.overall == "violated"]
     return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
@@ -151,16 +151,25 @@ def _cause(
 
 @dataclass(frozen=True, slots=True)
 class _Words:
+    """Wording of causes of one requirement.
+
+    Attributes:
+        subject: the signals.
+        record: the trace, up to the end of the window.
+        written: the requirement as written.
+        definitions: expressions by the names that the specification gives them.
+    """
+
     subject: Prepared
     record: Record
     written: ast.Expr
     definitions: dict[str, ast.Expr]
 
-    def readings(self, blame: CauseNode) -> tuple[SignalValue, ...]:
-        """The signals that the predicates of the tree read, each at the instants where they do."""
+    def readings(self, cause: CauseNode) -> tuple[SignalValue, ...]:
+        """The values that the predicates of a tree read, each signal at each instant once."""
         seen: dict[tuple[str, int], SignalValue] = {}
         read = self.subject.compiled.signature
-        for leaf in blame.leaves:
+        for leaf in cause.leaves:
             for name, later in _in_order(leaf):
                 sample = leaf.sample + later
                 if name not in read or not 0 <= sample < self.record.samples:
@@ -174,23 +183,20 @@ class _Words:
     def labels(self, tree: CauseNode) -> list[Label]:
         """Labels of the parts to underline, the predicate that decides first."""
         found: dict[Span, str] = {}
-        for blame in _told(tree):
-            found.setdefault(self.site(blame.span), self.told(blame))
-        first = self.site(_telling(tree).span)
+        for node in _labelled(tree):
+            found.setdefault(self.site(node.span), self.label(node))
+        first = self.site(_deciding(tree).span)
         spans = sorted(found, key=lambda span: (span != first, span.start))
         return [Label(span, found[span]) for span in spans]
 
-    def told(self, blame: CauseNode) -> str:
-        """The label of an underlined part."""
-        word = "true" if blame.holds else "false"
-        if blame.until is not None:
-            window = f"from {self.subject.moment(blame.sample)} to {self.subject.moment(blame.until)}"
-            return f"{'always' if blame.holds else 'never'} true {window}"
-        moment = self.subject.moment(blame.sample)
-        if not blame.premise:
-            return f"{word} at {moment}"
-        values = ", ".join(reading.text for reading in self.readings(blame))
-        return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
+    def label(self, node: CauseNode) -> str:
+        """The label of an underlined part: its truth and instant, of a premise also the values."""
+        moment = self.subject.moment(node.sample)
+        if node.until is not None:
+            window = f"from {moment} to {self.subject.moment(node.until)}"
+            return f"{'always' if node.holds else 'never'} true {window}"
+        values = ", ".join(reading.text for reading in self.readings(node)) if node.premise else ""
+        return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
 
     def because(self, tree: CauseNode) -> str:
         """The cause in words; where a premise decides, the conclusion is described, too."""
@@ -202,23 +208,19 @@ class _Words:
         return text
 
     def reason(self, tree: CauseNode) -> str:
-        """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
+        """The sentence `before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))
-        text = _flat(leaf.span.text)
+        text = f"`{_flat(leaf.span.text)}`"
         if not values:
-            return f"`{text}` is {truth} whatever the signals are"
-        chain = self.chain(self.written, leaf.span)
-        closest = _closest(tree)
-        if not chain:
-            if closest:
-                return f"`{text}` comes closest at {moment}, where {values}"
-            return f"`{text}` is {truth} where {values}, at {moment}"
-        name = chain[-1].name
-        body = _flat(self.definitions[name].span.text)
-        found = f"comes closest at {moment}, where {values}" if closest else f"{values} at {moment}"
-        return f"{name} means {body}, and {found} (line {leaf.span.line})"
+            return f"{text} is {truth} whatever the signals are"
+        nearest = f"comes closest at {moment}, where {values}" if _closest(tree) else ""
+        if chain := self.chain(self.written, leaf.span):
+            name = chain[-1].name
+            body = _flat(self.definitions[name].span.text)
+            return f"{name} means {body}, and {nearest or f'{values} at {moment}'} (line {leaf.span.line})"
+        return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
         """The part of the requirement that contains `span`, or refers to its definition."""
@@ -246,20 +248,18 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
     )
 
 
-def _told(tree: CauseNode) -> Iterator[CauseNode]:
-    """The nodes that get a label: premises as a whole, windows that never succeed, predicates."""
+def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
+    """The nodes with a label: premises as a whole, bodies of windows without success, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
-        yield replace(tree, formula=_body(tree.formula)) if tree.until is not None else tree
+        yield _body(tree)
         return
     for part in tree.parts:
-        yield from _told(part)
+        yield from _labelled(part)
 
 
-def _telling(tree: CauseNode) -> CauseNode:
+def _deciding(tree: CauseNode) -> CauseNode:
     """The labelled node that decides."""
-    if tree.until is not None:
-        return replace(tree, formula=_body(tree.formula))
-    return _telling(tree.parts[tree.main]) if tree.parts else tree
+    return _body(tree) if tree.until is not None or not tree.parts else _deciding(tree.parts[tree.main])
 
 
 def _closest(tree: CauseNode) -> bool:
@@ -270,17 +270,15 @@ def _closest(tree: CauseNode) -> bool:
     return _closest(part) or (tree.until is not None and not part.parts)
 
 
-def _body(formula: typed.Formula) -> typed.Formula:
-    match formula:
-        case typed.Temporal(body=body):
-            return body
-        case typed.Until(right=right):
-            return right
-    return formula
+def _body(node: CauseNode) -> CauseNode:
+    """The node of a window without success with its formula replaced by the body of the window."""
+    if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
+        return replace(node, formula=operands(node.formula)[-1])
+    return node
 
 
 def shown(value: float, column: Column) -> str:
-    """A value as text: the label of an enum, a number with its unit."""
+    """Return a value as text: the label of an enum member, else the number with its unit."""
     for label, number in column.labels:
         if number == value:
             return label
@@ -288,7 +286,7 @@ def shown(value: float, column: Column) -> str:
 
 
 def names_in(expr: object) -> Iterator[ast.Name]:
-    """All names in an expression, from left to right."""
+    """Yield all names in an expression, from left to right."""
     if isinstance(expr, ast.Name):
         yield expr
     elif isinstance(expr, tuple):

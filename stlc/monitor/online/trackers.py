@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -12,6 +13,7 @@ import numpy as np
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach, uses_end
+from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
@@ -19,7 +21,15 @@ from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
 from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, End, Side, shareable
 from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, span
-from stlc.monitor.online.streams import ColumnPlan, EndlessError, RecursiveColumn, endless, looks_on, plan
+from stlc.monitor.online.streams import (
+    ColumnPlan,
+    EndlessError,
+    PredicateColumn,
+    RecursiveColumn,
+    endless,
+    looks_on,
+    plan,
+)
 from stlc.monitor.online.unbounded import UnboundedOperators, UnboundedState, skeleton
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, by_truth, window_bounds
@@ -28,33 +38,37 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """The formula for one bound; with a `window`, an early end of the trace is unknown or cuts."""
+    """Return the formula whose value is a bound of `formula` wherever the trace ends.
+
+    With a `window` all instants up to its end exist, unless the end of the trace cuts windows.
+    """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """The sides of both bounds, and where the end of the trace cuts windows both of the cut formula."""
-    going_on: list[End] = ["lower", "upper"]
-    sides = [Side(plans[end], end, beyond, options.truth, least=end == "lower") for end in going_on]
-    if options.ending == "open":
-        return sides
-    return sides + [
-        Side(plans["truncate"], "truncate", 0, options.truth, least=least) for least in (True, False)
+    """Return the sides of the least and the greatest value; for cut windows also those of the cut formula."""
+    sides = [
+        Side(plans["lower"], "lower", beyond, options.truth),
+        Side(plans["upper"], "upper", beyond, options.truth, least=False),
     ]
+    if options.ending == "truncate":
+        cut = plans["truncate"]
+        sides += [Side(cut, "truncate", 0, options.truth, least=least) for least in (True, False)]
+    return sides
 
 
 def first_needed(planned: ColumnPlan, samples: int) -> int:
-    """The first sample whose signals a column still reads."""
-    reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
-    return max(min(reads, default=samples), 0)
+    """Return the first sample whose signals a column still reads."""
+    predicates = [stream for stream in planned.streams if isinstance(stream, PredicateColumn)]
+    return max(min((samples - each.ahead - each.back for each in predicates), default=samples), 0)
 
 
 # ----------------------------------------------------------------------------- in common
 
 
 class _CutTracker(ABC):
-    """Tracker with exact settled values where windows are cut, and bounds at all other instants."""
+    """Tracker of bounds at any instants, and of values at settled instants where windows are cut."""
 
     __slots__ = ()
 
@@ -70,14 +84,14 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Bounds at settled instants, with windows cut to the trace."""
+        """Return bounds at settled instants, with windows cut to the trace."""
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, with everything outside of the trace unknown."""
+        """Return bounds at any instants, with everything outside of the trace unknown."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations.
+        """Return bounds over all continuations.
 
         Where windows are cut, samples before the first one count as false, not as unknown.
         """
@@ -88,7 +102,7 @@ class _CutTracker(ABC):
         return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace."""
+        """Return bounds at the end of the trace."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -115,19 +129,16 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def cuts(self) -> bool:
-        """True if the end of the trace cuts windows."""
         return self.options.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
-        """Bounds at settled instants, with windows cut to the trace."""
         return Bounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
 
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, with everything outside of the trace unknown."""
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Forget instants before `start`."""
+        """Drop instants before `start`."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
@@ -170,13 +181,9 @@ class BoundedTracker(_ColumnTracker):
         self.samples = samples
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace."""
-        sides = self._sides
-        self._sides = [side.over() for side in sides]
-        try:
-            return _CutTracker.ended(self, starts)
-        finally:
-            self._sides = sides
+        last = copy(self)
+        last._sides = [side.over() for side in self._sides]
+        return _CutTracker.ended(last, starts)
 
     def _values(self, which: int, start: int, stop: int) -> Floats:
         if stop <= start:
@@ -321,7 +328,6 @@ class PlanningWindowTracker(_ColumnTracker):
                 self._kept.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
 
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, with everything outside of the trace unknown."""
         if not self._beyond:
             return _ColumnTracker.either(self, start, stop)
         middle = min(max(self.settled, start), stop)
@@ -331,7 +337,6 @@ class PlanningWindowTracker(_ColumnTracker):
         )
 
     def drop(self, start: int) -> int:
-        """Forget instants before `start`."""
         del self._kept[: start - self._first]
         self._first = start
         return _ColumnTracker.drop(self, start)
@@ -462,15 +467,12 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def cuts(self) -> bool:
-        """True if the end of the trace cuts windows."""
         return self.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
-        """Bounds at settled instants, with windows cut to the trace."""
         return self.ended(starts)
 
     def either(self, start: int, stop: int) -> Bounds:
-        """Bounds at any instants, with everything outside of the trace unknown."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         starts = range(start, stop)
@@ -478,7 +480,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Least and greatest values, wherever the traces end: (instants, traces) each."""
+        """Return least and greatest values, wherever the traces end: (instants, traces) each."""
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
@@ -486,10 +488,7 @@ class RecomputeTracker(_CutTracker):
                 self._long = self.samples, lengthened(lower, self.samples), lengthened(upper, self.samples)
             least, most = self._long[1:]
             if record.holes:
-                least, most = (
-                    unsure(least, record.holes, least=True),
-                    unsure(most, record.holes, least=False),
-                )
+                least, most = unsure(least, record.holes, least=True), unsure(most, record.holes, least=False)
             low = record.values([least], starts, "lower", FAR)[0]
             high = record.values([most], starts, "upper", FAR)[0]
             return np.asarray(low), np.asarray(high)
@@ -523,7 +522,7 @@ class Trackers:
     _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
 
     def of(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """The tracker of a requirement that needs the least memory.
+        """Return the tracker of a requirement that needs the least memory.
 
         Args:
             rule: the requirement.
@@ -533,13 +532,12 @@ class Trackers:
         Raises:
             UsageError: E313, the work that instants do not share is too large.
         """
-        alone = Trackers(self.horizon)
-        tried = alone.plain(rule, options, everywhere=everywhere)
-        window = tried.window if isinstance(tried, PlanningWindowTracker) else None
 
         def make(part: CompiledRequirement) -> Tracker:
             return Trackers(self.horizon).plain(part, options, everywhere=everywhere)
 
+        tried = make(rule)
+        window = tried.window if isinstance(tried, PlanningWindowTracker) else None
         paced = PacedTracker(rule, make, everywhere, isinstance(tried, RecomputeTracker), window)
         found = paced.effort(rule.formula, sum(span(rule.formula)) + (window or 0))
         if found.own > MOST:
@@ -549,7 +547,7 @@ class Trackers:
         return self.plain(rule, options, everywhere=everywhere)
 
     def plain(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """The tracker that evaluates a requirement after every sample."""
+        """Return the tracker that evaluates a requirement after every sample."""
         formula, window = rule.formula, window_of(rule, self.horizon)
         if window is not None and (bounded := without_end(formula, window)) is not None:
             formula, window = bounded, None
@@ -576,22 +574,19 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """The formula with `end` at a fixed number of samples after its instant; None if there is none.
+    """Return the formula with `end` at a fixed number of samples after its instant; None if there is none.
 
-    That is so where `end` stands under another window, in segments that would leave it (`sweep`), or where
-    bounded windows reach beyond `end`.
+    There is none where `end` stands under another window, in segments that would extend beyond `end`
+    (`sweep`), or where bounded windows extend beyond it.
     """
     moved = _ended(formula, window)
-    if moved is None or endless(moved) or uses_end(moved) or reach(moved).future > window:
-        return None
-    return moved
+    return None if endless(moved) or uses_end(moved) or reach(moved).future > window else moved
 
 
-def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
+def _ended(formula: ir.Formula, window: int) -> ir.Formula:
     match formula:
-        case ir.BoolOp(items=items):
-            found = [_ended(item, window) for item in items]
-            return None if None in found else replace(formula, items=tuple(each for each in found if each))
+        case ir.BoolOp():
+            return map_children(formula, formulas=lambda item: _ended(item, window))
         case ir.Temporal(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
             return replace(formula, window=ir.Window(lo, window))
         case _:

@@ -79,7 +79,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 
 
 def read_csv(path: Path) -> Table:
-    """The columns of a `.csv` file (comma, semicolon or tab; UTF-8); those of words are texts.
+    """Return the columns of a `.csv` file (comma, semicolon or tab; UTF-8); columns of words are texts.
 
     Between semicolons or tabs numbers may have decimal commas.
 
@@ -91,7 +91,7 @@ def read_csv(path: Path) -> Table:
 
 
 def table_of_text(path: Path, data: bytes) -> Table:
-    """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
+    """Return the columns of the text of a file; `path` is for messages. Raises TraceError as `read_csv`."""
     if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
         return table
     sheet = _sheet(path, data)
@@ -150,10 +150,11 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     findings: list[Diagnostic] = []
     units: dict[str, str] = {}
     names: list[str] = []
-    for text, span in _head_cells(sheet):
-        bare = text.removeprefix("#").strip() if not names else text  # np.savetxt begins a header with it
-        name, unit = split_head(bare)
-        if not _HEAD.fullmatch(bare):
+    for raw, span in _placed(sheet.source, sheet.header_at, _raw_heads(sheet.header, sheet.delimiter)):
+        text = _head(raw)
+        plain = text.removeprefix("#").strip() if not names else text  # np.savetxt begins a header with it
+        name, unit = split_head(plain)
+        if not _HEAD.fullmatch(plain):
             shown = f"`{text}` is not the name of a column" if text else "a column without a name"
             findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
         elif name in units:
@@ -190,14 +191,6 @@ def _head(raw: str) -> str:
     return from_spreadsheet(text.replace('""', '"') if _QUOTED.fullmatch(raw.strip()) else text)
 
 
-def _head_cells(sheet: _Sheet) -> Iterator[tuple[str, Span]]:
-    start = sheet.header_at
-    for raw in _raw_heads(sheet.header, sheet.delimiter):
-        at = start + (len(raw) - len(raw.lstrip()))
-        yield _head(raw), sheet.source.span(at, max(at + len(raw.strip()), at + 1))
-        start += len(raw) + 1
-
-
 def split_head(text: str) -> tuple[str, str]:
     """Name and unit of a header cell, `v [km/h]` or `v (km/h)`; other forms are a name as a whole."""
     match = _HEAD.fullmatch(text.strip())
@@ -209,11 +202,11 @@ def split_head(text: str) -> tuple[str, str]:
     return match["name"], (match["unit"] or "").strip()
 
 
-def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
-    """The cells of a line without blanks and quotes, with their places."""
-    for raw in line.split(delimiter):
+def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[str, Span]]:
+    """The cells of a line as written, with their places; `start` is the place of the line."""
+    for raw in cells:
         at = start + (len(raw) - len(raw.lstrip()))
-        yield bare(raw), source.span(at, max(at + len(raw.strip()), at + 1))
+        yield raw, source.span(at, max(at + len(raw.strip()), at + 1))
         start += len(raw) + 1
 
 
@@ -258,7 +251,7 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
         return None
     numbers = [i for i in range(width) if i not in texts]
     values = load(body, sheet.delimiter, numbers if texts else None)
-    words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _told(line, sheet)]
+    words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _filled(line, sheet)]
     if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
@@ -266,7 +259,7 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
     return [columns[i] for i in range(width)]
 
 
-def _told(line: str, sheet: _Sheet) -> bool:
+def _filled(line: str, sheet: _Sheet) -> bool:
     """True if any cell of a line is filled."""
     return bool(line.strip(f" \t{sheet.delimiter}"))
 
@@ -277,8 +270,9 @@ def _read_strict(
     """The lines of a block cell by cell, with the place of every error."""
     rows: list[list[float | str]] = []
     for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
-        if _told(line, sheet):
-            cells = list(_cells(sheet.source, start, line, sheet.delimiter))
+        if _filled(line, sheet):
+            placed = _placed(sheet.source, start, line.split(sheet.delimiter))
+            cells = [(bare(raw), span) for raw, span in placed]
             rows.append(_read_row(sheet, cells, width, texts, findings))
         start += len(line) + 1
         if len(findings) >= _MAX_FINDINGS:

@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ class _Element:
 
 
 def read_mat5(path: Path) -> dict[str, Array]:
-    """Numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are `s.field`.
+    """Return numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are `s.field`.
 
     An array is complex where an imaginary part is not 0.
 
@@ -111,12 +112,10 @@ class _Matrix:
 
 
 def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
-    """Name and content of a matrix element; an empty one is an empty array."""
-    parts = []
-    for part in _elements(data, order):
-        parts.append(part)
-        if len(parts) > MAX_ARRAYS:
-            raise _DamageError("too many parts")
+    """Name and content of a matrix element; an element without parts is an empty array."""
+    parts = list(islice(_elements(data, order), MAX_ARRAYS + 1))
+    if len(parts) > MAX_ARRAYS:
+        raise _DamageError("too many parts")
     if not parts:
         return "", _Matrix(6, False, False, (0,), ())
     if len(parts) < 3 or len(parts[0].data) < 8:

@@ -33,7 +33,7 @@ DEEPEST = 12
 STAMPS = ({"sec", "nanosec"}, {"secs", "nsecs"}, {"sec", "nsec"}, {"seconds", "nanos"})
 """Field names of a time stamp in the message languages."""
 HEADER = "header"
-"""The field whose stamps are used for the clock only."""
+"""The field that is no signal: its time stamp repeats the clock."""
 
 _ROOM = 64_000_000
 _RATIO = 50
@@ -44,7 +44,13 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True, slots=True)
 class MessageNumber:
-    """One number of a message: its path, value, and whether it is an integer or a truth value."""
+    """A number in a message.
+
+    Attributes:
+        name: its path in the message, `twist.linear.x`.
+        value: the number.
+        whole: it is an integer or a truth value.
+    """
 
     name: str
     value: float
@@ -52,7 +58,7 @@ class MessageNumber:
 
 
 Decode = Callable[[bytes], Iterable[MessageNumber]]
-"""A message as bytes -> its numbers; names are relative to the topic, "" is the topic itself."""
+"""Function from the bytes of a message to its numbers; the name "" stands for the topic itself."""
 
 
 class DamageError(Exception):
@@ -66,7 +72,7 @@ class _Topic:
     whole: set[str] = field(default_factory=set)
 
     def arrays(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Times in ns, in order, and the signals that are in every message."""
+        """Increasing times in ns, and the signals that occur in every message, as arrays (messages,)."""
         times = np.array(self.times, dtype=np.int64)
         kept = {n: np.array(x, dtype=np.float64) for n, x in self.values.items() if len(x) == len(times)}
         if (np.diff(times) < 0).any():

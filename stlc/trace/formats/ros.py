@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,18 +19,9 @@ from stlc.trace.formats.messages import DEEPEST, HEADER, LONGEST, STAMPS, Damage
 
 Form = Literal["ros1", "cdr"]
 
-_CODES = {
-    **{"bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
-    **{
-        "int32": "i",
-        "uint32": "I",
-        "int64": "q",
-        "uint64": "Q",
-        "float32": "f",
-        "float64": "d",
-        "octet": "B",
-    },
-}
+_TYPES = "bool byte char octet int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
+_CODES = dict(zip(_TYPES.split(), "?BBBbBhHiIqQfd", strict=True))
+"""Plain type of a field -> its code in `struct`."""
 _STAMPS = {"time": "II", "duration": "ii"}
 _TEXTS = ("string", "wstring")
 _SECTION = re.compile(r"^={3,}[ \t]*\n(?:MSG: ?)", re.MULTILINE)
@@ -99,7 +91,7 @@ class _Builder:
     def layout(self, text: str, package: str, depth: int) -> _Layout:
         if depth > _MAX_NESTED:
             raise DamageError("a definition that contains itself, or is nested too deeply")
-        fields = tuple(self.field(line, package, depth) for line in text.split("\n") if _tells(line))
+        fields = tuple(self.field(line, package, depth) for line in text.split("\n") if _declares(line))
         least = sum(self.least(each) for each in fields)
         return _Layout(fields, max(least, 1) if self.form == "cdr" else least)
 
@@ -138,11 +130,11 @@ class _Builder:
         return many * struct.calcsize("<" + (_CODES.get(each.kind) or _STAMPS[each.kind]))
 
 
-def _tells(line: str) -> bool:
+def _declares(line: str) -> bool:
     """True if a line declares a field, not a constant or a comment."""
-    told = line.split("#")[0]
-    match = _FIELD.fullmatch(told.rstrip())
-    return bool(told.strip()) and (match is None or not match["rest"].startswith("="))
+    text = line.split("#")[0].rstrip()
+    match = _FIELD.fullmatch(text)
+    return bool(text) and (match is None or not match["rest"].startswith("="))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +162,14 @@ class Decoder:
         return cursor.fields("", self.layout, 0)
 
 
+def _kept(numbers: Iterator[MessageNumber], wanted: bool) -> Iterable[MessageNumber]:
+    """The numbers, or none where they are not wanted: then all are read, to move the position past them."""
+    if wanted:
+        return numbers
+    deque(numbers, maxlen=0)
+    return ()
+
+
 class _Cursor:
     """A position in a message."""
 
@@ -183,12 +183,7 @@ class _Cursor:
             self.at += layout.least  # a message without fields takes a byte in CDR
         for each in layout.fields:
             inner = f"{name}.{each.name}" if name else each.name
-            found = self.field(inner, each, depth)
-            if each.name == HEADER:
-                for _ in found:
-                    pass
-            else:
-                yield from found
+            yield from _kept(self.field(inner, each, depth), each.name != HEADER)
 
     def field(self, name: str, each: _Field, depth: int) -> Iterator[MessageNumber]:
         if each.count is None:
@@ -197,30 +192,25 @@ class _Cursor:
         count = each.count
         if count < 0:
             (count,) = self.take("I")
-        told = count <= LONGEST
+        wanted = count <= LONGEST
         if each.inner is None and each.kind in _CODES:
-            yield from self.numbers(name, each.kind, count, told=told)
+            yield from self.numbers(name, each.kind, count, wanted=wanted)
             return
         if each.inner is not None and each.inner.least * count > len(self.data) - self.at:
             raise DamageError("an array that is longer than its message")
         if each.inner is not None and not each.inner.least:
             return
         for i in range(count):
-            found = self.value(f"{name}[{i}]", each, depth + 1)
-            if told:
-                yield from found
-            else:
-                for _ in found:
-                    pass
+            yield from _kept(self.value(f"{name}[{i}]", each, depth + 1), wanted)
 
-    def numbers(self, name: str, kind: str, count: int, *, told: bool) -> Iterator[MessageNumber]:
+    def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
         """The numbers of an array; long arrays are data and are skipped."""
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
             self.align(size)
         if count * size > len(self.data) - self.at:
             raise DamageError("an array that is longer than its message")
-        if told:
+        if wanted:
             values = struct.unpack_from(f"{self.order}{count}{_CODES[kind]}", self.data, self.at)
             whole = not kind.startswith("float")
             for i, value in enumerate(values):
@@ -231,11 +221,8 @@ class _Cursor:
         if each.inner is not None:
             if each.inner.stamp:
                 yield self.stamp(name, each.inner)
-            elif depth > DEEPEST:
-                for _ in self.fields(name, each.inner, depth + 1):
-                    pass
             else:
-                yield from self.fields(name, each.inner, depth + 1)
+                yield from _kept(self.fields(name, each.inner, depth + 1), depth <= DEEPEST)
         elif each.kind in _TEXTS:
             self.text(each.kind)
         elif each.kind in _CODES:
