@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
@@ -20,23 +21,27 @@ from stlc.source import Source, Span
 from stlc.trace import Trace, load_trace
 from stlc.view.held_out import HeldOut, load_held_out
 
+T = TypeVar("T")
 Record = Mapping[str, Any]
+
+TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")
 
 
 @dataclass(frozen=True, slots=True)
 class RunContents:
-    """The parts of one run.
+    """The parts of one run's folder; what is missing or unreadable is None or empty.
 
     Attributes:
-        run: its folder.
-        record: of `run.json`.
-        rows: of `train.jsonl`.
+        run: folder of the run.
+        record: content of `run.json`.
+        rows: lines of `train.jsonl`.
         requirements: name -> declaration, parsed from the run's specification.
-        texts: `spec.stl`, `system.yaml`, `compiled.txt`, `config.resolved.yaml`, if present.
+        outside: whether the specification uses external functions of its system.
+        texts: file name -> text, for those of `TEXTS` that exist.
         signature: of the system, for units and labels.
-        held_out: starts and robustness of their plans.
-        simulation: of `eval/simulate.json`.
-        units: requirement -> the unit of its robustness, where it has one.
+        held_out: held-out starts and the robustness of their plans.
+        simulation: content of `eval/simulate.json`.
+        units: requirement -> unit of its robustness; without requirements that have none.
         usual: default numbers of agents and steps of the system, under the deployment's scenario.
         trace: the recorded deployment.
     """
@@ -45,6 +50,7 @@ class RunContents:
     record: Record
     rows: Sequence[Record]
     requirements: Mapping[str, ast.Require]
+    outside: bool
     texts: Mapping[str, str]
     signature: Signature | None
     held_out: HeldOut | None
@@ -60,11 +66,6 @@ class RunContents:
         return result if isinstance(result, Mapping) else {}
 
     @property
-    def outside(self) -> bool:
-        """True if the specification uses external functions of its system."""
-        return any(isinstance(item, ast.Extern) for item in _items(self.texts.get("spec.stl", "")))
-
-    @property
     def spec(self) -> str:
         """Name of the specification."""
         return str(self.record.get("spec", "specification"))
@@ -76,21 +77,39 @@ def read_contents(run: RunDir) -> RunContents:
     Raises:
         RunError: R101, the folder is no run.
     """
-    decl, simulation = _decl(run), _simulation(run)
-    texts = {name: text for name in TEXTS if (text := _text(run, name))}
+    decl = readable(lambda: load_system_decl(run.path / "system.yaml"))
+    simulation = readable(lambda: run.read_json(SIMULATION))
+    simulation = simulation if isinstance(simulation, Mapping) else None
+    paths = {name: run.path / name for name in TEXTS}
+    read = {
+        name: readable(partial(path.read_text, encoding="utf-8", errors="replace"))
+        for name, path in paths.items()
+    }
+    spec = readable(lambda: parse(Source("spec.stl", read["spec.stl"] or "")))
+    scenario = (simulation or {}).get("scenario")
+    deployed = decl if decl is None or scenario is None else readable(lambda: under(decl, str(scenario)))
     return RunContents(
         run=run,
         record=run.record(),
         rows=run.rows(),
-        requirements=_requirements(texts.get("spec.stl", "")),
-        texts=texts,
+        requirements={} if spec is None else {i.name: i for i in spec.items if isinstance(i, ast.Require)},
+        outside=spec is not None and any(isinstance(item, ast.Extern) for item in spec.items),
+        texts={name: text for name, text in read.items() if text},
         signature=None if decl is None else decl.signature,
         held_out=load_held_out(run.path / "eval/held_out.npz"),
         simulation=simulation,
-        units={} if decl is None else _units(texts.get("spec.stl", ""), decl),
-        usual={} if decl is None else _usual(decl, (simulation or {}).get("scenario")),
-        trace=_trace(run),
+        units={} if decl is None or spec is None else readable(lambda: _units(spec, decl)) or {},
+        usual={} if deployed is None else {"agents": deployed.test.agents, "steps": deployed.test.steps},
+        trace=readable(lambda: load_trace(run.path / TRACE)),
     )
+
+
+def readable(read: Callable[[], T]) -> T | None:
+    """The result of `read`, or None if the file is missing, damaged or invalid."""
+    try:
+        return read()
+    except (OSError, StlcError):
+        return None
 
 
 def untagged(declared: ast.Require) -> Span:
@@ -102,64 +121,6 @@ def untagged(declared: ast.Require) -> Span:
     return Span(declared.span.source, start, declared.span.end)
 
 
-TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")
-
-
-def _text(run: RunDir, name: str) -> str:
-    try:
-        return (run.path / name).read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
-
-
-def _requirements(text: str) -> dict[str, ast.Require]:
-    return {item.name: item for item in _items(text) if isinstance(item, ast.Require)}
-
-
-def _items(text: str) -> tuple[ast.Item, ...]:
-    try:
-        return tuple(parse(Source("spec.stl", text)).items)
-    except StlcError:
-        return ()
-
-
-def _decl(run: RunDir) -> SystemDecl | None:
-    try:
-        return load_system_decl(run.path / "system.yaml")
-    except StlcError:
-        return None
-
-
-def _units(text: str, decl: SystemDecl) -> dict[str, str]:
-    try:
-        monitor = Monitor(parse(Source("spec.stl", text)), dt=decl.dt, horizon=decl.horizon * decl.dt)
-        rules = monitor.compiled.requirements
-    except StlcError:
-        return {}
+def _units(spec: ast.Spec, decl: SystemDecl) -> dict[str, str]:
+    rules = Monitor(spec, dt=decl.dt, horizon=decl.horizon * decl.dt).compiled.requirements
     return {rule.name: unit for rule in rules if (unit := margin_unit(rule.typed.formula))}
-
-
-def _usual(decl: SystemDecl, scenario: object) -> Record:
-    try:
-        test = (decl if scenario is None else under(decl, str(scenario))).test
-    except StlcError:
-        return {}
-    return {"agents": test.agents, "steps": test.steps}
-
-
-def _simulation(run: RunDir) -> Record | None:
-    try:
-        found = run.read_json(SIMULATION)
-    except StlcError:
-        return None
-    return found if isinstance(found, Mapping) else None
-
-
-def _trace(run: RunDir) -> Trace | None:
-    path = run.path / TRACE
-    if not path.exists():
-        return None
-    try:
-        return load_trace(path)
-    except StlcError:
-        return None

@@ -1,8 +1,8 @@
-"""The animation at the head of the report: playback, scrubbing, and jumps to violations.
+"""Interactive animation at the head of the report: playback, scrubbing, and jumps to violations.
 
 Without scripts the page shows a still. The animation is stored as drawing commands
-(`stlc.view.vector`), not as pixels: it is sharp at every width and follows the reader's light or dark scheme;
-`player.js` replays it.
+(`stlc.view.vector`), not as pixels: the picture is sharp at every width and follows the reader's light or
+dark scheme; `player.js` replays the commands.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import script_json
@@ -25,7 +23,7 @@ from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_by
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
 from stlc.view.run_animation import STILL, RunPanel, animation_name, animation_of, current, run_panels
-from stlc.view.signals import Strip, finite, margin_limits, margin_text
+from stlc.view.signals import Floats, Strip, constant_ranges, finite, margin_limits, margin_text
 from stlc.view.style import SCENES_ON_DARK
 from stlc.view.verdicts import Event
 from stlc.view.words import count, labelled
@@ -40,7 +38,7 @@ _WIDE, _HIGH = 1000, 40  # of a track
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """A strip chart of the page: its name, its curve, and its value at every frame."""
+    """A strip chart of the page: name, curve, and value at every frame."""
 
     name: str
     curve: Html
@@ -87,12 +85,12 @@ def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], co
                 attrs={
                     "role": "img",
                     "aria-label": panel.alt,
-                    "width": str(animation.width),
-                    "height": str(animation.height),
+                    "width": f"{one.width}",
+                    "height": f"{one.height}",
                 },
             ),
         )
-        for panel, animation in zip(panels, animations, strict=True)
+        for panel, one in zip(panels, animations, strict=True)
     ]
     wide = " wide" if len(panels) > 1 and animations[0].width > 2 * animations[0].height else ""
     kind = f"panels{wide}" if len(panels) > 1 else "panels one"
@@ -114,21 +112,14 @@ def _still(contents: RunContents) -> Html | None:
 
 
 def _controls(frames: int) -> Html:
-    slide = {
-        "type": "range",
-        "min": "0",
-        "max": str(frames - 1),
-        "step": "1",
-        "value": "0",
-        "aria-label": "time",
-    }
+    slide = {"type": "range", "min": "0", "max": str(frames - 1), "step": "1", "value": "0"}
     return classed(
         "div",
         "controls",
         el("button", "Play", attrs={"class": "play", "type": "button"}),
         el("button", "-1", attrs={"type": "button", "data-step": "-1", "aria-label": "one step back"}),
         el("button", "+1", attrs={"type": "button", "data-step": "1", "aria-label": "one step on"}),
-        el("input", attrs=slide),
+        el("input", attrs={**slide, "aria-label": "time"}),
         el("output", "0 s"),
     )
 
@@ -136,16 +127,11 @@ def _controls(frames: int) -> Html:
 def _keys(panels: Sequence[RunPanel]) -> Html:
     """The legend of all runs."""
     keys = {key.word: key for panel in panels for key in panel.keys}
-    swatches = [
-        classed(
-            "span",
-            "whole",
-            el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)}),
-            key.word,
-        )
-        for key in keys.values()
-    ]
-    return classed("p", "keys", swatches)
+    swatches = {
+        word: el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)})
+        for word, key in keys.items()
+    }
+    return classed("p", "keys", [classed("span", "whole", swatch, word) for word, swatch in swatches.items()])
 
 
 def _inks(color: str) -> str:
@@ -155,14 +141,13 @@ def _inks(color: str) -> str:
 
 def _files(contents: RunContents) -> Html | None:
     """The animation as files beside the page."""
-    name = animation_name(contents.run)
-    there = [
-        f"{name}{suffix}" for suffix in (".gif", ".mp4") if (contents.run.path / f"{name}{suffix}").exists()
+    names = [f"{animation_name(contents.run)}{suffix}" for suffix in (".gif", ".mp4")]
+    links = [
+        join(el("a", name, attrs={"href": name}), " ")
+        for name in names
+        if (contents.run.path / name).exists()
     ]
-    if not there:
-        return None
-    links = [join(el("a", path, attrs={"href": path}), " ") for path in there]
-    return classed("p", "quiet", "The same as a file: ", links)
+    return classed("p", "quiet", "The same as a file: ", links) if links else None
 
 
 # ------------------------------------------------------------------------------ tracks
@@ -171,7 +156,7 @@ def _files(contents: RunContents) -> Html | None:
 def _columns(panels: Sequence[RunPanel], tracks: Sequence[Sequence[_Track]]) -> Html:
     columns = []
     for panel, own in zip(panels, tracks, strict=True):
-        if not own:
+        if panel.strip is None or not own:
             continue
         rows = [
             classed(
@@ -183,54 +168,43 @@ def _columns(panels: Sequence[RunPanel], tracks: Sequence[Sequence[_Track]]) -> 
             )
             for track in own
         ]
-        times = panel.strip.times if panel.strip is not None else np.zeros(1)
-        foot = classed("div", "track axis", el("span"), classed("div", "ends", _ends(times)), el("span"))
-        words = f"{panel.strip.words}, red where violated" if panel.strip is not None else ""
-        words = f"{panel.title}: {words}" if panel.title else words
-        columns.append(classed("div", "tracks", classed("p", "quiet", words), rows, foot))
+        ends = [el("span", f"{time:g} s") for time in panel.strip.times[[0, -1]]]
+        foot = classed("div", "track axis", el("span"), classed("div", "ends", ends), el("span"))
+        words = f"{panel.title}: " if panel.title else ""
+        heading = classed("p", "quiet", f"{words}{panel.strip.words}, red where violated")
+        columns.append(classed("div", "tracks", heading, rows, foot))
     return classed("div", "columns", columns)
-
-
-def _ends(times: NDArray[np.float64]) -> list[Html]:
-    return [el("span", f"{times[0]:g} s"), el("span", f"{times[-1]:g} s")]
 
 
 def _tracks(panel: RunPanel, shown: range) -> list[_Track]:
     strip = panel.strip
     if strip is None:
         return []
-    rows = [_acted(strip, shown)] if strip.acted.any() else []
+    rows = [_interventions(strip, shown)] if strip.acted.any() else []
     return rows + [_margin(strip, name, shown) for name in strip.rows]
 
 
-def _acted(strip: Strip, shown: range) -> _Track:
+def _interventions(strip: Strip, shown: range) -> _Track:
     assert strip.decisions is not None
-    agents = strip.decisions.shape[1]
-    top = max(int(strip.acted.max()), 1)
     areas = [
-        _path(_area(strip.times, _up(low, top), _up(high, top)), "acted", style=_inks(color))
+        _path(_area(strip.times, low, high, (0, strip.acted.max())), "acted", style=_inks(color))
         for color, low, high in strip.stacked()
     ]
+    agents = strip.decisions.shape[1]
     values: list[str | None] = [f"{int(strip.acted[index])} of {agents}" for index in shown]
     return _Track("guard acted", _svg(areas), values)
 
 
 def _margin(strip: Strip, name: str, shown: range) -> _Track:
     rho, unit = finite(strip.margins[name]), strip.units.get(name, "")
-    low, high = margin_limits(rho)
-    fails = rho < -TOLERANCE
-
-    def up(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return _up(np.clip(values, low, high) - low, high - low)
-
-    zero = up(np.zeros(len(rho)))
+    limits, fails, zero = margin_limits(rho), rho < -TOLERANCE, np.zeros(len(rho))
     good, bad = np.where(fails, np.nan, rho), np.where(fails, rho, np.nan)
     parts = [
-        _path(f"M0 {zero[0]:.1f}H{_WIDE}", "zero"),
-        _path(_area(strip.times, zero, up(good)), "spare"),
-        _path(_area(strip.times, zero, up(bad)), "lost"),
-        _path(_line(strip.times, up(rho)), "line"),
-        _path(_line(strip.times, up(bad)), "line lost"),
+        _path(f"M0 {_up(zero, limits)[0]:.1f}H{_WIDE}", "zero"),
+        _path(_area(strip.times, zero, good, limits), "spare"),
+        _path(_area(strip.times, zero, bad, limits), "lost"),
+        _path(_line(strip.times, rho, limits), "line"),
+        _path(_line(strip.times, bad, limits), "line lost"),
     ]
     values = [margin_text(float(rho[index]), unit) or None for index in shown]
     return _Track(labelled(name, unit), _svg(parts), values)
@@ -245,44 +219,35 @@ def _svg(parts: Iterable[Html]) -> Html:
     return el("svg", parts, attrs=box)
 
 
-def _up(values: NDArray[np.float64], span: float) -> NDArray[np.float64]:
-    """Vertical coordinates of values in a track, from its upper edge."""
-    return np.asarray(_HIGH - _HIGH * values / (span or 1.0))
+def _up(values: Floats, limits: tuple[float, float]) -> Floats:
+    """Vertical coordinates of values in a track with these limits, from its upper edge."""
+    low, high = limits
+    return np.asarray(_HIGH - _HIGH * (np.clip(values, low, high) - low) / ((high - low) or 1.0))
 
 
-def _across(times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _across(times: Floats) -> Floats:
+    """Horizontal coordinates of the samples, and of the right edge."""
     span = float(times[-1] - times[0]) or 1.0
-    return np.asarray(_WIDE * (times - times[0]) / span)
+    return np.append(_WIDE * (times - times[0]) / span, _WIDE)
 
 
-def _line(times: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
+def _line(times: Floats, values: Floats, limits: tuple[float, float]) -> str:
     """SVG path of a step function, with gaps at NaN."""
-    words, last = list[str](), np.nan
-    for x, y in zip(_across(times), heights, strict=True):
-        if np.isnan(y):
-            if not np.isnan(last):
-                words.append(f"H{x:.1f}")
-        elif np.isnan(last):
-            words.append(f"M{x:.1f} {y:.1f}")
-        elif y != last:
-            words.append(f"H{x:.1f}V{y:.1f}")
-        last = y
-    if not np.isnan(last):
-        words.append(f"H{_WIDE}")
+    x, words, joined = _across(times), [], False
+    for begin, end, y in constant_ranges(_up(values, limits)):
+        if np.isfinite(y):
+            words.append(f"V{y:.1f}H{x[end]:.1f}" if joined else f"M{x[begin]:.1f} {y:.1f}H{x[end]:.1f}")
+        joined = bool(np.isfinite(y))
     return "".join(words)
 
 
-def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
-    """SVG path of the area between two step functions."""
-    x = np.append(_across(times), _WIDE)
-    words, begin = list[str](), 0
-    same = (heights[1:] == heights[:-1]) & (base[1:] == base[:-1])
-    edges = [0, *(np.flatnonzero(~same) + 1).tolist(), len(heights)]
-    for begin, end in pairwise(edges):
-        if np.isfinite(heights[begin]) and heights[begin] != base[begin]:
-            words.append(
-                f"M{x[begin]:.1f} {base[begin]:.1f}V{heights[begin]:.1f}H{x[end]:.1f}V{base[begin]:.1f}z"
-            )
+def _area(times: Floats, base: Floats, values: Floats, limits: tuple[float, float]) -> str:
+    """SVG path of the area between two step functions, with gaps at NaN."""
+    x, low, high, words = _across(times), _up(base, limits), _up(values, limits), []
+    for begin, end, _ in constant_ranges(low + 1j * high):
+        y0, y1 = low[begin], high[begin]
+        if np.isfinite(y1) and y0 != y1:
+            words.append(f"M{x[begin]:.1f} {y0:.1f}V{y1:.1f}H{x[end]:.1f}V{y0:.1f}z")
     return "".join(words)
 
 
@@ -298,16 +263,16 @@ def _events(panels: Sequence[RunPanel]) -> Html | None:
     for name in names:
         rows = [(panel, event) for panel in panels for event in panel.events if event.requirement == name]
         rows.sort(key=lambda row: row[1].sample)
-        counts = [sum(1 for own, _ in rows if own is panel) for panel in panels]
-        told = ", ".join(
-            f"{count(number, 'violation')} {panel.title}".strip()
-            for number, panel in zip(counts, panels, strict=True)
+        counts = ", ".join(
+            f"{count(sum(own is panel for own, _ in rows), 'violation')} {panel.title}".strip()
+            for panel in panels
         )
-        summary = el("summary", name, " ", classed("span", "bad" if rows else "quiet", told))
+        total = classed("span", "bad" if rows else "quiet", counts)
         if rows:
-            blocks.append(el("details", summary, _event_table(rows[:MOST_ROWS], len(rows))))
+            events = _event_table(rows[:MOST_ROWS], len(rows))
+            blocks.append(el("details", el("summary", name, " ", total), events))
         else:
-            blocks.append(classed("p", "none", el("strong", name), " ", classed("span", "quiet", told)))
+            blocks.append(classed("p", "none", el("strong", name), " ", total))
     return classed("div", "events", el("h3", "Violations in this animation"), blocks)
 
 
@@ -320,9 +285,8 @@ def _event_table(rows: list[tuple[RunPanel, Event]], count_: int) -> Html:
         at = {"type": "button", "data-at": f"{panel.time(event.sample) - panel.time(0):.9g}"}
         button = el("button", f"{panel.time(event.sample):.4g} s", attrs=at)
         window = beside(moment, start).removeprefix(moment).strip()
-        when: Child = join(button, el("small", window) if window else None)
-        drive: list[Child] = [panel.title] if several else []
-        cells.append([when, *drive, panel.names[event.agent], event.because])
+        when = join(button, el("small", window) if window else None)
+        cells.append([when, *([panel.title] if several else []), panel.names[event.agent], event.because])
     more = el("p", f"and {count_ - len(rows):,} more") if count_ > len(rows) else None
     return join(table(header, cells, kind="jump"), more)
 
@@ -346,5 +310,5 @@ def _data(
         "panels": [animation.as_json() for animation in animations],
         "rows": [track.values for own in tracks for track in own],
     }
-    text = script_json(dumps(document))
-    return el("script", Html(text), attrs={"type": "application/json", "id": "animation-data"})
+    text = Html(script_json(dumps(document)))
+    return el("script", text, attrs={"type": "application/json", "id": "animation-data"})

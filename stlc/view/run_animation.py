@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
@@ -26,6 +25,7 @@ from stlc.view.animation import (
     save_animation,
     save_still,
 )
+from stlc.view.contents import readable
 from stlc.view.region_map import RegionMap, map_animation, map_of
 from stlc.view.scene import LegendKey, Scene, SceneOptions, frames_of, keys_of, ratio_of, scene_animation
 from stlc.view.signals import Strip, decisions_of, signal_animation
@@ -113,9 +113,9 @@ class RecordedScene:
 
     Attributes:
         scene: snapshots stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
-        world: draws them.
-        dt: seconds between them.
-        judged: verdict on the agents; None if they cannot be judged.
+        world: draws the scene.
+        dt: seconds between frames.
+        judged: verdicts on the agents; None if they cannot be judged.
         events: violations of all requirements.
     """
 
@@ -163,44 +163,39 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     if scene is None:
         return None
     try:
-        decl = load_system_decl(run.path / SYSTEM)
-        scenario = _scenario(run)
+        decl, scenario = load_system_decl(run.path / SYSTEM), _scenario(run)
         decl = decl if scenario is None else under(decl, scenario)
-        world = None if decl.test.world is None else world_type(decl)
+        if decl.test.world is None:
+            return None
+        world = world_type(decl)
     except StlcError:
         return None
-    if world is None:
-        return None
-    judged = _judged(run, trace_name, scene)
+    found = RecordedScene(scene, world, float(decl.dt))
+    judged = readable(lambda: _judged(run, trace_name, scene))
     if judged is None:
-        return RecordedScene(scene, world, float(decl.dt))
-    events = events_of(judged.executed, judged.executed.traces)
-    marked = marks(events, frames_of(scene), judged.executed.traces, judged.marked)
-    return RecordedScene({**scene, "violated": marked}, world, float(decl.dt), judged, tuple(events))
+        return found
+    traces = judged.executed.traces
+    events = events_of(judged.executed, traces)
+    marked = marks(events, found.frames, traces, judged.marked)
+    return replace(found, scene={**scene, "violated": marked}, judged=judged, events=tuple(events))
 
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
-    """Verdict on a scene's agents; None if the trace is of another deployment or cannot be judged."""
-    decisions = scene.get("decision")
-    if decisions is None:
+    """Verdicts on a scene's agents; None if the trace is of another deployment."""
+    decisions, trace = scene.get("decision"), load_trace(run.path / trace_name)
+    if decisions is None or trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
         return None
-    try:
-        trace = load_trace(run.path / trace_name)
-        if trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
-            return None
-        return judge_agents(trace, decisions.shape[1], system=run.path / SYSTEM)
-    except StlcError:
-        return None
+    return judge_agents(trace, decisions.shape[1], system=run.path / SYSTEM)
 
 
 def _scene_animation(run: RunDir, title: str) -> Animation | None:
-    seen = recorded_scene(run)
-    if seen is None:
+    found = recorded_scene(run)
+    if found is None:
         return None
     try:
-        stage = seen.stage if bullet.available() else None
-        draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
-        return scene_animation(seen.scene, SceneOptions(draw, seen.dt, title, seen.own_keys, seen.strip))
+        stage = found.stage if bullet.available() else None
+        draw = found.world.draw if stage is None else bullet.stage_drawing(stage)
+        return scene_animation(found.scene, SceneOptions(draw, found.dt, title, found.own_keys, found.strip))
     except Exception:  # whatever a world's own code raises: there are other pictures
         return None
 
@@ -216,7 +211,7 @@ class RunPanel:
         title: name of the guard; empty for a single run.
         alt: description in words.
         frames: number of instants.
-        dt: seconds between them.
+        dt: seconds between frames.
         t0: time of the first frame, s.
         keys: legend entries.
         strip: strip charts.
@@ -247,45 +242,40 @@ WITHOUT, WITH = "without the guard", "with the guard"
 
 
 def run_panels(run: RunDir) -> list[RunPanel]:
-    """Shots of the newest deployment for a page: the first seed without and with the guard.
+    """Panels of the newest deployment for a page: the first seed without and with the guard.
 
     One panel without a comparison; signals of the trace if there is no world; empty without a recording.
     """
-    panels = []
-    for guarded, title in ((False, WITHOUT), (True, WITH)):
-        seen = recorded_scene(run, guarded=guarded)
-        if seen is not None:
-            panels.append((seen, title))
-    if panels and panels[-1][1] == WITH:
-        same = len(panels) > 1 and panels[0][0].frames == panels[1][0].frames
-        chosen = panels if same else panels[-1:]
-        try:
-            return [_scene_panel(seen, title if same else "") for seen, title in chosen]
-        except Exception:  # whatever a world's own code raises: there are other pictures
-            pass
+    found, other = recorded_scene(run), recorded_scene(run, guarded=False)
+    try:
+        if found is not None and other is not None and found.frames == other.frames:
+            return [_scene_panel(other, WITHOUT), _scene_panel(found, WITH)]
+        if found is not None:
+            return [_scene_panel(found, "")]
+    except Exception:  # whatever a world's own code raises: there are other pictures
+        pass
     return _trace_panels(run)
 
 
-def _scene_panel(seen: RecordedScene, title: str) -> RunPanel:
-    judged, agents = seen.judged, seen.scene["decision"].shape[1] if "decision" in seen.scene else 0
-    ratio = ratio_of(seen.world.draw, seen.scene)
-    size = (PANEL, round(PANEL * ratio, 2))
+def _scene_panel(found: RecordedScene, title: str) -> RunPanel:
+    judged, agents = found.judged, found.scene["decision"].shape[1] if "decision" in found.scene else 0
+    size = (PANEL, round(PANEL * ratio_of(found.world.draw, found.scene), 2))
 
     def record(shown: range) -> VectorAnimation:
         from stlc.view.vector import vector_frames
 
-        return vector_frames(lambda axes, index: seen.world.draw(axes, seen.scene, index), shown, size)
+        return vector_frames(lambda axes, index: found.world.draw(axes, found.scene, index), shown, size)
 
     record(range(1))  # errors of a world's drawing code are raised here, not while the page is written
     return RunPanel(
         title=title,
         alt=f"{agents} agents drive {title}".strip(),
-        frames=seen.frames,
-        dt=seen.dt,
+        frames=found.frames,
+        dt=found.dt,
         t0=0.0 if judged is None else judged.trace.t0,
-        keys=tuple(keys_of(seen.scene, seen.own_keys)),
-        strip=seen.strip,
-        events=seen.events,
+        keys=tuple(keys_of(found.scene, found.own_keys)),
+        strip=found.strip,
+        events=found.events,
         names=tuple(f"agent {agent}" for agent in range(agents)),
         requirements=() if judged is None else tuple(j.name for j in judged.executed),
         vector_frames=record,
@@ -304,10 +294,11 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
 
         return vector_animation(animation, shown)
 
-    try:
-        judged = judge_agents(trace, trace.traces, system=run.path / SYSTEM)
-    except StlcError:
-        judged = None
+    judged = readable(lambda: judge_agents(trace, trace.traces, system=run.path / SYSTEM))
+    decided = decisions_of(trace)
+    if decided is not None:  # one decision per step: the last one is shown at the last sample, too
+        whole = decided.shape[1] == trace.samples - 1
+        decided = np.concatenate((decided.T, decided.T[-1:])) if whole else None
     return [
         RunPanel(
             title="",
@@ -316,7 +307,7 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
             dt=animation.dt,
             t0=trace.t0,
             keys=(),
-            strip=None if judged is None else strip_of(judged, _decisions_shown(trace)),
+            strip=None if judged is None else strip_of(judged, decided),
             events=() if judged is None else tuple(events_of(judged.executed, trace.traces)),
             names=tuple(trace_names(trace)),
             requirements=() if judged is None else tuple(j.name for j in judged.executed),
@@ -325,41 +316,27 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
     ]
 
 
-def _decisions_shown(trace: Trace) -> NDArray[np.int64] | None:
-    """Source of the decision at every sample, (samples, traces); None if not recorded."""
-    decided = decisions_of(trace)
-    if decided is None or decided.shape[1] != trace.samples - 1:
-        return None
-    return np.concatenate((decided.T, decided.T[-1:]))
-
-
 def _scenario(run: RunDir) -> str | None:
     """The scenario of the newest deployment, if any."""
-    try:
-        name = run.read_json(SIMULATION).get("scenario")
-    except (StlcError, AttributeError):
-        return None
+    result = readable(lambda: run.read_json(SIMULATION))
+    name = result.get("scenario") if isinstance(result, dict) else None
     return None if name is None else str(name)
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    try:
-        trace = load_trace(run.path / TRACE)
-    except StlcError:
+    """Animation of the trace: over the regions of its specification if it names any, else of its signals."""
+    trace = readable(lambda: load_trace(run.path / TRACE))
+    if trace is None:
         return None
-    region_map = _map_of(trace)
+    region_map = readable(lambda: _map_of(trace))
     return (
         signal_animation(trace, title=title) if region_map is None else map_animation(region_map, title=title)
     )
 
 
 def _map_of(trace: Trace) -> RegionMap | None:
-    """The map of a trace; None if its specification names no regions."""
-    try:
-        monitor = monitor_of(trace)
-        return map_of(monitor.spec, monitor.check(trace), trace)
-    except StlcError:
-        return None
+    monitor = monitor_of(trace)
+    return map_of(monitor.spec, monitor.check(trace), trace)
 
 
 def _load_scene(path: Path) -> Scene | None:
@@ -368,8 +345,7 @@ def _load_scene(path: Path) -> Scene | None:
             scene = {name: file[name] for name in file.files}
     except (OSError, ValueError, BadZipFile):
         return None
-    whole = scene and all(values.ndim and len(values) for values in scene.values())
-    return scene if whole else None
+    return scene if scene and all(values.ndim and len(values) for values in scene.values()) else None
 
 
 def _title(run: RunDir) -> str:

@@ -144,22 +144,6 @@ def choose_traces(
     return Choice(worst, f"worst: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
 
 
-@dataclass(frozen=True, slots=True)
-class _Agent:
-    """A trace of a recording."""
-
-    trace: Trace
-    margins: Margins
-    index: int
-
-    def decided(self) -> Iterator[tuple[float, float, int]]:
-        """Time intervals with a constant source of decisions: from, to, source."""
-        decisions, trace = decisions_of(self.trace), self.trace
-        if decisions is not None:
-            for start, stop, value in _runs(decisions[self.index].astype(np.float64)):
-                yield trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt, int(value)
-
-
 def draw_signals(
     trace: Trace, margins: Margins, choices: Sequence[Choice], units: Mapping[str, str] | None = None
 ) -> Picture:
@@ -182,7 +166,7 @@ def draw_signals(
         for column, choice in zip(grid.T, choices, strict=True):
             column[0].set_title(_wrapped(choice.title), pad=8)
             for axes, (kind, name) in zip(column, rows, strict=True):
-                _draw_row(axes, kind, name, _Agent(trace, margins, choice.index))
+                _draw_row(axes, kind, name, trace, margins, choice.index)
             column[-1].set_xlabel("time [s]")
             column[-1].tick_params(labelbottom=True)
         for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
@@ -217,16 +201,12 @@ def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
     """Draw the legend of margins and decisions."""
     from matplotlib.patches import Patch
 
-    handles = []
-    if judged:
-        handles = [
-            Patch(color=BLUE, alpha=0.5, lw=0, label="robustness margin"),
-            Patch(color=RED, lw=0, label="violated"),
-        ]
+    keys = [(BLUE, 0.5, "robustness margin"), (RED, None, "violated")] if judged else []
     decisions = decisions_of(trace)
     for source in sorted(set() if decisions is None else {*np.unique(decisions).tolist()} - {POLICY}):
-        word, color = DECISIONS.get(int(source), ("", MUTED))
-        handles.append(Patch(color=color, lw=0, label=f"{word} decided"))
+        word, color = DECISIONS.get(source, ("", MUTED))
+        keys.append((color, None, f"{word} decided"))
+    handles = [Patch(color=color, alpha=alpha, lw=0, label=label) for color, alpha, label in keys]
     if handles:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.0)
 
@@ -236,30 +216,28 @@ def _wrapped(title: str) -> str:
     return title if len(title) <= MOST_LETTERS else title.replace(": ", ":\n", 1)
 
 
-def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
-    """Draw a panel; interventions of the guard are shaded behind numbers and margins."""
-    trace = agent.trace
+def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, index: int) -> None:
+    """Draw a panel of trace `index`; interventions of the guard are shaded behind numbers and margins."""
     match kind:
         case "line":
-            axes.plot(trace.times, _broken(trace.data[name][agent.index]), color=INK, lw=1.1)
+            axes.plot(trace.times, _broken(trace.data[name][index]), color=INK, lw=1.1)
         case "strip":
-            _draw_discrete(axes, agent, trace.signature[name])
+            _draw_discrete(axes, trace, trace.data[name][index], trace.signature[name])
         case "robustness":
-            rho = agent.margins[name][agent.index]
+            rho = margins[name][index]
             _plot_margin(axes, trace.times[: len(rho)], rho)
-            axes.set_ylim(*margin_limits(agent.margins[name]))
+            axes.set_ylim(*margin_limits(margins[name]))
     if kind in ("line", "robustness"):
         axes.locator_params(axis="y", nbins=3)
-    elif kind == "decision":
+    else:
         axes.set_ylim(0, 1)
         hide_frame(axes)
-    if kind != "strip":
-        for left, right, source in agent.decided():
+    decisions = None if kind == "strip" else decisions_of(trace)
+    for start, stop, source in [] if decisions is None else constant_ranges(decisions[index]):
+        if kind == "decision" or source != POLICY:
             _, color = DECISIONS.get(source, ("", MUTED))
-            if kind == "decision":
-                axes.axvspan(left, right, color=color, lw=0)
-            elif source != POLICY:
-                axes.axvspan(left, right, color=color, alpha=0.13, lw=0)
+            left, right = trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt
+            axes.axvspan(left, right, color=color, alpha=1 if kind == "decision" else 0.13, lw=0)
 
 
 def _broken(values: Floats) -> Floats:
@@ -274,27 +252,23 @@ def _broken(values: Floats) -> Floats:
     return broken
 
 
-def _draw_discrete(axes: Axes, agent: _Agent, column: Column) -> None:
-    """A discrete signal as coloured intervals with their labels inside."""
-    trace = agent.trace
-    values = trace.data[column.name][agent.index]
+def _draw_discrete(axes: Axes, trace: Trace, values: Floats, column: Column) -> None:
+    """Draw a discrete signal as coloured intervals with their labels inside."""
     labels = {value: label for label, value in column.labels} or {0.0: "", 1.0: "yes"}
     levels = sorted({*labels, *np.unique(values[np.isfinite(values)]).tolist()})
     tints = (FAINT, SKY, MUTED, BLUE, GREEN)
-    for start, stop, value in _runs(values):
+    for start, stop, value in constant_ranges(values):
         left, right = trace.times[start], trace.times[stop - 1] + trace.dt
         axes.axvspan(left, right, color=tints[levels.index(value) % len(tints)], alpha=0.75, lw=0)
         label = labels.get(value, f"{value:g}")
         if label and (right - left) > 0.08 * trace.dt * trace.samples:
             axes.text((left + right) / 2, 0.5, label, ha="center", va="center", fontsize=7, color=INK)
-    axes.set_ylim(0, 1)
-    hide_frame(axes)
 
 
-def _runs(values: Floats) -> list[tuple[int, int, float]]:
+def constant_ranges(values: NDArray[Any]) -> list[tuple[int, int, Any]]:
     """(start, stop, value) of each range of equal values."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
-    return [(a, b, float(values[a])) for a, b in pairwise(edges) if b > a]
+    return [(a, b, values[a].item()) for a, b in pairwise(edges) if b > a]
 
 
 # ------------------------------------------------------------------------------ strip charts of films
