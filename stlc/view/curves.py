@@ -1,4 +1,4 @@
-"""Learning curves: accuracy, requirements, loss and learning rate over time."""
+"""Learning curves: plan accuracy, accuracy per requirement, loss and learning rate over training time."""
 
 from __future__ import annotations
 
@@ -39,20 +39,15 @@ def draw_curves(rows: Rows) -> Picture | None:
 
 def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Seconds and values of the rows that have `key`."""
-    kept = [row for row in rows if row.get(key) is not None]
-    return (
-        np.array([float(row["seconds"]) for row in kept]),
-        np.array([float(row[key]) for row in kept]),
-    )
+    pairs = [(float(row["seconds"]), float(row[key])) for row in rows if row.get(key) is not None]
+    seconds, values = np.array(pairs).reshape(-1, 2).T
+    return seconds, values
 
 
-def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Moving average of `values`, with a shorter window at the ends."""
-    reach, count = len(values) // 60, len(values)
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    first = np.maximum(np.arange(count) - reach, 0)
-    last = np.minimum(np.arange(count) + reach + 1, count)
-    return np.asarray((sums[last] - sums[first]) / (last - first))
+def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Moving average of `values` over a 30th of them, with a shorter window at the ends."""
+    window = np.ones(2 * (len(values) // 60) + 1)
+    return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
 
 
 def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
@@ -67,7 +62,7 @@ def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
 def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
     """Draw measurements faintly, and their moving average above them."""
     axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
-    axes.plot(seconds, _even(shares), **style)
+    axes.plot(seconds, _smoothed(shares), **style)
 
 
 def _legend(axes: Axes, rows: int) -> None:
@@ -87,11 +82,11 @@ def _draw_accuracy(axes: Axes, rows: Rows) -> None:
     axes.set_title("plan accuracy")
     axes.set_ylabel("share of starts")
     seconds, accuracy = _column(rows, "accuracy")
-    label = f"policy  {_even(accuracy)[-1]:.3f}"
+    label = f"policy  {_smoothed(accuracy)[-1]:.3f}"
     _draw_share(axes, seconds, accuracy, color=BLUE, lw=1.8, zorder=3, label=label)
     known, feasible = _column(rows, "feasible")
     if len(feasible):
-        label = f"known feasible  {_even(feasible)[-1]:.3f}"
+        label = f"known feasible  {_smoothed(feasible)[-1]:.3f}"
         _draw_share(axes, known, feasible, color=MUTED, lw=1.2, ls=(0, (4, 2)), label=label)
     _set_share_axis(axes, [accuracy, feasible])
     _legend(axes, 2)
@@ -99,17 +94,16 @@ def _draw_accuracy(axes: Axes, rows: Rows) -> None:
 
 def _draw_requirements(axes: Axes, rows: Rows) -> None:
     axes.set_title("per requirement")
-    names = list(dict.fromkeys(name for row in rows for name in (row.get("requirements") or {})))
+    shares_of = [(row["seconds"], row.get("requirements") or {}) for row in rows]
+    names = list(dict.fromkeys(name for _, shares in shares_of for name in shares))
     everything = []
     for index, name in enumerate(names):
-        kept = [row for row in rows if name in (row.get("requirements") or {})]
-        seconds = np.array([float(row["seconds"]) for row in kept])
-        shares = np.array([float(row["requirements"][name]) for row in kept])
+        own = [{"seconds": seconds, "share": shares.get(name)} for seconds, shares in shares_of]
+        seconds, shares = _column(own, "share")
         everything.append(shares)
         color, style = SERIES[index % len(SERIES)], "-" if index < len(SERIES) else "--"
-        _draw_share(
-            axes, seconds, shares, color=color, ls=style, label=picture(f"{name}  {_even(shares)[-1]:.3f}")
-        )
+        label = picture(f"{name}  {_smoothed(shares)[-1]:.3f}")
+        _draw_share(axes, seconds, shares, color=color, ls=style, label=label)
     if everything:
         _set_share_axis(axes, everything)
         _legend(axes, 3)
@@ -122,7 +116,7 @@ def _draw_loss(axes: Axes, rows: Rows) -> None:
     seconds, loss = _column(rows, "loss")
     if len(loss):
         axes.plot(seconds, loss, color=INK, lw=0.7, alpha=0.3)
-        axes.plot(seconds, _even(loss), color=INK, lw=1.2)
+        axes.plot(seconds, _smoothed(loss), color=INK, lw=1.2)
         if loss.min() > 0 and loss.max() > 5 * loss.min():
             axes.set_yscale("log")
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -133,16 +127,8 @@ def _draw_loss(axes: Axes, rows: Rows) -> None:
         return
     twin = axes.twinx()
     twin.fill_between(seconds, rate, color=MUTED, alpha=0.14, lw=0)
-    twin.annotate(
-        f"learning rate, at most {rate.max():.1e}",
-        (1, 1),
-        xycoords="axes fraction",
-        xytext=(0, 3),
-        textcoords="offset points",
-        ha="right",
-        color=MUTED,
-        fontsize=7.5,
-    )
+    text = f"learning rate, at most {rate.max():.1e}"
+    twin.set_title(text, loc="right", pad=3, color=MUTED, fontsize=7.5, weight="normal")
     twin.set_ylim(0, 1.08 * float(rate.max()))
     twin.set_yticks([])
     twin.spines["right"].set_visible(False)

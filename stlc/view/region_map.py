@@ -1,11 +1,10 @@
-"""The map: regions of the specification, paths through them, and occupancy of each region over time."""
+"""Map of a trace: regions of the specification, paths through them, and their occupancy over time."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +63,7 @@ class RegionMap:
     Attributes:
         trace: the recording.
         plane: the two signals and their regions.
-        violated: mask of the traces that violate a requirement, (traces,).
+        violated: (traces,), whether a trace violates a requirement.
     """
 
     trace: Trace
@@ -135,7 +134,7 @@ def map_animation(region_map: RegionMap, *, title: str = "") -> Animation:
             moving.turn(index)
             for region, area in zip(region_map.plane.regions, areas, strict=True):
                 strength = STRONG if region.active(now - region_map.trace.t0) else FEEBLE
-                area.set_facecolor(_tint(region_map.color(region), strength))
+                area.set_facecolor((region_map.color(region), strength))
             for cursor in cursors:
                 cursor.set_xdata([now, now])
 
@@ -163,18 +162,15 @@ def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
     """Axes of the map, and of a row for each region beside it."""
     (left, right), (low, high) = region_map.plane.window(region_map.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
-    grid = figure.add_gridspec(len(region_map.plane.regions), 2, width_ratios=[1.55 * ratio**0.5, 1])
-    plot = figure.add_subplot(grid[:, 0])
+    grid = figure.add_gridspec(1, 2, width_ratios=[1.55 * ratio**0.5, 1])
+    plot = figure.add_subplot(grid[0])
     plot.set(xlim=(left, right), ylim=(low, high), aspect="equal")
     across, up = (
         labelled(name, region_map.trace.signature[name].unit.text) for name in region_map.plane.axes
     )
     plot.set(xlabel=across, ylabel=up)
-    rows: list[Axes] = []
-    for index in range(len(region_map.plane.regions)):
-        rows.append(figure.add_subplot(grid[index, 1], sharex=rows[0] if rows else None))
-    for axes in rows[:-1]:
-        axes.tick_params(labelbottom=False)
+    beside = grid[1].subgridspec(len(region_map.plane.regions), 1)
+    rows = beside.subplots(sharex=True, squeeze=False)[:, 0].tolist()
     rows[-1].set_xlabel("time [s]")
     return plot, rows
 
@@ -198,8 +194,10 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
             filled.remove()
             others = [other for k, (_, _, other) in enumerate(sampled) if k != index]
             row, column = _clearest(depth, others)
-            _write(axes, region.title, (float(xs[column]), float(ys[row])))
-        area = PathPatch(outline, fc=_tint(color, STRONG), ec=color, lw=1.2, zorder=2)
+            paper = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7}
+            bold: Any = {"ha": "center", "va": "center", "color": INK, "weight": "bold", "zorder": 6}
+            axes.annotate(region.title, (xs[column], ys[row]), bbox=paper, **bold)
+        area = PathPatch(outline, fc=(color, STRONG), ec=color, lw=1.2, zorder=2)
         if region.role == "avoid":
             area.set_hatch("///")
         axes.add_patch(area)
@@ -207,22 +205,11 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
     return areas
 
 
-def _tint(color: str, strength: float) -> tuple[float, float, float, float]:
-    from matplotlib.colors import to_rgba
-
-    return to_rgba(color, strength)
-
-
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Position of a label: deep in its region and, if possible, outside the others; (row, column)."""
+    """Grid position (row, column) of a label: deep in its region and, if possible, outside the others."""
     free = np.minimum.reduce([depth, *(-other for other in others)])
-    best = int(np.argmax(free if (free >= 0).any() else depth))
-    return best // depth.shape[1], best % depth.shape[1]
-
-
-def _write(axes: Axes, name: str, at: tuple[float, float]) -> None:
-    paper = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7}
-    axes.annotate(name, at, ha="center", va="center", color=INK, weight="bold", zorder=6, bbox=paper)
+    row, column = np.unravel_index(np.argmax(free if (free >= 0).any() else depth), depth.shape)
+    return int(row), int(column)
 
 
 def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
@@ -261,32 +248,19 @@ def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None
     axes.fill_between(times, share, 0, color=color, alpha=0.35, lw=0, zorder=1)
     axes.plot(times, share, color=color, lw=1.2, zorder=2)
     if region.visited:
-        so_far = np.logical_or.accumulate(inside & _matters(region, region_map.trace), axis=1).mean(0)
+        active = region.active(times - region_map.trace.t0)
+        so_far = np.logical_or.accumulate(inside & active, axis=1).mean(0)
         axes.plot(times, so_far, color=color, lw=1, ls=(0, (3, 2)), zorder=2)
     axes.set(ylim=(-0.04, 1.12), xlim=(times[0], times[-1]))
     axes.set_yticks([0, 1], ["0", "all"])
     axes.grid(visible=False)
     word = "not in" if region.role == "avoid" else "in"
     axes.set_title(f"{word} {region.title}", color=INK, pad=3)
-    axes.annotate(
-        uses_text(region.uses),
-        (1, 1),
-        xycoords="axes fraction",
-        xytext=(0, 3.5),
-        textcoords="offset points",
-        ha="right",
-        color=MUTED,
-        fontsize=7.5,
-    )
-
-
-def _matters(region: MapRegion, trace: Trace) -> Mask:
-    """Mask of the samples at which a region is active, (samples,)."""
-    return np.array([region.active(float(seconds) - trace.t0) for seconds in trace.times])
+    axes.set_title(uses_text(region.uses), loc="right", pad=3, color=MUTED, fontsize=7.5, weight="normal")
 
 
 class _MovingAgents:
-    """The agents of the animation: a point and a trail each."""
+    """The agents of an animation, each drawn as a point with a trail."""
 
     def __init__(self, axes: Axes, region_map: RegionMap) -> None:
         chosen = region_map.first(MOST_AGENTS)
@@ -301,7 +275,7 @@ class _MovingAgents:
         )
 
     def turn(self, index: int) -> None:
-        """Show this sample."""
+        """Move the agents to their positions at a sample."""
         recent = slice(max(0, index - self._tail), index + 1)
         self._recent.set_data(_joined(self._across[:, recent]), _joined(self._up[:, recent]))
         self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))
@@ -327,8 +301,8 @@ class Use:
 
     Attributes:
         requirement: its name.
-        negative: under an odd number of negations.
-        visit: under an `eventually`: one visit is enough.
+        negative: whether the region is to be avoided: it is under an odd number of negations.
+        visit: whether one visit is enough: the region is under an `eventually`.
         window: active time, in seconds from the start of the trace; None if always active.
     """
 
@@ -343,8 +317,8 @@ class MapRegion:
     """A region of the plane.
 
     Attributes:
-        name: as declared, or its text.
-        uses: its occurrences in the specification.
+        name: as declared, or the text of the region.
+        uses: occurrences of the region in the specification.
         monitor: evaluates membership of a point.
     """
 
@@ -374,9 +348,10 @@ class MapRegion:
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
-    def active(self, seconds: float) -> bool:
-        """True if it is active at this time."""
-        return not self.windows or any(low <= seconds <= high for low, high in self.windows)
+    def active(self, seconds: Any) -> Mask:
+        """Mask of the times, in seconds from the start of the trace, at which it is active."""
+        windows = self.windows or ((-np.inf, np.inf),)
+        return np.asarray(np.any([(low <= seconds) & (seconds <= high) for low, high in windows], axis=0))
 
     def depth(self, points: Trace) -> NDArray[np.float64]:
         """Signed distance to the border, positive inside: (traces, samples)."""
@@ -403,10 +378,10 @@ class Plane:
             values = trace.data[name][np.isfinite(trace.data[name])]
             ends.append(tuple(np.quantile(values, [0.01, 0.99])) if len(values) else (0.0, 1.0))
         size = max(high - low for low, high in ends) or 1.0
-        search = [(low - size, high + size) for low, high in ends]
-        lows, highs = [np.array([end[k] for end in ends]) for k in (0, 1)]
+        lows, highs = np.array(ends).T
+        search = ((lows[0] - size, highs[0] + size), (lows[1] - size, highs[1] + size))
         for region in self.regions:
-            xs, ys, depth = self.sampled(region, trace, (search[0], search[1]), count=GRID // 2)
+            xs, ys, depth = self.sampled(region, trace, search, count=GRID // 2)
             inside = depth >= 0.0
             if inside.any() and not (inside[0] | inside[-1] | inside[:, 0] | inside[:, -1]).any():
                 here = np.array([xs[inside.any(0)][[0, -1]], ys[inside.any(1)][[0, -1]]])
@@ -452,34 +427,28 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
                 if node.negated and _point(node) is not node.item:  # a complement, not a `not` around it
                     use = _turned(use)
                 uses.setdefault(_texts(node), []).append(use)
-    found: list[tuple[tuple[str, ...], MapRegion]] = []
     shown = {_texts(node): node for node in members.values()}
+    planes: dict[tuple[str, ...], list[MapRegion]] = {}
     for key, its in uses.items():
-        judge = _judge_of(spec, shown[key], trace)
-        if judge is not None:
-            columns = judge.compiled.signature.names
-            found.append((columns, MapRegion(key[1], tuple(its), judge)))
-    flat = [columns for columns, _ in found if len(columns) == 2 and all(c in trace.data for c in columns)]
+        monitor = _membership(spec, shown[key], trace)
+        if monitor is not None:
+            region = MapRegion(key[1], tuple(its), monitor)
+            planes.setdefault(monitor.compiled.signature.names, []).append(region)
+    flat = [axes for axes in planes if len(axes) == 2 and all(name in trace.data for name in axes)]
     if not flat:
         return None
-    axes = Counter(flat).most_common(1)[0][0]
-    return Plane((axes[0], axes[1]), tuple(region for columns, region in found if columns == axes))
+    axes = max(flat, key=lambda axes: len(planes[axes]))
+    return Plane((axes[0], axes[1]), tuple(planes[axes]))
 
 
-def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
+def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
     """A monitor of one membership predicate; None if it does not compile alone (it uses an argument, say)."""
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
-    alone = ast.Require(
-        name="inside",
-        name_span=node.span,
-        tags=(),
-        doc="",
-        span=node.span,
-        formula=replace(node, item=_point(node), negated=False),
-    )
+    formula = replace(node, item=_point(node), negated=False)
+    alone = ast.Require(name="inside", name_span=node.span, tags=(), doc="", span=node.span, formula=formula)
     try:
-        judge = Monitor(replace(spec, items=(*declared, alone)), dt=trace.dt, overrides=trace.meta.spec_set)
-        return judge if judge.compiled.requirements else None
+        monitor = Monitor(replace(spec, items=(*declared, alone)), dt=trace.dt, overrides=trace.meta.spec_set)
+        return monitor if monitor.compiled.requirements else None
     except StlcError:
         return None
 
@@ -545,17 +514,11 @@ def _point(node: ast.Member) -> ast.Expr:
 
 def _texts(node: ast.Member) -> tuple[str, str]:
     """Key of a region: texts of the point and of the region."""
-    return _text(_point(node)), _text(node.region)
-
-
-def _text(node: ast.Node) -> str:
-    return " ".join(node.span.text.split())
+    point, region = (" ".join(part.span.text.split()) for part in (_point(node), node.region))
+    return point, region
 
 
 def uses_text(uses: Sequence[Use]) -> str:
-    """Requirements on a region, in a few words."""
-    parts = []
-    for use in uses:
-        when = "" if use.window is None else f" {use.window[0]:g} to {use.window[1]:g} s"
-        parts.append(f"{use.requirement}{when}")
-    return ", ".join(dict.fromkeys(parts))
+    """The requirements on a region with their times, such as `pass_gate 1 to 3 s`."""
+    times = [f" {use.window[0]:g} to {use.window[1]:g} s" if use.window else "" for use in uses]
+    return ", ".join(dict.fromkeys(use.requirement + time for use, time in zip(uses, times, strict=True)))
