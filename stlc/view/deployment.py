@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
@@ -23,17 +23,12 @@ def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
     if not guards:
         return []
     name, guard = list(guards.items())[-1]
-    metrics = guard.get("metrics") or {}
-    beside = guard_words(name).beside
-    each = {
-        guard_words(name).beside: f"{drives['obeyed']:,} of {drives['count']:,}"
-        for name, drives in drives_of(contents.simulation).items()
-    }
+    accuracy = share(_mean(guard.get("metrics") or {}, "plan_accuracy"))
     tiles = [
-        *((obeyed, f"drives obeyed, {guard}") for guard, obeyed in reversed(each.items())),
-        (share(_mean(metrics, "plan_accuracy")), f"of deployed plans, {beside}"),
+        (f"{drives['obeyed']:,} of {drives['count']:,}", f"drives obeyed, {guard_words(each).beside}")
+        for each, drives in reversed(drives_of(contents.simulation).items())
     ]
-    return [tile for tile in tiles if tile[0]]
+    return tiles + ([(accuracy, f"of deployed plans, {guard_words(name).beside}")] if accuracy else [])
 
 
 def deployment_section(contents: RunContents) -> Section | None:
@@ -48,10 +43,10 @@ def deployment_section(contents: RunContents) -> Section | None:
         _compared("Progress", guards, _progress_rows(guards)),
         _compared("Decisions", guards, _decision_rows(guards)),
         _compared("Plans and starts, window by window", guards, _share_rows(guards)),
-        _unforeseen(guards),
-        _compared("Requirements of plans, as driven", guards, _requirement_rows(guards)),
+        _model_gap(guards),
+        _compared("Requirements of plans on the executed trajectories", guards, _requirement_rows(guards)),
     )
-    return Section("deployment", "How it drives", body)
+    return Section("deployment", "Closed-loop runs", body)
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
@@ -75,16 +70,16 @@ def _setting(simulation: Record) -> str:
     return f"{size}. Means over the seeds with their interval ({interval})." if interval else f"{size}."
 
 
-def _unforeseen(guards: Mapping[str, Record]) -> Html | None:
+def _model_gap(guards: Mapping[str, Record]) -> Html | None:
     """Explanation of a gap between the satisfaction of plans and of closed-loop runs."""
-    foreseen = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
-    if foreseen is None or foreseen >= 1.0:
+    consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
+    if consistent is None or consistent >= 1.0:
         return None
-    seen = f"from {share(foreseen)} of the starts" if foreseen else "from no start"
+    starts = f"from {share(consistent)} of the starts" if consistent else "from no start"
     return el(
         "p",
-        "Plans are judged as the model foresees them, drives as they were. The world did what the model says "
-        f"through the whole window {seen}; elsewhere a drive holds what no plan could know.",
+        "Plans are judged by the model's prediction, drives by what happened. The world followed the model "
+        f"through the whole window {starts}; elsewhere it did what no plan could know.",
     )
 
 
@@ -99,24 +94,21 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     known = [drives for drives in each if drives is not None]
     if not known:
         return []
+
+    def row(label: Child, counts: Iterable[tuple[int, int] | None]) -> tuple[Child, ...]:
+        return label, *(None if each is None else f"{each[0]:,} of {each[1]:,}" for each in counts)
+
     meaning = el("small", "a drive is one agent over one seed, judged from its first instant to its last")
-    whole = [None if d is None else _of(d["obeyed"], d["count"]) for d in each]
-    rows: list[tuple[Child, ...]] = [(join("drives that obeyed every rule", meaning), *whole)]
+    label = join("drives that obeyed every rule", meaning)
+    rows = [row(label, [None if d is None else (d["obeyed"], d["count"]) for d in each])]
     if any(drives["lost"] for drives in known):
-        others = el(
-            "small", "without those from whose start no plan is known, or since the world told them something"
-        )
-        viable = [None if d is None else _of(d["obeyed"], d["count"] - d["lost"]) for d in each]
-        rows.append((join("of those that were not lost", others), *viable))
+        others = el("small", "without drives from whose start, or after an exogenous event, no plan is known")
+        label = join("of those that were not lost", others)
+        rows.append(row(label, [None if d is None else (d["obeyed"], d["count"] - d["lost"]) for d in each]))
     for rule in known[-1]["rules"]:
-        kept = [None if d is None else d["rules"].get(rule) for d in each]
-        cells = [None if k is None else _of(k["obeyed"], sum(k.values())) for k in kept]
-        rows.append((rule, *cells))
+        found = [None if d is None else d["rules"].get(rule) for d in each]
+        rows.append(row(rule, [None if r is None else (r["obeyed"], sum(r.values())) for r in found]))
     return rows
-
-
-def _of(some: int, all_: int) -> str:
-    return f"{some:,} of {all_:,}"
 
 
 def _broken(simulation: Record | None) -> Html | None:
@@ -133,7 +125,7 @@ def _broken(simulation: Record | None) -> Html | None:
         rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, cause_words(drive)))
     more = len(broken) - MOST_BROKEN
     note = el("p", f"{more} more are in eval/simulate.json.") if more > 0 else None
-    return join(el("h3", "Who broke a rule, and when"), table(("drive", "rules", "why"), rows), note)
+    return join(el("h3", "Drives that violated a rule"), table(("drive", "rules", "why"), rows), note)
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:
@@ -145,13 +137,12 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     return [
         (join(metric.label, el("small", metric.meaning)), *_cells(guards, metric.key, _share_cell))
         for metric in METRICS.values()
-        if metric.key in _names(guards) and (metric.key != "foreseen" or _ever(guards, metric.key))
+        if metric.key in _names(guards)
+        and (
+            metric.key != "foreseen"
+            or any(_mean(guard.get("metrics") or {}, metric.key) for guard in guards.values())
+        )
     ]
-
-
-def _ever(guards: Mapping[str, Record], name: str) -> bool:
-    """True if a share is above zero with any guard."""
-    return any(_mean(guard.get("metrics") or {}, name) for guard in guards.values())
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
@@ -165,14 +156,12 @@ def _cells(guards: Mapping[str, Record], name: str, cell: Callable[[Record | Non
 
 
 def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    rows: list[tuple[Child, ...]] = []
-    for name in filter(is_progress, _names(guards)):
-        cells = []
+    def cells(name: str) -> Iterator[Child]:
         for guard in guards.values():
             unit = str((guard.get("units") or {}).get(name, ""))
-            cells.append(_number_cell((guard.get("metrics") or {}).get(name), unit))
-        rows.append((name.replace("_", " "), *cells))
-    return rows
+            yield _number_cell((guard.get("metrics") or {}).get(name), unit)
+
+    return [(name.replace("_", " "), *cells(name)) for name in filter(is_progress, _names(guards))]
 
 
 def _share_cell(metric: Record | None) -> Child:
@@ -213,9 +202,9 @@ def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 def _decided(name: str) -> Child:
     words = {
         "policy": "the policy decided",
-        "polished": "a polished plan was taken",
+        "polished": "a repaired plan was followed",
         "backup": "the backup decided",
-        "safest": "the safest prefix was taken",
+        "safest": "the safest prefix was followed",
     }
     if name.startswith("backup "):
         return classed("span", "quiet", f"of which {name.removeprefix('backup ')}")

@@ -1,13 +1,13 @@
-"""Failures on held-out starts: the region of the initial set that has most of them, in words and drawn.
+"""Failure region on held-out starts: found by subgroup discovery, described in words, and drawn.
 
-The region is a conjunction of simple conditions that covers many failing starts and few others, found by
-subgroup discovery: a beam search that maximises the F-score.
+The region is a conjunction of simple conditions that covers many failing starts and few others; a beam search
+maximises its F-score.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -42,13 +42,14 @@ class HeldOut:
     """The held-out starts of a run and the robustness of the policy's plans.
 
     Attributes:
-        names: of the columns of `x0`.
+        names: state of each column of `x0`.
         requirements: names, in the order of the columns of `each`.
-        x0: (starts, columns).
-        rho: (starts,) over all requirements.
-        each: (starts, requirements).
-        known: starts with a known satisfying plan, (starts,); None in runs that did not record it.
-        searched: starts that the policy solves or for which a plan was searched, (starts,); None: all.
+        x0: starts, (starts, columns).
+        rho: robustness over all requirements, (starts,).
+        each: robustness per requirement, (starts, requirements).
+        known: mask of the starts with a known satisfying plan, (starts,); None if not recorded.
+        searched: mask of the starts that the policy solves or for which a plan was searched, (starts,); None
+            for all.
     """
 
     names: tuple[str, ...]
@@ -71,24 +72,25 @@ class HeldOut:
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Number of failing starts, and of those among them with a known satisfying plan."""
+        """Number of failing starts, and number of failing starts with a known satisfying plan."""
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The condition `column op value` on a start."""
+    """Condition on a start: the state in `column` compared with `value`."""
 
     column: int
     op: Literal["<=", ">=", "="]
     value: float
 
     def holds(self, x0: Array) -> Mask:
-        """Mask of the starts (starts, columns) that meet it."""
-        compare = {"<=": np.less_equal, ">=": np.greater_equal, "=": np.equal}[self.op]
-        meets: Mask = compare(x0[:, self.column], self.value)
-        return meets
+        """Mask, (starts,), of the starts (starts, columns) that meet the condition."""
+        return np.asarray(_COMPARE[self.op](x0[:, self.column], self.value))
+
+
+_COMPARE = {"<=": np.less_equal, ">=": np.greater_equal, "=": np.equal}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +99,8 @@ class Weakness:
 
     Attributes:
         requirement: index of the requirement.
-        failing: share of all starts that fail it.
-        conditions: their conjunction is the region.
+        failing: share of all starts that fail the requirement.
+        conditions: the region is their conjunction.
         inside: share of the region's starts that fail.
         covered: share of the failing starts that lie in the region.
         axes: the two columns that separate failures best.
@@ -113,13 +115,14 @@ class Weakness:
 
 
 def load_held_out(path: Path) -> HeldOut | None:
-    """The held-out set that training wrote to `path`; None where there is none or it is not one."""
+    """The held-out set that training wrote to `path`; None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(str(file["meta"]))
             x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
-            known = np.asarray(file["known"], dtype=bool) if "known" in file else None
-            searched = np.asarray(file["searched"], dtype=bool) if "searched" in file else None
+            known, searched = (
+                np.asarray(file[key], dtype=bool) if key in file else None for key in ("known", "searched")
+            )
     except (OSError, KeyError, ValueError, BadZipFile):
         return None
     names, requirements = tuple(meta.get("names", ())), tuple(meta.get("requirements", ()))
@@ -157,11 +160,11 @@ def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
     beam = [best]
     for _ in range(MAX_CONDITIONS):
         grown: dict[frozenset[Condition], tuple[float, tuple[Condition, ...]]] = {}
-        for kept in beam:
-            region = _region(x0, kept)
+        for shorter in beam:
+            region = _region(x0, shorter)
             for condition in _candidates(x0, region, failing, values):
                 score = _f_score(region & condition.holds(x0), failing)
-                grown.setdefault(frozenset((*kept, condition)), (score, (*kept, condition)))
+                grown.setdefault(frozenset((*shorter, condition)), (score, (*shorter, condition)))
         ranked = sorted(grown.values(), key=lambda found: -found[0])[:BEAM]
         beam = [conditions for _, conditions in ranked]
         if ranked and ranked[0][0] > LEAST_GAIN * best_score:
@@ -169,11 +172,9 @@ def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
     return best
 
 
-def _region(x0: Array, conditions: tuple[Condition, ...]) -> Mask:
-    held = np.ones(len(x0), dtype=bool)
-    for condition in conditions:
-        held &= condition.holds(x0)
-    return held
+def _region(x0: Array, conditions: Sequence[Condition]) -> Mask:
+    """Mask of the starts that meet all conditions."""
+    return np.asarray(np.all([np.ones(len(x0), dtype=bool), *(c.holds(x0) for c in conditions)], axis=0))
 
 
 def _f_score(region: Mask, failing: Mask) -> float:
@@ -207,27 +208,20 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
     for column, kinds in enumerate(values):
         found.extend(Condition(column, "=", value) for value in kinds.common)
         if kinds.continuous and len(bad):
-            cuts = _rounded(np.quantile(bad[:, column], np.linspace(0, 1, 11)), kinds.span)
+            digits = max(2 - int(np.floor(np.log10(kinds.span))), 0)  # about a hundredth of the span
+            cuts = np.quantile(bad[:, column], np.linspace(0, 1, 11)).round(digits).tolist()
             found.extend(Condition(column, ">=", cut) for cut in cuts[:-1] if cut not in kinds.common)
             found.extend(Condition(column, "<=", cut) for cut in cuts[1:] if cut not in kinds.common)
     return found
 
 
-def _rounded(cuts: Array, span: float) -> list[float]:
-    """Cuts rounded to about a hundredth of the column's span."""
-    digits = 2 - int(np.floor(np.log10(span)))
-    return [round(float(cut), max(digits, 0)) for cut in cuts]
-
-
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
     """The two columns for a picture: those in the region's inequalities first, then by separation."""
-    used = [condition.column for condition in conditions if condition.op != "="]
-    focus = _region(x0, tuple(condition for condition in conditions if condition.op == "="))
-    many = [c for c in range(x0.shape[1]) if len(np.unique(x0[focus, c])) > FEW_VALUES] or list(
-        range(x0.shape[1])
-    )
+    used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
+    focus = _region(x0, [each for each in conditions if each.op == "="])
+    many = [c for c in every if len(np.unique(x0[focus, c])) > FEW_VALUES] or every
     ranked = sorted(many, key=lambda c: -_separation(x0[focus, c], failing[focus]))
-    first, second, *_ = [*dict.fromkeys([*used, *ranked]), *range(x0.shape[1]), 0, 0]
+    first, second, *_ = [*dict.fromkeys([*used, *ranked]), *every, 0, 0]
     return first, second
 
 
@@ -271,7 +265,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Sentence on a region: failure rate inside, and its share of all failures."""
+    """Clause on a region: failure rate inside, and its share of all failures."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -309,7 +303,7 @@ def draw_failures(
     Args:
         held: starts and robustness of their plans.
         signature: of the system, for units and labels of states.
-        units: requirement -> that of its robustness, where it has one.
+        units: requirement -> unit of its robustness; without requirements that have none.
     """
     weakness = find_weakness(held)
     if weakness is None:
@@ -325,20 +319,18 @@ def draw_failures(
 
 def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signature | None) -> None:
     labels = tuple(condition for condition in weakness.conditions if condition.op == "=")
-    shown = np.ones(len(held.x0), dtype=bool)
-    for condition in labels:
-        shown &= condition.holds(held.x0)
+    shown = _region(held.x0, labels)
     failing = held.each[:, weakness.requirement] < -TOLERANCE
     name = held.requirements[weakness.requirement]
     where = region_text(labels, held.names, signature)
     axes.set_title(f"starts with {where}" if where else "all held-out starts")
     a, b = weakness.axes
-    kinds = [(shown & ~failing, BLUE, 5, "satisfied")]
-    if held.known is None:
-        kinds.append((shown & failing, RED, 9, f"{name} fails"))
-    else:
-        kinds.append((shown & failing & ~held.known, MUTED, 7, "no plan is known"))
-        kinds.append((shown & failing & held.known, RED, 9, f"{name} fails"))
+    known = np.ones(len(held.x0), dtype=bool) if held.known is None else held.known
+    kinds = [
+        (shown & ~failing, BLUE, 5, "satisfied"),
+        (shown & failing & ~known, MUTED, 7, "no plan is known"),
+        (shown & failing & known, RED, 9, f"{name} fails"),
+    ]
     kinds = [kind for kind in kinds if kind[0].any()]
     for mask, color, size, label in kinds:
         axes.scatter(
@@ -353,8 +345,8 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
         )
     _draw_region(axes, weakness, held.x0[shown])
     for name, write in ((held.names[a], axes.set_xlabel), (held.names[b], axes.set_ylabel)):
-        known = signature is not None and name in signature
-        write(labelled(name, signature[name].unit.text) if signature is not None and known else name)
+        declared = signature is not None and name in signature
+        write(labelled(name, signature[name].unit.text) if signature is not None and declared else name)
     axes.margins(0.02)
     legend = axes.legend(
         loc="upper left", bbox_to_anchor=(-0.02, -0.14), ncols=len(kinds), handletextpad=0.1, markerscale=1.6
@@ -370,18 +362,14 @@ def _draw_region(axes: Axes, weakness: Weakness, x0: NDArray[np.float64]) -> Non
 
     if len(x0) == 0 or not any(c.column in weakness.axes and c.op != "=" for c in weakness.conditions):
         return
-    (left, right), (low, high) = (_extent(weakness.conditions, c, x0) for c in weakness.axes)
-    axes.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec=INK, lw=1, ls=(0, (4, 2))))
-
-
-def _extent(conditions: tuple[Condition, ...], column: int, x0: NDArray[np.float64]) -> tuple[float, float]:
-    low, high = float(x0[:, column].min()), float(x0[:, column].max())
-    for condition in conditions:
-        if condition.column == column and condition.op == ">=":
-            low = max(low, condition.value)
-        if condition.column == column and condition.op == "<=":
-            high = min(high, condition.value)
-    return low, high
+    low, high = x0.min(0), x0.max(0)
+    for each in weakness.conditions:
+        if each.op == ">=":
+            low[each.column] = max(low[each.column], each.value)
+        if each.op == "<=":
+            high[each.column] = min(high[each.column], each.value)
+    corner, size = low[[*weakness.axes]], (high - low)[[*weakness.axes]]
+    axes.add_patch(Rectangle(tuple(corner), *size, fill=False, ec=INK, lw=1, ls=(0, (4, 2))))
 
 
 def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness, units: Mapping[str, str]) -> None:
@@ -391,12 +379,10 @@ def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness, units: Mapping[
     rho = held.each[:, weakness.requirement]
     rho = rho[np.isfinite(rho)]
     low, high = np.quantile(rho, [0.002, 0.998])
-    edges = np.linspace(min(low, -1e-3), max(high, 1e-3), 46)
-    edges = np.sort(np.append(edges, -TOLERANCE))
-    bins = edges.tolist()
-    clipped = np.clip(rho, edges[0], edges[-1])
-    for mask, color in ((rho >= -TOLERANCE, BLUE), (rho < -TOLERANCE, RED)):
-        axes.hist(clipped[mask], bins=bins, color=color, alpha=0.85)
+    edges = np.sort(np.append(np.linspace(min(low, -1e-3), max(high, 1e-3), 46), -TOLERANCE))
+    clipped, fails = np.clip(rho, edges[0], edges[-1]), rho < -TOLERANCE
+    axes.hist(clipped[~fails], bins=edges.tolist(), color=BLUE, alpha=0.85)
+    axes.hist(clipped[fails], bins=edges.tolist(), color=RED, alpha=0.85)
     axes.axvline(0, color=INK, lw=0.8)
     axes.set_yscale("symlog", linthresh=10)
     axes.set_ylim(bottom=0)

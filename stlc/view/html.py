@@ -54,6 +54,11 @@ def classed(name: str, kind: str, *children: Child) -> Html:
     return el(name, *children, attrs={"class": kind})
 
 
+def with_code(text: str) -> Html:
+    """Text whose parts in backticks are code."""
+    return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
+
+
 def table(
     header: Sequence[str],
     rows: Iterable[Sequence[Child]],
@@ -64,15 +69,12 @@ def table(
     """A table of class `kind`; the columns `numeric` are right-aligned."""
 
     def row(cell: str, cells: Sequence[Child]) -> Html:
-        return el("tr", [_cell(cell, value, i in numeric) for i, value in enumerate(cells)])
+        attrs = [{"class": "num"} if index in numeric else None for index in range(len(cells))]
+        return el("tr", [el(cell, each, attrs=own) for each, own in zip(cells, attrs, strict=True)])
 
     head = el("thead", row("th", header)) if header else None
     body = el("tbody", [row("td", cells) for cells in rows])
     return classed("div", "scroll", classed("table", kind, head, body))
-
-
-def _cell(name: str, value: Child, numeric: bool) -> Html:
-    return el(name, value, attrs={"class": "num"} if numeric else None)
 
 
 def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
@@ -87,13 +89,6 @@ def facts(pairs: Iterable[tuple[str, Child]]) -> Html:
 
 
 # ---------------------------------------------------------------------- page
-
-
-SHEET = "report.css"
-
-
-def _sheet() -> str:
-    return (files("stlc.view") / SHEET).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +139,7 @@ def page(
             el("meta", attrs={"name": "viewport", "content": "width=device-width, initial-scale=1"}),
             el("meta", attrs={"http-equiv": "Content-Security-Policy", "content": policy}),
             el("title", title),
-            el("style", Html(_sheet())),
+            el("style", Html((files("stlc.view") / "report.css").read_text(encoding="utf-8"))),
         ),
         el(
             "body",

@@ -58,12 +58,12 @@ class Learning:
     """Verdict on a training.
 
     Attributes:
-        level: in one word.
+        level: degree of training.
         share: accuracy over the known feasible starts; None without any.
         sentence: level and share as a sentence.
-        worst: the worst requirement and its failure region, as a sentence; "" if none fails.
-        advice: one sentence each.
+        advice: sentences of advice.
         command: the next command.
+        worst: the worst requirement and its failure region, as a sentence; "" if none fails.
     """
 
     level: Level
@@ -90,7 +90,7 @@ class Commands:
     """Commands of one run that a verdict may recommend.
 
     Attributes:
-        train_on: resumes the training, without a budget.
+        train_on: resumes the training; a budget is appended.
         simulate: simulates the policy under the recommended guard.
         report: writes the report.
     """
@@ -129,7 +129,7 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
     try:
         guards = [each for each in found.get("guards") or () if isinstance(each, Mapping)]
         if not guards:
-            why = found.get("why") or "no drive came to its end in the time that there was"
+            why = found.get("why") or "no drive ended within the time limit"
             return [f"not driven: {why}"]
         best = found.get("recommended")
         first = sorted(guards, key=lambda each: each.get("guard") != best)
@@ -182,7 +182,7 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
 def learning_on_record(
     record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
 ) -> Learning | None:
-    """The verdict on the training in `run.json` and `train.jsonl`; None if it is not finished."""
+    """The verdict on the training with this `run.json` and `train.jsonl`; None if it is not finished."""
     result = record.get("result")
     if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
         return None
@@ -202,77 +202,72 @@ def learning_of(
 
     Args:
         result: that of `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
-        rows: of `train.jsonl`.
-        commands: that may be recommended.
+        rows: lines of `train.jsonl`.
+        commands: commands that may be recommended.
         where: failure region of the worst requirement as a clause ("fails in …"), or "".
     """
     accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
     if feasible <= 0.0:
-        sentence = (
-            "no plan that satisfies the specification was found for any start, by the policy or by search"
-        )
-        proved = bool(result.get("proved"))
-        if proved:
+        if result.get("proved"):
+            level: Level = "infeasible"
             sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
-        more = "more training cannot help" if proved else "more training hardly helps where there is no plan"
-        advice: tuple[str, ...] = (
-            f"a looser specification, a longer horizon, or another initial set: {more}",
-        )
-        level: Level = "infeasible" if proved else "no plan known"
-        return Learning(level, None, sentence, advice, commands.report)
+            more = "more training cannot help"
+        else:
+            level = "no plan known"
+            sentence = "neither the policy nor search found a satisfying plan for any start"
+            more = "more training hardly helps where there is no plan"
+        advice = f"a looser specification, a longer horizon, or another initial set: {more}"
+        return Learning(level, None, sentence, (advice,), commands.report)
     part = min(accuracy / feasible, 1.0)
     level = "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
     searched, held_out = int(result.get("searched") or 0), int(result.get("held_out") or 0)
     sampled = 0 < searched < held_out
     estimate = f", by an estimate from {searched:,} of the {held_out:,} starts" if sampled else ""
     sentence = (
-        f"the policy's plan satisfies the specification from {share(accuracy)} of the starts; some plan that "
-        f"does is known for {share(feasible)}{estimate}"
+        f"the policy's plan satisfies the specification from {share(accuracy)} of the starts; a satisfying "
+        f"plan is known for {share(feasible)}{estimate}"
     )
     worst, hard = _worst(result, where), _hard_starts(feasible, sampled=sampled)
     if level == "trained":
         return Learning(level, part, sentence, hard, commands.simulate, worst)
-    curve = forecast(rows, accuracy, feasible)
-    longer = _longer(curve, float(result.get("seconds") or 0.0), commands)
-    if level == "partly trained":
-        return Learning(level, part, sentence, (longer[0], *hard), commands.simulate, worst)
-    guard = (
-        f"`{commands.simulate}` shows what the guard makes of it: it replaces rejected plans where it finds "
-        "better ones, and the policy stays as it is"
+    longer, command = _longer(
+        forecast(rows, accuracy, feasible), float(result.get("seconds") or 0.0), commands
     )
-    return Learning(level, part, sentence, (longer[0], *hard, guard), longer[1] or commands.report, worst)
+    if level == "partly trained":
+        return Learning(level, part, sentence, (longer, *hard), commands.simulate, worst)
+    guard = (
+        f"`{commands.simulate}` shows what the guard adds: it replaces rejected plans by better ones that it "
+        "finds, and leaves the policy unchanged"
+    )
+    return Learning(level, part, sentence, (longer, *hard, guard), command or commands.report, worst)
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
-    """Extrapolation of plan accuracy towards `feasible`, from rows and the final `accuracy`.
+    """Extrapolate plan accuracy towards `feasible`, from the rows of a training and its final `accuracy`.
 
-    The log-odds of success are fitted by a line over the logarithm of the step, from a quarter of the steps
-    on; its slope is continued from the final accuracy. A rough figure, as the learning rate decays at the end
-    of every training.
+    The log-odds of success are fitted by a line over the logarithm of the step, without the first quarter of
+    the steps; the line is continued from the final accuracy. The forecast is rough, as the learning rate
+    decays at the end of every training.
     """
     pairs = [
         (float(row["step"]), float(row["accuracy"]) / feasible)
         for row in rows
         if row.get("accuracy") is not None and row.get("step")
     ]
-    late = [(step, value) for step, value in pairs if 4.0 * step >= pairs[-1][0]]
+    late = [(math.log2(step), _log_odds(value)) for step, value in pairs if 4.0 * step >= pairs[-1][0]]
     if len(late) < LEAST_ROUNDS:
         return Curve("short")
-    doublings = np.log2([step for step, _ in late])
-    odds = np.array([_log_odds(value) for _, value in late])
-    centred = doublings - doublings.mean()
-    growth = float((centred * odds).sum() / (centred * centred).sum())
-    left = odds - odds.mean() - growth * centred
-    doubt = math.sqrt(float((left * left).sum()) / (len(late) - 2) / float((centred * centred).sum()))
-    if growth - doubt < FLAT:
+    doublings, odds = np.array(late).T
+    (growth, _), covariance = np.polyfit(doublings, odds, 1, cov=True)
+    if growth - math.sqrt(covariance[0, 0]) < FLAT:
         return Curve("flat")
     times = 2.0 ** min((_log_odds(TRAINED) - _log_odds(accuracy / feasible)) / growth, 60.0)
     return Curve("rising", times if times <= MOST_TIMES else None)
 
 
 def _log_odds(value: float) -> float:
-    kept = min(max(value, 0.001), 0.999)
-    return math.log(kept / (1.0 - kept))
+    bounded = min(max(value, 0.001), 0.999)
+    return math.log(bounded / (1.0 - bounded))
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
@@ -283,19 +278,17 @@ def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]
             late = min(times * times, MOST_TIMES)
             command = f"{commands.train_on} --budget {budget_text(max((late - 1.0) * seconds, 10.0))}"
             about = f"{duration(_rough(times * seconds))} to {duration(_rough(late * seconds))}"
-            told = f"a longer budget: the curve is rising, and points to {share(TRAINED, 0)} of what is known"
-            return f"{told} to be feasible after {about} in all (a rough figure): `{command}`", command
+            text = f"a longer budget: the curve is rising, and points to {share(TRAINED, 0)} of what is known"
+            return f"{text} to be feasible after {about} in all (a rough figure): `{command}`", command
         case "rising", _:
-            told = (
-                "a much longer budget: the curve is rising, but slowly, and no time can be foretold from it"
-            )
-            return f"{told}: `{twice}`", twice
+            text = "a much longer budget: the curve is rising, but too slowly for a forecast of the time"
+            return f"{text}: `{twice}`", twice
         case "flat", _:
-            told = "a longer budget alone promises little, the curve is flat: let the policy see what decides"
-            return f"{told} (`policy: {{observe: …}}`), or look at where it fails: `{commands.report}`", ""
-    told = f"a longer budget: {LEAST_ROUNDS} search rounds are needed to say how long, and there were fewer"
+            text = "a longer budget alone promises little, the curve is flat: let the policy see what decides"
+            return f"{text} (`policy: {{observe: …}}`), or look at where it fails: `{commands.report}`", ""
+    text = f"a longer budget: {LEAST_ROUNDS} search rounds are needed to say how long, and there were fewer"
     enough = f"{commands.train_on} --budget {budget_text(max(seconds, 60.0))}"
-    return f"{told}: `{enough}`", enough
+    return f"{text}: `{enough}`", enough
 
 
 def _worst(result: Mapping[str, Any], where: str) -> str:
@@ -310,15 +303,15 @@ def _worst(result: Mapping[str, Any], where: str) -> str:
 def _hard_starts(feasible: float, *, sampled: bool) -> tuple[str, ...]:
     if feasible > MUCH_INFEASIBLE:
         return ()
-    about = "about " if sampled else ""
-    told = f"for {about}{share(1.0 - feasible)} of the starts search found no satisfying plan either"
+    starts = f"{'about ' if sampled else ''}{share(1.0 - feasible)} of the starts"
     return (
-        f"{told}; where there is none, only a narrower `init`, a longer `horizon` or later deadlines help",
+        f"for {starts} search found no satisfying plan either; where there is none, only a narrower `init`, "
+        "a longer `horizon` or later deadlines help",
     )
 
 
 def _rough(seconds: float) -> float:
-    """A duration with one digit, or two where the first is a 1."""
+    """A duration rounded to one significant digit, or to two if the first is 1."""
     digits = math.floor(math.log10(max(seconds, 1.0)))
     step = 10.0**digits if seconds >= 2.0 * 10.0**digits else 10.0 ** (digits - 1)
     return float(round(max(seconds, 1.0) / step)) * step

@@ -15,13 +15,13 @@ from stlc.monitor.judgement import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged
-from stlc.view.html import Child, Html, Section, classed, el, figure, join, table
+from stlc.view.html import Child, Html, Section, classed, el, figure, join, table, with_code
 from stlc.view.region_map import draw_map, map_of
 from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
 from stlc.view.verdicts import judged_at_start, margins_of, monitor_of, trace_names, units_of
 from stlc.view.words import count, share
 
-TITLE = "What was driven"
+TITLE = "Recorded runs"
 MAP_CAPTION = (
     "Paths over the regions that the specification names, from the hollow points to the full ones. Beside "
     "the map the share of traces in each region over time (shaded: times at which it is active; dashed: the "
@@ -39,10 +39,7 @@ def recorded_section(contents: RunContents) -> Section | None:
         verdict = monitor.check(trace)
         margins = margins_of(monitor, verdict, trace)
     except StlcError as error:
-        reason = el(
-            "p", "The trace could not be judged: ", "; ".join(d.message for d in error.diagnostics), "."
-        )
-        return Section("driven", TITLE, reason)
+        return Section("driven", TITLE, el("p", f"The trace could not be judged: {_messages(error)}."))
     names = trace_names(trace)
     causes = explain_all(verdict)
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
@@ -65,8 +62,7 @@ def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html |
         monitor = monitor_of(trace, system=contents.run.path / "system.yaml", drives=True)
         verdict = monitor.check(trace)
     except StlcError as error:
-        said = "; ".join(d.message for d in error.diagnostics)
-        return el("p", "The drives could not be judged by their rules: ", said, ".")
+        return el("p", f"The drives could not be judged by their rules: {_messages(error)}.")
     obeyed = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')} obeyed every rule of "
     causes = explain_all(verdict)
     return join(
@@ -75,6 +71,10 @@ def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html |
         causes_of(causes, names, monitor.spec),
         el("h3", "Window by window, as plans are judged"),
     )
+
+
+def _messages(error: StlcError) -> str:
+    return "; ".join(diagnostic.message for diagnostic in error.diagnostics)
 
 
 def _monitor(contents: RunContents, trace: Trace) -> Monitor:
@@ -105,18 +105,12 @@ def _per_trace(verdict: Verdict) -> NDArray[np.float64]:
 def _summary(verdict: Verdict) -> str:
     traces = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'trace')}"
     whole = f"{traces} satisfy every requirement at every start"
-    return f"{whole}; from {share(verdict.share)} of all starts what was driven satisfies all of them."
+    return f"{whole}; from {share(verdict.share)} of all starts the trajectory satisfies all requirements."
 
 
 def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[str]) -> Html:
-    header = (
-        "requirement",
-        "verdict",
-        "violating traces",
-        "starts that satisfy it",
-        "least robustness",
-        "where",
-    )
+    counts = ("violating traces", "satisfying starts", "least robustness")
+    header = ("requirement", "verdict", *counts, "where")
     rows: list[tuple[Child, ...]] = []
     for judgement in verdict:
         trace, _ = judgement.worst
@@ -169,13 +163,11 @@ def _caption(trace: Trace, once: list[str]) -> Html:
     if acted is None or not acted.any():
         return join(words)
     sources = {int(value) for value in np.unique(trace.extras["decision"])} & DECISIONS.keys()
-    keys = [_key(*DECISIONS[source]) for source in sorted(sources - {POLICY})]
+    keys = []
+    for word, color in (DECISIONS[source] for source in sorted(sources - {POLICY})):
+        swatch = el("span", attrs={"class": "key", "style": f"background:{color}"})
+        keys += [classed("span", "whole", swatch, word), "  "]
     return join(words, "Shaded, where the policy did not decide: ", keys)
-
-
-def _key(word: str, color: str) -> Html:
-    swatch = el("span", attrs={"class": "key", "style": f"background:{color}"})
-    return join(classed("span", "whole", swatch, word), "  ")
 
 
 def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
@@ -183,8 +175,8 @@ def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> 
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
-    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes.values()]
-    return join(el("h3", "What failed, and why"), told)
+    listed = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes.values()]
+    return join(el("h3", "Violations and their causes"), listed)
 
 
 def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) -> Html:
@@ -195,21 +187,16 @@ def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) ->
         for label in labels
         if written.start <= label.span.start and label.span.end <= written.end
     )
-    told = [el("li", el("code", " ".join(label.span.text.split())), f" is {label.text}") for label in labels]
+    items = [el("li", el("code", " ".join(label.span.text.split())), f" is {label.text}") for label in labels]
     return join(
         el("p", el("strong", cause.judgement.name), f" fails worst in {names[cause.trace]}."),
         el("pre", _marked(written.text, marks)),
-        el("ul", told, el("li", "because ", _code(cause.because))),
+        el("ul", items, el("li", "because ", with_code(cause.because))),
     )
 
 
-def _code(text: str) -> Html:
-    """Text with its parts in backticks as code."""
-    return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
-
-
 def _marked(text: str, marks: list[tuple[int, int]]) -> Html:
-    """`text` with the ranges `marks` (start, end) highlighted; overlapping ones are merged."""
+    """`text` with the ranges `marks` (start, end) highlighted; overlapping ranges are merged."""
     parts: list[Html | str] = []
     last = 0
     for start, end in marks:

@@ -8,7 +8,7 @@ follows the reader's light or dark scheme. Missing parts (a deployment, say) are
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from stlc.view.html import (
     page,
     spec_html,
     table,
+    with_code,
     yaml_html,
 )
 from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
@@ -53,7 +54,7 @@ REPORT = "report.html"
 
 
 def write_report(run: RunDir) -> Path:
-    """Write the report of `run` into its folder, its pictures beside it as PNG; returns the report's path.
+    """Write the report of a run and its pictures as PNG into the run's folder; return the report's path.
 
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
@@ -86,19 +87,22 @@ def sections_of(contents: RunContents) -> list[Section]:
 
 
 def render_report(contents: RunContents, sections: list[Section]) -> str:
-    """The page of `material`."""
+    """The page of a run."""
     animation = player_section(contents)
+    tiles = [(value, name) for value, name in _training_tiles(contents.result) if value]
+    tiles += deployment_tiles(contents)
+    shown = [classed("div", "tile", el("b", value), el("span", name)) for value, name in tiles]
     head = join(
         headline(contents),
-        animation.html if animation is not None else None,
-        numbers(contents, deployment_tiles(contents)),
+        None if animation is None else animation.html,
+        classed("div", "tiles", shown) if shown else None,
     )
     return page(
         f"{contents.spec} · {contents.run.name}",
         head,
         sections,
         f"Written by stlc {__version__} from {contents.run.shown}",
-        script() if animation is not None else None,
+        None if animation is None else script(),
     )
 
 
@@ -108,28 +112,21 @@ def render_report(contents: RunContents, sections: list[Section]) -> str:
 def headline(contents: RunContents) -> Html:
     """Result of the run in one sentence, with advice.
 
-    A deployed run is judged by its closed-loop runs, another by its plans.
+    A simulated run is judged by its closed-loop runs, another by its plans.
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
-    driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
-    trial = [] if driven else driven_lines(result or {})
-    head = f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else _verdict(contents)
+    obeyed, viable = obeyed_sentence(simulation), viable_sentence(simulation)
+    verdict = _verdict(contents)
+    trial = [] if obeyed else driven_lines(result)
     names = dict.fromkeys((contents.spec, str(record.get("system", "")), f"run {contents.run.name}"))
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
-        el("h1", driven or head),
-        el("p", *_spoken(". ".join((*trial[1:], _verdict(contents))))) if trial else None,
-        el("p", f"{lost}.") if lost else None,
-        el("p", f"{_verdict(contents)}. {_beside(result)}" if driven else _beside(result))
-        if result
-        else None,
+        el("h1", obeyed or (f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else verdict)),
+        el("p", _sentence(". ".join((*trial[1:], verdict)))) if trial else None,
+        el("p", f"{viable}.") if viable else None,
+        el("p", f"{verdict}. {_beside(result)}" if obeyed else _beside(result)) if result else None,
         _advice(contents),
     )
-
-
-def numbers(contents: RunContents, tiles: list[tuple[str, str]]) -> Html | None:
-    """Key figures of the training; `tiles` adds those of the deployment."""
-    return _tiles([*_training_tiles(contents.result), *tiles])
 
 
 def _verdict(contents: RunContents) -> str:
@@ -143,21 +140,16 @@ def _verdict(contents: RunContents) -> str:
 
 def _beside(result: Mapping[str, Any]) -> str:
     accuracy, feasible, ends = result.get("accuracy"), result.get("feasible"), result.get("interval")
-    parts = [f"The 95 % interval is {interval(ends)}." if ends else ""]
+    parts = [f"The 95 % interval is {interval(ends)}."] if ends else []
     if feasible and accuracy is not None:
+        searched, held_out = result.get("searched"), result.get("held_out")
+        sampled = searched and held_out and searched < held_out
+        estimate = f" (an estimate: {searched:,} were searched or solved)" if sampled else ""
         parts.append(
-            f"Some satisfying plan is known for {share(feasible)} of them{_sampled(result)}; the policy "
+            f"Some satisfying plan is known for {share(feasible)} of them{estimate}; the policy "
             f"finds {share(accuracy / feasible)} of what is known to be feasible."
         )
-    return " ".join(part for part in parts if part)
-
-
-def _sampled(result: Mapping[str, Any]) -> str:
-    """Remark that the share is an estimate if not all starts were searched."""
-    searched, held_out = result.get("searched"), result.get("held_out")
-    if not searched or not held_out or searched >= held_out:
-        return ""
-    return f" (an estimate: {searched:,} were searched or solved)"
+    return " ".join(parts)
 
 
 def _advice(contents: RunContents) -> Html | None:
@@ -168,35 +160,26 @@ def _advice(contents: RunContents) -> Html | None:
     if learning is None or not learning.advice:
         return None
     level = f"{learning.level[0].upper()}{learning.level[1:]}."
-    told = (*learning.advice[:1], *filter(None, [learning.worst]), *learning.advice[1:])
-    items = [el("li", *_spoken(advice)) for advice in told]
+    advice = (*learning.advice[:1], *filter(None, [learning.worst]), *learning.advice[1:])
+    items = [el("li", _sentence(each)) for each in advice]
     return join(el("p", el("strong", level), " What helps:"), el("ul", items))
 
 
-def _spoken(advice: str) -> list[Child]:
+def _sentence(advice: str) -> Html:
     """Advice as a sentence, capitalised and with a full stop, commands marked as code."""
-    sentence = f"{advice[0].upper()}{advice[1:]}."
-    return [el("code", part) if i % 2 else part for i, part in enumerate(sentence.split("`"))]
+    return with_code(f"{advice[0].upper()}{advice[1:]}.")
 
 
 def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     accuracy, feasible = result.get("accuracy"), result.get("feasible")
-    driven = result.get("closed_loop")
-    closed = driven.get("share") if isinstance(driven, Mapping) else None
-    tiles = [(share(closed), "of drives satisfied")] if closed is not None else []
-    tiles.append((share(accuracy), "plan accuracy"))
-    if accuracy is not None and feasible:
-        tiles.append((share(accuracy / feasible), "of what is known feasible"))
-    tiles.append((seconds(result.get("seconds")), "of training and verdict"))
-    return [(value, name) for value, name in tiles if value]
-
-
-def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
-    if not tiles:
-        return None
-    return classed(
-        "div", "tiles", [classed("div", "tile", el("b", value), el("span", name)) for value, name in tiles]
-    )
+    part = accuracy / feasible if accuracy is not None and feasible else None
+    executed = result.get("closed_loop")
+    return [
+        (share(executed.get("share")) if isinstance(executed, Mapping) else "", "of drives satisfied"),
+        (share(accuracy), "plan accuracy"),
+        (share(part), "of what is known feasible"),
+        (seconds(result.get("seconds")), "of training and verdict"),
+    ]
 
 
 def requirements_section(contents: RunContents) -> Section | None:
@@ -235,7 +218,7 @@ def _described(contents: RunContents, name: str) -> Html:
 def training_section(contents: RunContents) -> Section:
     """Curves, options, machine and versions."""
     curves = draw_curves(contents.rows)
-    shown = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
+    shown = figure(curves.data_uri(), curves.alt, CURVES_CAPTION) if curves else None
     last = contents.rows[-1] if contents.rows else {}
     search = None
     if last.get("failing") is not None:
@@ -248,38 +231,42 @@ def training_section(contents: RunContents) -> Section:
     return Section("training", "How it was trained", body, curves)
 
 
-_CURVES = (
+CURVES_CAPTION = (
     "Plan accuracy while training, with the share of starts for which some satisfying plan is known; "
-    "each requirement alone; the loss over the learning rate (shaded). Faint what was measured, on a few "
-    "fresh starts each time; strong its running mean, with its last value."
+    "each requirement alone; the loss over the learning rate (shaded). Faint lines are measurements on a few "
+    "fresh starts; strong lines are their running means, whose last values the legend gives."
 )
 
 
 def _facts(contents: RunContents) -> list[tuple[str, Child]]:
     record = contents.record
     hardware, git = record.get("hardware") or {}, record.get("git") or {}
-    versions = record.get("versions") or {}
-    budget = record.get("budget")
-    steps = record.get("steps")
-    taken = f"{steps:,} steps" if isinstance(steps, int) else ""
+    budget, steps = record.get("budget"), record.get("steps")
+    length = f"{steps:,} steps" if isinstance(steps, int) else ""
     if budget:
-        taken += (
-            f" (a budget of {budget if isinstance(budget, str) else seconds(float(budget))}{_clock(record)})"
-        )
+        processor = (record.get("options") or {}).get("clock") == "processor"
+        time = budget if isinstance(budget, str) else seconds(float(budget))
+        length += f" (a budget of {time}{' of processor time' if processor else ''})"
+    engine = record.get("engine") or record.get("options") or {}
+    options = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
+    if record.get("margin") is not None:
+        options.append(f"margin {number(float(record['margin']))}")
+    threads = f", {count(int(record['threads']), 'thread')}" if record.get("threads") else ""
     machine = (
         str(hardware.get("processor") or hardware.get("machine") or ""),
         count(int(hardware["cores"]), "core") if hardware.get("cores") else "",
-        f"{number(hardware['memory_gib'], 'GiB')}" if hardware.get("memory_gib") else "",
+        number(hardware.get("memory_gib") or None, "GiB"),
         str(hardware.get("system", "")),
     )
     commit = str(git.get("commit", ""))[:12]
+    versions = (record.get("versions") or {}).items()
     return [
-        ("steps", taken),
-        ("options", _options(record)),
+        ("steps", length),
+        ("options", ", ".join(options)),
         ("seed", str(record.get("seed", ""))),
-        ("device", _device(record)),
+        ("device", f"{record.get('device', '')}{threads}"),
         ("machine", ", ".join(part for part in machine if part)),
-        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions)),
         ("source", f"{commit}{', with uncommitted changes' if git.get('dirty') else ''}" if commit else ""),
         ("started", str(record.get("started", ""))),
         ("specification", _hashed(record, "spec")),
@@ -287,26 +274,7 @@ def _facts(contents: RunContents) -> list[tuple[str, Child]]:
     ]
 
 
-def _clock(record: Mapping[str, Any]) -> str:
-    """Clock of a budget if it is not the wall clock."""
-    return " of processor time" if (record.get("options") or {}).get("clock") == "processor" else ""
-
-
-def _options(record: Mapping[str, Any]) -> str:
-    """Resolved options that the run records."""
-    engine = record.get("engine") or record.get("options") or {}
-    shown = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
-    if record.get("margin") is not None:
-        shown.append(f"margin {number(float(record['margin']))}")
-    return ", ".join(shown)
-
-
 _OPTIONS = ("method", "hidden", "plans", "batch", "lr")
-
-
-def _device(record: Mapping[str, Any]) -> str:
-    device, threads = str(record.get("device", "")), record.get("threads")
-    return f"{device}, {count(int(threads), 'thread')}" if threads else device
 
 
 def _hashed(record: Mapping[str, Any], what: str) -> Child:
@@ -339,8 +307,8 @@ def failures_section(contents: RunContents) -> Section | None:
         return Section("failures", "Where plans fail", el("p", text))
     boxed = "; the dashed box is the region named above" if picture.figure.axes[0].patches else ""
     caption = (
-        f"Held-out starts over the two columns that tell most about failing{boxed}. "
-        "Right: how far the plans are from failing (counts on a logarithmic scale)."
+        f"Held-out starts over the two states that separate failures best{boxed}. "
+        "Right: robustness of the plans (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
     left = el("p", f"Unsolved: {unsolved_text(contents.held_out)}.")
@@ -394,31 +362,19 @@ def _simulate(contents: RunContents) -> list[str]:
     words = ["stlc", "simulate", contents.run.shown, *guard_words(guard).option.split()]
     if done.get("scenario"):
         words += ["--scenario", str(done["scenario"])]
-    seeds = done.get("seeds") or range(10)
-    if list(seeds) != list(range(10)):
-        words += ["--seeds", _seeds(seeds)]
-    for name, usual in (("agents", contents.usual.get("agents")), ("steps", contents.usual.get("steps"))):
-        if done.get(name) not in (None, usual):
+    seeds = list(done.get("seeds") or range(10))
+    if seeds != list(range(10)):
+        whole = len(seeds) > 1 and seeds == list(range(seeds[0], seeds[-1] + 1))
+        words += ["--seeds", f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))]
+    for name in ("agents", "steps"):
+        if done.get(name) not in (None, contents.usual.get(name)):
             words += [f"--{name}", str(done[name])]
-    return words + _limits(done)
-
-
-def _seeds(seeds: Sequence[int]) -> str:
-    """Seeds in the notation of `--seeds`: `0..9`, or `0,3`."""
-    whole = len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1))
-    return f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))
-
-
-def _limits(done: Mapping[str, Any]) -> list[str]:
-    """Options of the guard that differ from the defaults."""
-    words = []
-    hurried = done.get("paper_time_limit") is not None
-    if hurried or ("time_limit" in done and done["time_limit"] != USUAL_LIMIT):
-        limit = done["time_limit"]
+    limit = done.get("time_limit", USUAL_LIMIT)
+    if limit != USUAL_LIMIT or done.get("paper_time_limit") is not None:
         words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
     words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []
-    asked = done.get("margin") or {}
-    return words + [word for name in asked for word in ("--margin", f"{name}={asked[name]:.6g}")]
+    margins = (done.get("margin") or {}).items()
+    return words + [word for name, value in margins for word in ("--margin", f"{name}={value:.6g}")]
 
 
 def texts_section(contents: RunContents) -> Section | None:

@@ -118,7 +118,12 @@ def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A trace to show and the reason for it."""
+    """A trace to draw.
+
+    Attributes:
+        index: number of the trace.
+        title: heading, such as `worst: trace 3`.
+    """
 
     index: int
     title: str
@@ -127,7 +132,9 @@ class Choice:
 def choose_traces(
     least: Floats, names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
 ) -> tuple[Choice, ...]:
-    """The worst trace, and the one with most interventions or else a typical one; one if they coincide.
+    """The trace with the least robustness, and that with most interventions, else one of median robustness.
+
+    One trace if both are the same.
 
     Args:
         least: robustness per trace, (traces,); NaN if unknown.
@@ -153,7 +160,7 @@ def draw_signals(
         trace: the recording.
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
         choices: the traces to show.
-        units: requirement -> unit of its robustness, where it has one.
+        units: requirement -> unit of its robustness; without requirements that have none.
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
@@ -198,7 +205,7 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
 
 
 def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
-    """Draw the legend of margins and decisions."""
+    """Draw the legend of robustness margins and decisions."""
     from matplotlib.patches import Patch
 
     keys = [(BLUE, 0.5, "robustness margin"), (RED, None, "violated")] if judged else []
@@ -283,8 +290,8 @@ class Strip:
         margins: requirement -> least robustness of all agents from each instant on, (frames,); NaN if
             unknown.
         decisions: sources of the decisions, (frames, agents); None if not recorded.
-        words: meaning of the margins, for a heading.
-        units: requirement -> unit of its margin, where it has one.
+        words: description of the margins, for a heading.
+        units: requirement -> unit of its margin; without requirements that have none.
     """
 
     times: Floats
@@ -324,7 +331,12 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class FrameUpdate:
-    """Function that updates artists to a frame, and these artists."""
+    """Artists that change from frame to frame.
+
+    Attributes:
+        turn: updates the artists to a frame.
+        artists: the artists.
+    """
 
     turn: Callable[[int], None]
     artists: tuple[Artist, ...]
@@ -387,7 +399,7 @@ def _titled(axes: Axes, name: str) -> Text:
 
 
 def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
-    """A cover over the future and a line at the present time."""
+    """Cover the time after the present one, and draw a line at the present time."""
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))
@@ -408,7 +420,7 @@ def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
 
 
 def signal_animation(trace: Trace, *, title: str = "") -> Animation:
-    """The animation of a trace without a world or regions: a panel per signal, with all agents."""
+    """Animation of a trace without a world or regions: a panel per signal, with all agents."""
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 

@@ -1,8 +1,8 @@
-"""Verdicts on recorded runs by their own specification: monitor, margins, violation events."""
+"""Verdicts on recorded runs by their own specification: monitor, robustness margins, violation events."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Fl
 
 
 def units_of(verdict: Verdict) -> dict[str, str]:
-    """Requirement -> unit of its robustness, where it has one."""
+    """Requirement -> unit of its robustness; without requirements that have none."""
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
@@ -90,29 +90,28 @@ def trace_names(trace: Trace) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class SceneVerdicts:
-    """The runs of a scene's agents (those of the first seed) and the verdict on them.
+    """The runs of a scene's agents (those of the first seed) and the verdicts on them.
 
     Attributes:
-        trace: of these agents.
-        monitor: of the specification of plans.
-        verdict: of that monitor.
-        executed: verdict by the rules for closed-loop runs, if stored; else the same.
-        foreseen: model-consistent samples: the world followed the model for the length of a plan, (agents,
-            samples); None: not recorded.
+        trace: recording of these agents.
+        monitor: monitor of the specification of plans.
+        verdict: verdict of that monitor.
+        executed: verdict by the rules for closed-loop runs, if stored; else equal to `verdict`.
+        consistent: mask of the model-consistent samples, (agents, samples); None if not recorded.
     """
 
     trace: Trace
     monitor: Monitor
     verdict: Verdict
     executed: Verdict
-    foreseen: Mask | None
+    consistent: Mask | None
 
     @property
     def marked(self) -> set[str]:
-        """Requirements whose violations are marked: all rules for runs, else those tagged `@safety`."""
-        names = {judgement.name for judgement in self.executed if "safety" in judgement.rule.tags}
+        """Requirements whose violations are marked: all rules for runs; without rules those tagged `@safety`."""
+        safety = {each.name for each in self.executed if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
-        return names if names and not ruled else {judgement.name for judgement in self.executed}
+        return safety if safety and not ruled else {each.name for each in self.executed}
 
 
 def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
@@ -121,21 +120,22 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
     Raises:
         StlcError: the trace cannot be judged.
     """
-    first = {name: values[:agents] for name, values in trace.data.items()}
-    monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
-    verdict = executed = monitor.check(seen)
+    data = {name: values[:agents] for name, values in trace.data.items()}
+    monitor, first = monitor_of(trace, system=system), replace(trace, data=data, extras={})
+    verdict = executed = monitor.check(first)
     if trace.meta.judge_text:
-        executed = monitor_of(trace, system=system, drives=True).check(seen)
-    return SceneVerdicts(seen, monitor, verdict, executed, model_consistent(trace, agents))
+        executed = monitor_of(trace, system=system, drives=True).check(first)
+    return SceneVerdicts(first, monitor, verdict, executed, model_consistent(trace, agents))
 
 
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins and of the decisions, (frames, agents)."""
     rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
     times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
-    if judged.foreseen is not None:
-        margins = {name: least(rho, judged.foreseen) for name, rho in rows.items()}
-        if _known(margins) >= ENOUGH * _known(every):
+    if judged.consistent is not None:
+        margins = {name: least(rho, judged.consistent) for name, rho in rows.items()}
+        known, all_known = (np.isfinite([*each.values()]).sum() for each in (margins, every))
+        if known >= ENOUGH * all_known:
             return Strip(times, margins, decisions, CONSISTENT_ONLY, units)
     return Strip(times, every, decisions, units=units)
 
@@ -159,10 +159,6 @@ def least(rho: Floats, counts: Mask | bool = True) -> Floats:
     return np.where(np.isfinite(known), known, np.nan)
 
 
-def _known(margins: Mapping[str, Floats]) -> int:
-    return sum(int(np.isfinite(rho).sum()) for rho in margins.values())
-
-
 # ------------------------------------------------------------------------------------- violations
 
 
@@ -171,9 +167,9 @@ class Event:
     """A violation by one agent.
 
     Attributes:
-        requirement: its name.
+        requirement: name of the requirement.
         agent: number of the trace.
-        sample: of the violation.
+        sample: first sample of the violation.
         until: last sample of consecutive violations.
         start: first sample of the violated window.
         because: cause in one line.
@@ -190,8 +186,8 @@ class Event:
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
     """Violations by the first `agents` traces, in order of time.
 
-    A violation is placed at its cause. The search continues with windows that begin after that instant, so
-    that each cause is found once; it ends after `most` events of a requirement.
+    A violation is placed at its cause. The search then continues with windows that begin after that instant,
+    so that each cause is found once, and ends after `most` events of a requirement.
     """
     found: list[Event] = []
     for judgement in verdict:
@@ -223,9 +219,9 @@ def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[s
 
     Args:
         events: violations.
-        frames: instants of the animation.
-        agents: number of agents in it.
-        names: requirements that count; None: all.
+        frames: number of instants.
+        agents: number of agents.
+        names: requirements whose violations are marked; None for all.
     """
     shown = np.zeros((frames, agents), dtype=bool)
     pattern = np.array(FLASH * FLASHES)

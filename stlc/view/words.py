@@ -31,7 +31,7 @@ def number(value: float | None, unit: str = "") -> str:
 
 
 def spread(mean: float, half: float | None) -> tuple[str, str]:
-    """A mean and half its interval with the same decimals, two digits of the half: (`4.10`, `0.10`)."""
+    """A mean and the half-width of its interval with as many decimals as two digits of the latter need."""
     if not half:
         return number(mean), "" if half is None else "0"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{half:.1e}"))))
@@ -55,8 +55,8 @@ class GuardWords:
     """Names of a guard.
 
     Attributes:
-        title: heading of its column.
-        option: of `stlc simulate`; "" where it needs none.
+        title: heading of its column in a table.
+        option: option of `stlc simulate` that selects it; "" for no guard.
     """
 
     title: str
@@ -124,43 +124,35 @@ def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 CAUSES = {
-    "told": "lost at {}, when the world told of what no plan from there solves",
-    "later": "no plan is known from {} on, although the one followed until then was good",
-    "missed": "a plan is known at {}, and another one was followed",
+    "told": "lost at {}, by an exogenous event after which no plan is known",
+    "later": "no plan is known from {} on, although the plan followed until then satisfied",
+    "missed": "a plan is known at {}, but another plan was followed",
 }
 """Causes of a violation, from `stlc.controller.evaluation.rules.Lost`."""
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Number and time of lost drives, and share of the others that obeyed; "" if none was lost."""
+    """Sentence on the lost drives, and on the other ones that obeyed; "" if none was lost."""
     each = list(drives_of(simulation).values())
-    if not each:
+    if not each or not each[-1]["lost"]:
         return ""
-    drives = each[-1]
-    lost, told = drives["lost"], drives.get("told", 0)
-    if not lost:
-        return ""
-    parts = []
-    if lost > told:
-        begun = lost - told
-        parts.append(
-            f"{count(begun, 'drive')} {'was' if begun == 1 else 'were'} lost from the start, "
-            "where no plan is known"
-        )
-    if told:
-        of = f"{told:,}" if parts else count(told, "drive")
-        parts.append(
-            f"{of} {'was' if told == 1 else 'were'} lost when the world told of what "
-            "no plan from there solves"
-        )
-    return f"{', and '.join(parts)}: {drives['obeyed']} of the {drives['count'] - lost} others obeyed"
+    drives, later = each[-1], each[-1].get("told", 0)
+    start, parts = drives["lost"] - later, []
+    if start:
+        were = "was" if start == 1 else "were"
+        parts.append(f"{count(start, 'drive')} {were} lost from the start, where no plan is known")
+    if later:
+        number = f"{later:,}" if parts else count(later, "drive")
+        were = "was" if later == 1 else "were"
+        parts.append(f"{number} {were} lost by an exogenous event after which no plan is known")
+    return (
+        f"{', and '.join(parts)}: {drives['obeyed']} of the {drives['count'] - drives['lost']} others obeyed"
+    )
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
     """Reason for which a drive broke a rule, for an entry of `broken`; "" if unknown."""
-    cause = broken.get("cause")
-    if cause is None:
-        return "lost from its start" if broken["lost"] else ""
-    if cause["why"] == "start":
-        return "lost from its start"
+    cause = broken.get("cause") or {"why": "start" if broken["lost"] else ""}
+    if cause["why"] in ("start", ""):
+        return "lost from its start" if cause["why"] else ""
     return CAUSES[cause["why"]].format(f"{cause['time']:.3g} s")

@@ -94,7 +94,7 @@ def test_a_deployed_run(deployed):
     assert "4.00 ± 0.10 m/s" in page.text
     assert "of which T0=1" in page.text
     assert "0.6 ms" in page.text
-    assert "What failed, and why" in page.text
+    assert "Violations and their causes" in page.text
     assert "before_junction means x < x_inter / 2" in page.text
     assert "stlc check" in page.text
     assert "Violations in this animation" in page.text
@@ -204,7 +204,7 @@ def part_of(run, section):
 def test_a_world_that_no_plan_foresees_is_said(deployed):
     document = json.loads((deployed.path / "eval/simulate.json").read_text())
     text = part_of(deployed, deployment_section)
-    assert "from 71.0 % of the starts; elsewhere a drive holds what no plan could know" in text
+    assert "from 71.0 % of the starts; elsewhere it did what no plan could know" in text
     assert "the backup decided" in text
     assert "model-consistent, startsshare of starts" in text
     for guard in document["guards"].values():

@@ -86,11 +86,11 @@ def test_how_many_drives_obeyed():
     )
     told = {**simulation, "guards": {"full": drives(190, 10, told=2)}}
     assert viable_sentence(told) == (
-        "8 drives were lost from the start, where no plan is known, and 2 were lost when the world told of "
-        "what no plan from there solves: 190 of the 190 others obeyed"
+        "8 drives were lost from the start, where no plan is known, and 2 were lost by an exogenous "
+        "event after which no plan is known: 190 of the 190 others obeyed"
     )
     only = {**simulation, "guards": {"full": drives(198, 1, told=1)}}
-    assert viable_sentence(only).startswith("1 drive was lost when the world told of")
+    assert viable_sentence(only).startswith("1 drive was lost by an exogenous event")
 
 
 def test_why_a_rule_was_broken():
@@ -99,6 +99,6 @@ def test_why_a_rule_was_broken():
 
     assert words(True, "start") == words(True) == "lost from its start"
     assert words(False) == ""
-    assert words(True, "told") == "lost at 1.8 s, when the world told of what no plan from there solves"
+    assert words(True, "told") == "lost at 1.8 s, by an exogenous event after which no plan is known"
     assert words(False, "later").startswith("no plan is known from 1.8 s on")
-    assert words(False, "missed") == "a plan is known at 1.8 s, and another one was followed"
+    assert words(False, "missed") == "a plan is known at 1.8 s, but another plan was followed"
