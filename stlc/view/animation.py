@@ -1,4 +1,4 @@
-"""Films: frame-by-frame drawings and their encoding as GIF, video or still."""
+"""Animations drawn frame by frame, and their encoding as GIF, video or still."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ LONGEST = 16.0
 DPI, FINE = 100, 2
 """Dots per inch of a GIF, and how many times as many a video and a still have."""
 QUALITY = 86
-"""Of WebP."""
+"""WebP quality of a still."""
 
 
 @dataclass(frozen=True, slots=True)
 class Animation:
-    """A drawing for each of a number of instants.
+    """A picture for each of a number of instants.
 
     Attributes:
         frames: number of instants.
-        dt: seconds between them.
-        size: of the picture in inches.
-        begin: sets up an empty figure; returns the function that draws an instant on its canvas.
+        dt: seconds between instants.
+        size: size of the picture in inches.
+        begin: sets up an empty figure; returns the function that draws an instant on the figure's canvas.
         alt: description in words.
         moment: index of the most informative instant, for a still.
         draws: whether that function renders the canvas itself; otherwise it only updates artists.
@@ -132,14 +132,14 @@ def save_animation(
     max_frames: int = MAX_FRAMES,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write `animation` as a GIF and as a video; every instant is drawn once.
+    """Write an animation as a GIF and as a video; every instant is drawn once.
 
     Args:
-        animation: to write.
-        gif: path of the GIF, smaller in width where it would exceed `max_bytes`.
-        mp4: path of the video.
-        max_frames: more instants are subsampled evenly.
-        max_bytes: of the GIF.
+        animation: the animation.
+        gif: path of the GIF, whose width is reduced if the file would exceed `max_bytes`.
+        mp4: path of the video; None for none.
+        max_frames: maximum number of frames; more instants are subsampled evenly.
+        max_bytes: maximum size of the GIF.
 
     Raises:
         MissingError: R201, a file cannot be written; R301, there is no ffmpeg for the video.
@@ -290,7 +290,7 @@ def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Call
     """Write an H.264 video that every browser plays; yields the function that appends an RGB picture.
 
     Args:
-        path: of the file, replaced when the block ends well.
+        path: path of the file, replaced if the block ends without an exception.
         size: width and height of all pictures; an odd last row or column is cut off.
         milliseconds: duration of each picture.
 

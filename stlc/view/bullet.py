@@ -91,7 +91,7 @@ def require_window() -> None:
 
 
 class Renderer:
-    """The robots of a stage and the balls around them, side by side along x."""
+    """PyBullet scene of a stage: its robots and their balls, side by side along x."""
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
         with _silenced():
@@ -103,7 +103,7 @@ class Renderer:
             self.count = stage.joints.shape[1]
             self.places = PITCH * stage.reach * np.arange(self.count)[:, None] * np.array([1.0, 0.0, 0.0])
             if mode == "window":
-                self._look()
+                self._prepare_window()
             self.robots = self._robots()
             self.discs = [self._disc(place) for place in self.places]
             self.balls = [[self._ball(ball) for _ in range(self.count)] for ball in stage.balls]
@@ -116,7 +116,7 @@ class Renderer:
         return bool(self.client.isConnected())
 
     def close(self) -> None:
-        """End it."""
+        """Disconnect from PyBullet, which closes its window."""
         if self.open:
             with _silenced():
                 self.client.disconnect()
@@ -187,7 +187,7 @@ class Renderer:
     def _middle(self) -> list[float]:
         return [float(self.places[:, 0].mean()), 0.0, 0.5 * self.stage.reach]
 
-    def _look(self) -> None:
+    def _prepare_window(self) -> None:
         """Hide the window's panels, and suspend rendering while robots are loaded."""
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)
@@ -229,14 +229,14 @@ def _silenced() -> Iterator[None]:
     """Silence PyBullet, whose C code prints to the standard output."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [os.dup(number) for number in (1, 2)]
+    streams = [os.dup(number) for number in (1, 2)]
     try:
         with Path(os.devnull).open("wb") as nowhere:
             for number in (1, 2):
                 os.dup2(nowhere.fileno(), number)
             yield
     finally:
-        for number, saved in zip((1, 2), kept, strict=True):
+        for number, saved in zip((1, 2), streams, strict=True):
             os.dup2(saved, number)
             os.close(saved)
 
@@ -249,12 +249,12 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 
 
 def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
-    """`urdf` itself if it has visual geometry, else a copy in `folder` with added geometry.
+    """Path of a robot description with visual geometry: `urdf` if it has some, else a copy in `folder`.
 
     Args:
-        urdf: of the robot; kinematics are enough.
-        meshes: link -> file among those that come with PyBullet; others get rods.
-        folder: for the copy.
+        urdf: description of the robot; kinematics suffice.
+        meshes: link -> mesh file of PyBullet; other links are drawn as rods.
+        folder: folder of the copy.
 
     Raises:
         OSError, ValueError: the file cannot be read, or is no robot description.

@@ -51,7 +51,7 @@ class SceneOptions:
     """Parameters of a scene's animation.
 
     Attributes:
-        draw: what draws one frame of it.
+        draw: function that draws a frame on axes.
         dt: seconds between frames.
         title: of the picture.
         keys: label -> colour of further legend entries.
@@ -80,7 +80,7 @@ def frames_of(scene: Scene) -> int:
 
 
 def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
-    """The animation of a scene, arrays (instants, …)."""
+    """Animation of a scene, whose arrays are (frames, …)."""
     frames = frames_of(scene)
     keys = keys_of(scene, options.keys)
     plan = _planned(ratio_of(options.draw, scene), 0 if options.strip is None else options.strip.height, keys)
@@ -118,14 +118,11 @@ def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
 def _moment(scene: Scene, frames: int) -> int:
     """Frame with most interventions, without the first and last ones; the middle one if there are none."""
     middle = frames // 2
-    if "decision" not in scene:
-        return middle
-    acted = (scene["decision"][:frames] > 0).sum(1).astype(float)
     low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)
-    inner = acted[low:high]
-    if not inner.any():
+    acted = (scene["decision"][low:high] > 0).sum(1) if "decision" in scene else np.zeros(0)
+    if not acted.any():
         return middle
-    best = np.flatnonzero(inner == inner.max()) + low
+    best = np.flatnonzero(acted == acted.max()) + low
     return int(best[np.abs(best - middle).argmin()])
 
 

@@ -181,11 +181,9 @@ class Picture:
 
 def _themed(svg: str) -> str:
     """`svg` with its colours as CSS variables, set for the light and the dark scheme."""
-    svg = svg[svg.index("<svg") :]
-    for light in ON_DARK:
-        svg = re.sub(rf"{light}\b", f"var(--c{light[1:]})", svg)
-    light_inks = ";".join(f"--c{ink[1:]}:{ink}" for ink in ON_DARK)
-    dark_inks = ";".join(f"--c{ink[1:]}:{dark}" for ink, dark in ON_DARK.items())
-    sheet = f"<style>svg{{{light_inks}}}@media(prefers-color-scheme:dark){{svg{{{dark_inks}}}}}</style>"
-    head = svg.index(">") + 1
-    return svg[:head] + sheet + svg[head:]
+    inks = "|".join(ON_DARK)
+    svg = re.sub(rf"({inks})\b", lambda ink: f"var(--c{ink[1][1:]})", svg[svg.index("<svg") :])
+    light = ";".join(f"--c{ink[1:]}:{ink}" for ink in ON_DARK)
+    dark = ";".join(f"--c{ink[1:]}:{other}" for ink, other in ON_DARK.items())
+    sheet = f"<style>svg{{{light}}}@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
+    return svg.replace(">", f">{sheet}", 1)

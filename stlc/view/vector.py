@@ -1,7 +1,7 @@
-"""An animation as drawing commands, not pixels: paths, texts and images, for a page that replays them.
+"""Animations as drawing commands, not pixels: paths, texts and images, for a page that replays them.
 
-`Tape` is the matplotlib renderer that records them. Commands shared by frames are stored once. Coordinates
-are whole quarters of a dot from the upper left.
+`CommandRenderer` is the matplotlib renderer that records the commands. Commands shared by frames are stored
+once. Coordinates are whole quarters of a dot from the upper left.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.backend_bases import RendererBase
@@ -20,9 +20,6 @@ from matplotlib.transforms import Affine2D
 
 from stlc.view.animation import Animation, Command, VectorAnimation, clear_artists
 from stlc.view.style import new_figure, picture_style
-
-if TYPE_CHECKING:
-    pass
 
 FINE = 4
 """Coordinate steps per dot."""
@@ -73,7 +70,7 @@ class CommandRenderer(RendererBase):
         self.width, self.height = width, height
         self._known: dict[Command, int] = {}
         self._frames: list[list[int]] = []
-        self._letters: Any = _measuring(width, height, DPI)
+        self._letters: Any = RendererAgg(width, height, DPI)  # type: ignore[no-untyped-call]
 
     def begin(self) -> None:
         """Begin another frame."""
@@ -189,10 +186,6 @@ class CommandRenderer(RendererBase):
         """The clip path, if it is not the frame of the axes."""
         path, transform = gc.get_clip_path()
         return None if path is None else self._path(path, transform)
-
-
-_measuring: Any = RendererAgg
-"""Renderer that measures text."""
 
 
 def _color(color: Any, gc: Any) -> str | None:

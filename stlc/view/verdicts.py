@@ -108,7 +108,7 @@ class SceneVerdicts:
 
     @property
     def marked(self) -> set[str]:
-        """Requirements whose violations are marked: all rules for runs; without rules those tagged `@safety`."""
+        """Requirements whose violations are marked: all rules for runs, else the `@safety` ones."""
         safety = {each.name for each in self.executed if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
         return safety if safety and not ruled else {each.name for each in self.executed}
