@@ -166,7 +166,7 @@ def _combined(name: str, call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]]
     if not pairs:
         scope.fail(Diagnostic("E105", f"`{name}` needs at least one region", call.span))
     parts = tuple(_as_region(name, expr, value, scope) for expr, value in pairs)
-    sizes = {size for part in parts if (size := dimension(part)) is not None}
+    sizes = set(map(dimension, parts))
     if len(sizes) > 1:
         message = f"regions of {' and '.join(map(str, sorted(sizes)))} dimensions do not go together"
         scope.fail(Diagnostic("E205", message, call.span))

@@ -6,8 +6,9 @@ min of its parts: exact in sign, and inside a union or outside an intersection a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
+from typing import TypeVar
 
 from stlc.compile.frontend.arithmetic import agree, apply, cross, dot, gap, minus, negated, norm
 from stlc.compile.frontend.scope import Scope
@@ -29,6 +30,7 @@ from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 PlanePoint = tuple[float, float]
+T = TypeVar("T")
 
 
 def points(corners: Sequence[VectorValue]) -> tuple[PlanePoint, ...] | None:
@@ -42,6 +44,11 @@ def points(corners: Sequence[VectorValue]) -> tuple[PlanePoint, ...] | None:
     return tuple(found)
 
 
+def edges(corners: Sequence[T]) -> list[tuple[T, T]]:
+    """Return the edges of a polygon, as pairs of adjacent corners."""
+    return list(zip(corners, (*corners[1:], corners[0]), strict=True))
+
+
 def turn(a: PlanePoint, b: PlanePoint, c: PlanePoint) -> float:
     """Return twice the signed area of a triangle: positive where `c` lies left of `a -> b`."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -49,21 +56,15 @@ def turn(a: PlanePoint, b: PlanePoint, c: PlanePoint) -> float:
 
 def area(corners: Sequence[PlanePoint]) -> float:
     """Return the signed area: positive for counter-clockwise corners."""
-    pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
-    return sum(a[0] * b[1] - a[1] * b[0] for a, b in pairs) / 2
+    return sum(a[0] * b[1] - a[1] * b[0] for a, b in edges(corners)) / 2
 
 
 def simple(corners: Sequence[PlanePoint]) -> bool:
     """True if no two edges cross and no adjacent corners coincide."""
-    edges = list(zip(corners, (*corners[1:], corners[0]), strict=True))
-    if any(a == b for a, b in edges):
-        return False
-    return not any(_crossing(first, second) for first, second in combinations(edges, 2))
-
-
-def _crossing(first: tuple[PlanePoint, PlanePoint], second: tuple[PlanePoint, PlanePoint]) -> bool:
-    (a, b), (c, d) = first, second
-    return turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
+    return all(a != b for a, b in edges(corners)) and not any(
+        turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
+        for (a, b), (c, d) in combinations(edges(corners), 2)
+    )
 
 
 def convex(corners: Sequence[VectorValue]) -> bool:
@@ -104,21 +105,24 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
     return not any(turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0 for p in others)
 
 
-def dimension(region: Region) -> int | None:
-    """Return the dimension of a region; None if it fits any."""
+def dimension(region: Region) -> int:
+    """Return the number of coordinates of the points of a region."""
     match region:
-        case NormBall(center):
-            return len(center.items)
-        case Box(lower):
-            return len(lower.items)
-        case HalfSpace(normal):
-            return len(normal.items)
+        case NormBall(vector) | Box(vector) | HalfSpace(vector):
+            return len(vector.items)
         case Polygon():
             return 2
-        case Combined(_, parts):
-            return dimension(parts[0])
-        case Dilated(inner) | Complement(inner):
-            return dimension(inner)
+        case Combined(_, (part, *_)) | Dilated(part) | Complement(part):
+            return dimension(part)
+    raise AssertionError("a combination has at least one part")
+
+
+def check_dimension(point: VectorValue, region: Region, span: Span, scope: Scope) -> None:
+    """Raise Failed (E205) for a point with another number of components than the region."""
+    size = dimension(region)
+    if size != len(point.items):
+        message = f"a point of {len(point.items)} components and a region of {size} do not go together"
+        scope.fail(Diagnostic("E205", message, span))
 
 
 def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
@@ -127,10 +131,7 @@ def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope
     Raises:
         Failed: the point has another number of components, or another unit (E205, E203).
     """
-    size = dimension(region)
-    if size is not None and size != len(point.items):
-        message = f"a point of {len(point.items)} components and a region of {size} do not go together"
-        scope.fail(Diagnostic("E205", message, span))
+    check_dimension(point, region, span, scope)
     match region:
         case NormBall(center, radius):
             away = norm(minus(point, center, span, scope), span, scope)
@@ -142,13 +143,39 @@ def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope
             return apply("div", (room, norm(normal, span, scope)), span, scope)
         case Polygon(corners):
             return _polygon(point, corners, span, scope)
+        case _:
+
+            def of_part(part: Region) -> Number:
+                return signed_distance(point, part, span, scope)
+
+            return composed(region, of_part, of_part, lambda margin: margin, span, scope)
+
+
+def composed(
+    region: Combined | Dilated | Complement,
+    inner: Callable[[Region], Number],
+    opposite: Callable[[Region], Number],
+    margin: Callable[[Number], Number],
+    span: Span,
+    scope: Scope,
+) -> Number:
+    """Return the signed distance to a union, intersection, dilation or complement.
+
+    Args:
+        region: composed of others.
+        inner: distance to a part.
+        opposite: distance to a complemented part, before negation: the greatest where `inner` is the least.
+        margin: value of the margin of a dilation.
+        span: of the expression.
+        scope: receives findings.
+    """
+    match region:
         case Combined(op, parts):
-            inner = [signed_distance(point, part, span, scope) for part in parts]
-            return apply("max" if op == "union" else "min", inner, span, scope)
-        case Dilated(inside, margin):
-            return apply("add", (signed_distance(point, inside, span, scope), margin), span, scope)
-        case Complement(inside):
-            return negated(signed_distance(point, inside, span, scope), span)
+            return apply("max" if op == "union" else "min", list(map(inner, parts)), span, scope)
+        case Dilated(part, extra):
+            return apply("add", (inner(part), margin(extra)), span, scope)
+        case Complement(part):
+            return negated(opposite(part), span)
 
 
 def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
@@ -171,8 +198,7 @@ def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span,
 
 def _polygon(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> Number:
     """Signed distance to a polygon: distance to the nearest edge, positive inside one of its triangles."""
-    edges = zip(corners, (*corners[1:], corners[0]), strict=True)
-    nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
+    nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges(corners)], span, scope)
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
     inside = parts[0] if len(parts) == 1 else ir.BoolOp("or", tuple(parts), span)
     return Number(
@@ -189,11 +215,14 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
     return norm(minus(ahead, foot, span, scope), span, scope)
 
 
+def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
+    """Return `turn(start, end, point)` of points that vary: positive where `point` lies left of the edge."""
+    found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
+    assert isinstance(found, Number)
+    return found
+
+
 def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
     """True if the point lies left of every edge of a convex, counter-clockwise polygon."""
-    atoms = []
-    for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
-        turn = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
-        assert isinstance(turn, Number)
-        atoms.append(ir.Predicate(turn.num, span=span))
-    return ir.BoolOp("and", tuple(atoms), span)
+    sides = (side(point, start, end, span, scope) for start, end in edges(corners))
+    return ir.BoolOp("and", tuple(ir.Predicate(each.num, span=span) for each in sides), span)

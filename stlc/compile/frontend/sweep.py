@@ -11,18 +11,28 @@ A moving region is assumed to move in a straight line too.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import partial
 from itertools import combinations, product
+from typing import Literal, TypeVar
 
-from stlc.compile.frontend.arithmetic import apply, cross, dot, gap, minus, negated, norm
-from stlc.compile.frontend.regions import convex, dimension, signed_distance, to_segment
+from stlc.compile.frontend.arithmetic import apply, dot, gap, minus, negated, norm, total
+from stlc.compile.frontend.regions import (
+    check_dimension,
+    composed,
+    convex,
+    edges,
+    side,
+    signed_distance,
+    to_segment,
+)
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
+    REGION_TYPES,
     Box,
     Combined,
     Complement,
     Dilated,
-    HalfSpace,
     NormBall,
     Number,
     Polygon,
@@ -32,7 +42,6 @@ from stlc.compile.frontend.values import (
 )
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import shifted
-from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 _SHORT = 1e-9
@@ -42,6 +51,7 @@ _AHEAD = 1e-6
 
 Pair = tuple[Number, Number]
 """A number at both ends of the segment; linear in between."""
+T = TypeVar("T")
 
 
 def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
@@ -50,67 +60,58 @@ def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope)
     Raises:
         Failed: the point has another number of components, or another unit (E205, E203).
     """
-    size = dimension(region)
-    if size is not None and size != len(point.items):
-        message = f"a point of {len(point.items)} components and a region of {size} do not go together"
-        scope.fail(Diagnostic("E205", message, span))
-    return _Sweep(point, span, scope).least(region)
+    check_dimension(point, region, span, scope)
+    return _Sweep(point, span, scope).extreme(region, "min")
 
 
 class _Sweep:
     """Distance computations along one segment."""
 
     def __init__(self, point: VectorValue, span: Span, scope: Scope) -> None:
-        self.ends = (point, _vector_later(point))
+        self.ends = (point, _later(point))
         self.span, self.scope = span, scope
 
-    # -------------------------------------------------------------- least and greatest
+    def extreme(self, region: Region, which: Literal["min", "max"]) -> Number:
+        """Least or greatest signed distance along the segment.
 
-    def least(self, region: Region) -> Number:
-        """Least signed distance; for a convex region it is concave along the segment, so least at an end."""
+        The signed distance to a convex region is concave along the segment, so it is least at an end.
+        """
         match region:
-            case Combined(op, parts):
-                return self.apply("max" if op == "union" else "min", *map(self.least, parts))
-            case Dilated(inside, margin):
-                return self.apply("add", self.least(inside), self.apply("min", *_both(margin)))
-            case Complement(inside):
-                return self.negative(self.greatest(inside))
+            case Combined() | Dilated() | Complement():
+                same = partial(self.extreme, which=which)
+                opposite = partial(self.extreme, which="max" if which == "min" else "min")
+                return composed(
+                    region,
+                    same,
+                    opposite,
+                    lambda margin: self.apply(which, margin, _later(margin)),
+                    self.span,
+                    self.scope,
+                )
             case Polygon(corners) if not convex(corners):
-                return self.apply("min", *self.at_ends(region), *self._clearances(corners))
-            case _:
-                return self.apply("min", *self.at_ends(region))
-
-    def greatest(self, region: Region) -> Number:
-        """Greatest signed distance."""
-        match region:
-            case Combined(op, parts):
-                return self.apply("max" if op == "union" else "min", *map(self.greatest, parts))
-            case Dilated(inside, margin):
-                return self.apply("add", self.greatest(inside), self.apply("max", *_both(margin)))
-            case Complement(inside):
-                return self.negative(self.least(inside))
-            case NormBall(center, radius):
-                return self.apply("sub", self.apply("max", *_both(radius)), self.past(center))
-            case HalfSpace():
-                return self.apply("max", *self.at_ends(region))
-            case Box():
+                clearances = self._clearances(corners)
+                if which == "max":
+                    clearances = list(map(self.negative, clearances))
+                return self.apply(which, *self.at_ends(region), *clearances)
+            case NormBall(center, radius) if which == "max":
+                return self.apply("sub", self.apply("max", radius, _later(radius)), self.past(center))
+            case Box() if which == "max":
                 return self._over_box(region)
-            case Polygon(corners) if convex(corners):
+            case Polygon(corners) if which == "max":
                 outside = [self.negative(self.past(corner)) for corner in corners]
                 return self._over(self._edges(corners), (*self.at_ends(region), *outside))
-            case Polygon(corners):
-                crossed = [self.negative(gap) for gap in self._clearances(corners)]
-                return self.apply("max", *self.at_ends(region), *crossed)
+            case _:
+                return self.apply(which, *self.at_ends(region))
 
     # ------------------------------------------------------------------ convex regions
 
     def _over_box(self, box: Box) -> Number:
         faces = []
         for axis, sides in enumerate(zip(box.lower.items, box.upper.items, strict=True)):
-            for side, sign in zip(sides, (1, -1), strict=True):
+            for face, sign in zip(sides, (1, -1), strict=True):
                 room = [
                     gap(*(pair if sign > 0 else pair[::-1]), self.span, self.scope)
-                    for pair in zip((end.items[axis] for end in self.ends), _both(side), strict=True)
+                    for pair in zip((end.items[axis] for end in self.ends), (face, _later(face)), strict=True)
                 ]
                 faces.append((room[0], room[1]))
         size = len(box.lower.items)
@@ -138,14 +139,14 @@ class _Sweep:
         sizes = [self.apply("abs", slope) for slope in slopes]
         meetings = []
         for i, j in combinations(range(len(faces)), 2):
-            total = self.apply("max", self.apply("add", sizes[i], sizes[j]), literal(_SHORT, self.span))
+            steep = self.apply("max", self.apply("add", sizes[i], sizes[j]), literal(_SHORT, self.span))
             weighed = (
                 self.apply("mul", faces[i][0], sizes[j]),
                 self.apply("mul", faces[j][0], sizes[i]),
             )
-            there = self.apply("div", self.apply("add", *weighed), total)
+            there = self.apply("div", self.apply("add", *weighed), steep)
             opposed = ir.Predicate(self.apply("mul", slopes[i], slopes[j]).num, -1, strict=True)
-            long = ir.Predicate(self.apply("sub", total, literal(_SHORT, self.span)).num, strict=True)
+            long = ir.Predicate(self.apply("sub", steep, literal(_SHORT, self.span)).num, strict=True)
             meetings.append(self._choose(ir.BoolOp("and", (opposed, long)), there, best[i]))
         return self.apply("min", *best, *meetings)
 
@@ -166,7 +167,7 @@ class _Sweep:
                 active = Number(ir.Indicator(ir.Predicate(ahead.num, -1, strict=True)))
                 pull.append(self.apply("mul", active, self.apply("mul", room, slope)))
                 stiffness.append(self.apply("mul", active, self.apply("square", slope)))
-            step = self._ratio(self._sum(pull), self._sum(stiffness))
+            step = self._ratio(*(total(items, self.span, self.scope) for items in (pull, stiffness)))
             share = self._share(self.apply("sub", start, step))
             beyond = [
                 self.apply("relu", self.negative(self._along(face, slope, share)))
@@ -190,41 +191,31 @@ class _Sweep:
     def _edges(self, corners: Sequence[VectorValue]) -> list[Pair]:
         """Signed distances of both ends of the segment to every edge, positive on the left."""
         found = []
-        for start, stop in _cycle(corners):
-            along = minus(stop, start, self.span, self.scope)
-            length = norm(along, self.span, self.scope)
-            sides = []
-            for end in self.ends:
-                turn = cross(along, minus(end, start, self.span, self.scope), self.span, self.scope)
-                assert isinstance(turn, Number)
-                sides.append(self.apply("div", turn, length))
-            found.append((sides[0], sides[1]))
+        for start, stop in edges(corners):
+            length = norm(minus(stop, start, self.span, self.scope), self.span, self.scope)
+            before, after = (
+                self.apply("div", side(end, start, stop, self.span, self.scope), length) for end in self.ends
+            )
+            found.append((before, after))
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
         """Distance of the segment to every edge; negative crossing depth where they cross."""
-        past = [self.past(corner) for corner in corners]
-        turns = [self._turn(corner) for corner in corners]
+        now, then = self.ends
+        past = edges([self.past(corner) for corner in corners])
+        turns = edges([side(corner, now, then, self.span, self.scope) for corner in corners])
         found = []
-        for index, ((start, stop), sides) in enumerate(
-            zip(_cycle(corners), self._edges(corners), strict=True)
+        for (start, stop), sides, near, around in zip(
+            edges(corners), self._edges(corners), past, turns, strict=True
         ):
-            after = (index + 1) % len(corners)
             ends = [to_segment(end, start, stop, self.span, self.scope) for end in self.ends]
-            gap = self.apply("min", *ends, past[index], past[after])
-            between = ir.Predicate(self.apply("mul", *sides).num, -1, strict=True)
-            astride = ir.Predicate(self.apply("mul", turns[index], turns[after]).num, -1, strict=True)
+            gap = self.apply("min", *ends, *near)
+            between, astride = (
+                ir.Predicate(self.apply("mul", *signs).num, -1, strict=True) for signs in (sides, around)
+            )
             crossing = ir.BoolOp("and", (between, astride))
             found.append(self._choose(crossing, self.negative(gap), gap))
         return found
-
-    def _turn(self, corner: VectorValue) -> Number:
-        """Side of the segment on which a corner lies, as the sign of a cross product."""
-        now, then = self.ends
-        along, ahead = minus(then, now, self.span, self.scope), minus(corner, now, self.span, self.scope)
-        turn = cross(along, ahead, self.span, self.scope)
-        assert isinstance(turn, Number)
-        return turn
 
     # ---------------------------------------------------------------------- arithmetic
 
@@ -233,14 +224,14 @@ class _Sweep:
         now, then = self.ends
         return (
             signed_distance(now, region, self.span, self.scope),
-            signed_distance(then, _region_later(region), self.span, self.scope),
+            signed_distance(then, _later(region), self.span, self.scope),
         )
 
     def past(self, place: VectorValue) -> Number:
         """Least distance of the segment to a point that may move in a straight line."""
         now, then = (
             minus(end, there, self.span, self.scope)
-            for end, there in zip(self.ends, (place, _vector_later(place)), strict=True)
+            for end, there in zip(self.ends, (place, _later(place)), strict=True)
         )
         along = minus(then, now, self.span, self.scope)
         back = self.negative(dot(now, along, self.span, self.scope))
@@ -259,12 +250,6 @@ class _Sweep:
     def _share(self, number: Number) -> Number:
         return self.apply("clip", number, literal(0, self.span), literal(1, self.span))
 
-    def _sum(self, numbers: Sequence[Number]) -> Number:
-        total = numbers[0]
-        for number in numbers[1:]:
-            total = self.apply("add", total, number)
-        return total
-
     def _choose(self, cond: ir.Formula, yes: Number, no: Number) -> Number:
         return Number(ir.Where(cond, yes.num, no.num), no.unit, no.flexible, span=self.span)
 
@@ -277,37 +262,14 @@ class _Sweep:
         return negated(number, self.span)
 
 
-def _cycle(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, VectorValue]]:
-    return list(zip(corners, (*corners[1:], corners[0]), strict=True))
-
-
-def _both(number: Number) -> tuple[Number, ...]:
-    """Return a number at both ends."""
-    return number, _number_later(number)
-
-
-def _number_later(number: Number) -> Number:
-    return replace(number, num=shifted(number.num, 1, clamped=True))
-
-
-def _vector_later(vector: VectorValue) -> VectorValue:
-    return replace(vector, items=tuple(map(_number_later, vector.items)))
-
-
-def _region_later(region: Region) -> Region:
-    """Return the region at the next sample; at the last sample, the region there."""
-    match region:
-        case NormBall(center, radius):
-            return replace(region, center=_vector_later(center), radius=_number_later(radius))
-        case Box(lower, upper):
-            return replace(region, lower=_vector_later(lower), upper=_vector_later(upper))
-        case HalfSpace(normal, offset):
-            return replace(region, normal=_vector_later(normal), offset=_number_later(offset))
-        case Polygon():
-            return region
-        case Combined(_, parts):
-            return replace(region, parts=tuple(map(_region_later, parts)))
-        case Dilated(inside, margin):
-            return replace(region, region=_region_later(inside), margin=_number_later(margin))
-        case Complement(inside):
-            return replace(region, region=_region_later(inside))
+def _later(value: T) -> T:
+    """Return a number, vector or region at the next sample; at the last sample, the value there."""
+    match value:
+        case Number():
+            return replace(value, num=shifted(value.num, 1, clamped=True))
+        case tuple():
+            return type(value)(map(_later, value))
+        case _ if isinstance(value, (VectorValue, *REGION_TYPES)):
+            return replace(value, **{each.name: _later(getattr(value, each.name)) for each in fields(value)})
+        case _:
+            return value
