@@ -1,16 +1,16 @@
 """Parse tree to AST, expressions: one function per rule of `stl.lark`.
 
-A function takes the built children of its node: AST nodes, `TerminalToken`s, None for an omitted optional
-part. A rule without a function is an error. Tokens become names, units and numbers; errors in well-formed
-text are reported.
+A function takes the built children of its node: AST nodes, `TerminalToken`s, and None for an omitted optional
+part. Every rule needs a function. Errors in well-formed text, such as an unknown unit, are reported.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
@@ -103,11 +103,9 @@ def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
 
 def near_unit(word: str) -> str | None:
     """Return the unit closest to an unknown unit `word`."""
-    return (
-        None
-        if word in SYMBOLS or means_celsius(word)
-        else UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
-    )
+    if word in SYMBOLS or means_celsius(word):
+        return None
+    return UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
 
 
 def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:
@@ -130,12 +128,17 @@ def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:
     return Fraction(0)
 
 
-_WORD = re.compile(r"[A-Za-z]+")
-
 BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
-# -------------------------------------------------------------------------- atoms
+def node(kind: Callable[..., Any]) -> BuildRule:
+    """Return the rule of a node whose fields are its children."""
+    return lambda _, span, children: kind(span, *children)
+
+
+def several(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the children."""
+    return tuple(children)
 
 
 def _quantity(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Quantity:
@@ -143,41 +146,9 @@ def _quantity(context: BuildContext, span: Span, children: Sequence[Any]) -> ast
     return ast.Quantity(span, number_of(context, number), unit_of(context, unit))
 
 
-def _string(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.String:
-    return ast.String(span, children[0].text[1:-1])
-
-
-def _true(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Bool:
-    return ast.Bool(span, True)
-
-
-def _false(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Bool:
-    return ast.Bool(span, False)
-
-
-def _inf(_: BuildContext, span: Span, __: Sequence[Any]) -> ast.Inf:
-    return ast.Inf(span)
-
-
 def _name(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Name:
     (leaf,) = children
     return ast.Name(span, name_of(leaf), quoted=leaf.text.startswith("`"))
-
-
-def _vector(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Vector:
-    return ast.Vector(span, tuple(item for item in children if item is not None))
-
-
-def _set_literal(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.SetLiteral:
-    return ast.SetLiteral(span, tuple(children))
-
-
-# ------------------------------------------------------------ postfix, arithmetic
-
-
-def _index(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Index:
-    base, index = children
-    return ast.Index(span, base, index)
 
 
 def _attr(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Attr:
@@ -190,39 +161,15 @@ def _call(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Call:
     return ast.Call(span, func, args or ())
 
 
-def _args(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[ast.Arg, ...]:
-    return tuple(children)
-
-
 def _arg(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Arg:
     leaf, value = children
     return ast.Arg(span, None if leaf is None else name_of(leaf), value)
-
-
-def _negative(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Neg:
-    return ast.Neg(span, children[-1])
 
 
 def _binary(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Binary:
     left, op, right = children
     return ast.Binary(span, op.text, left, right)
 
-
-def _compare(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Compare:
-    return ast.Compare(span, tuple(children[::2]), tuple(op.text for op in children[1::2]))
-
-
-def _member_of(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Member:
-    item, region = children
-    return ast.Member(span, item, region)
-
-
-def _not_member_of(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Member:
-    item, region = children
-    return ast.Member(span, item, region, negated=True)
-
-
-# ----------------------------------------------------------------- logic and time
 
 _LOGIC: Mapping[str, Any] = MappingProxyType(
     {
@@ -237,57 +184,27 @@ def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
     return ast.Logic(span, _LOGIC[op.text], left, right)
 
 
-def _not(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Not:
-    return ast.Not(span, children[0])
-
-
-def _interval(*, lo_open: bool, hi_open: bool) -> BuildRule:
-    def build(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Interval:
-        lo, hi = children
-        return ast.Interval(span, lo, hi, lo_open, hi_open)
-
-    return build
-
-
-def _clocked(operator: TerminalToken, interval: ast.Interval) -> ast.Interval:
-    if not operator.kind.endswith("_AT"):
-        return interval
-    return ast.Interval(interval.span, interval.lo, interval.hi, interval.lo_open, interval.hi_open, "start")
-
-
-def _spelled(operator: TerminalToken, table: Mapping[str, str]) -> tuple[Any, str]:
-    """Return the operator's name, and the alias by which it is written, if any."""
-    match = _WORD.match(operator.text)
+def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[str, ast.Interval | None, str]:
+    """Return the name of a temporal operator, its interval, and the alias by which it is written, if any."""
+    match = _LETTERS.match(token.text)
     assert match is not None
-    word = match[0]
-    return table[word], "" if table[word] == word else word
+    op = (UNARY_TEMPORAL | BINARY_TEMPORAL)[match[0]]
+    interval = written[0] if written else None
+    if interval is not None and token.kind.endswith("_AT"):
+        interval = replace(interval, clock="start")
+    return op, interval, "" if op == match[0] else match[0]
 
 
 def _temporal(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Temporal:
-    operator, interval, body = children
-    op, alias = _spelled(operator, UNARY_TEMPORAL)
-    return ast.Temporal(span, op, _clocked(operator, interval), body, alias)
-
-
-def _temporal_unbounded(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Temporal:
-    operator, body = children
-    op, alias = _spelled(operator, UNARY_TEMPORAL)
-    return ast.Temporal(span, op, None, body, alias)
+    token, *written, body = children
+    op, interval, alias = _operator(token, written)
+    return ast.Temporal(span, op, interval, body, alias)
 
 
 def _until(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Until:
-    left, operator, interval, right = children
-    op, alias = _spelled(operator, BINARY_TEMPORAL)
-    return ast.Until(span, op, _clocked(operator, interval), left, right, alias)
-
-
-def _until_unbounded(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Until:
-    left, operator, right = children
-    op, alias = _spelled(operator, BINARY_TEMPORAL)
-    return ast.Until(span, op, None, left, right, alias)
-
-
-# ------------------------------------------------------------------------ binders
+    left, token, *written, right = children
+    op, interval, alias = _operator(token, written)
+    return ast.Until(span, op, interval, left, right, alias)
 
 
 def _quantifier(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Quantifier:
@@ -295,61 +212,46 @@ def _quantifier(context: BuildContext, span: Span, children: Sequence[Any]) -> a
     return ast.Quantifier(span, kind.text, own_name(context, name), domain, body)
 
 
-def _pair(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[ast.Expr, ast.Expr]:
-    low, high = children
-    return low, high
-
-
-def _freeze(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Freeze:
-    *bindings, body = children
-    return ast.Freeze(span, tuple(bindings), body)
-
-
 def _binding(context: BuildContext, _: Span, children: Sequence[Any]) -> tuple[str, ast.Expr]:
     name, value = children
     return own_name(context, name), value
 
 
-def _if_then_else(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.IfThenElse:
-    cond, yes, no = children
-    return ast.IfThenElse(span, cond, yes, no)
-
-
 EXPRESSIONS: Mapping[str, BuildRule] = MappingProxyType(
     {
         "quantity": _quantity,
-        "string": _string,
-        "true": _true,
-        "false": _false,
-        "inf": _inf,
+        "string": lambda _, span, children: ast.String(span, children[0].text[1:-1]),
+        "true": node(partial(ast.Bool, value=True)),
+        "false": node(partial(ast.Bool, value=False)),
+        "inf": node(ast.Inf),
         "name": _name,
-        "vector": _vector,
-        "set_literal": _set_literal,
-        "index": _index,
+        "vector": lambda _, span, children: ast.Vector(span, tuple(filter(None, children))),
+        "set_literal": lambda _, span, children: ast.SetLiteral(span, tuple(children)),
+        "index": node(ast.Index),
         "attr": _attr,
         "call": _call,
-        "args": _args,
+        "args": several,
         "arg": _arg,
-        "negative": _negative,
+        "negative": lambda _, span, children: ast.Neg(span, children[-1]),
         "binary": _binary,
-        "compare": _compare,
-        "member_of": _member_of,
-        "not_member_of": _not_member_of,
+        "compare": lambda _, span, children: ast.Compare(
+            span, tuple(children[::2]), tuple(op.text for op in children[1::2])
+        ),
+        "member_of": node(ast.Member),
+        "not_member_of": node(partial(ast.Member, negated=True)),
         "logic": _logic,
-        "not_": _not,
-        "closed_closed": _interval(lo_open=False, hi_open=False),
-        "closed_open": _interval(lo_open=False, hi_open=True),
-        "open_closed": _interval(lo_open=True, hi_open=False),
-        "open_open": _interval(lo_open=True, hi_open=True),
-        "temporal": _temporal,
-        "temporal_unbounded": _temporal_unbounded,
-        "until": _until,
-        "until_unbounded": _until_unbounded,
+        "not_": node(ast.Not),
+        "closed_closed": node(ast.Interval),
+        "closed_open": node(partial(ast.Interval, hi_open=True)),
+        "open_closed": node(partial(ast.Interval, lo_open=True)),
+        "open_open": node(partial(ast.Interval, lo_open=True, hi_open=True)),
+        **dict.fromkeys(("temporal", "temporal_unbounded"), _temporal),
+        **dict.fromkeys(("until", "until_unbounded"), _until),
         "quantifier": _quantifier,
-        "range_domain": _pair,
-        "span_domain": _pair,
-        "freeze": _freeze,
+        **dict.fromkeys(("range_domain", "span_domain"), several),
+        "freeze": lambda _, span, children: ast.Freeze(span, tuple(children[:-1]), children[-1]),
         "binding": _binding,
-        "if_then_else": _if_then_else,
+        "if_then_else": node(ast.IfThenElse),
     }
 )
+"""Rule of the grammar -> its function."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
@@ -17,6 +18,7 @@ from stlc.grammar.parse.builder import (
     name_of,
     number_of,
     own_name,
+    several,
     unit_of,
 )
 from stlc.source import Source, Span
@@ -36,12 +38,6 @@ class Pragma:
 
 Item: TypeAlias = Pragma | ast.Import | ast.Item | tuple[ast.Item, ...]
 
-# ------------------------------------------------------------------------ pragmas
-
-
-def _spec_name(_: BuildContext, span: Span, children: Sequence[Any]) -> Pragma:
-    return Pragma("spec", name_of(children[0]), span)
-
 
 def _system_ref(_: BuildContext, __: Span, children: Sequence[Any]) -> Pragma:
     (leaf,) = children
@@ -60,29 +56,18 @@ def _import(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.I
     return ast.Import(span, path, is_file, None if alias is None else own_name(context, alias))
 
 
-# ---------------------------------------------------------------- parts of several
-
-
-def _several(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(children)
-
-
 def _tag(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Tag:
     leaf, args = children
     return ast.Tag(span, name_of(leaf), args or ())
 
 
 def _type(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.TypeRef:
-    leaf, size = children
-    return ast.TypeRef(span, name_of(leaf), None if size is None else _size(context, size))
-
-
-def _size(context: BuildContext, leaf: TerminalToken) -> int:
-    digits = leaf.text.strip("[] \t\r\n")
-    if len(digits) <= _SIZE_DIGITS:
-        return int(digits)
-    context.findings.append(Diagnostic("E005", "a vector of that size is too large", leaf.span))
-    return 1
+    leaf, written = children
+    digits = "" if written is None else written.text.strip("[] \t\r\n")
+    if len(digits) > _SIZE_DIGITS:
+        context.findings.append(Diagnostic("E005", "a vector of that size is too large", written.span))
+        digits = "1"
+    return ast.TypeRef(span, name_of(leaf), int(digits) if digits else None)
 
 
 def _sort(context: BuildContext, _: Span, children: Sequence[Any]) -> tuple[ast.TypeRef | None, str]:
@@ -95,29 +80,32 @@ def _formal(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.F
     return ast.Formal(span, own_name(context, leaf), written)
 
 
-def _doc(context: BuildContext, end: int) -> str:
-    """Return the `##` lines from the last declaration up to `end`."""
-    lines = [match[1] for match in _DOC.finditer(context.source.text, context.documented, end)]
-    return "\n".join(lines)
-
-
-def _head(
-    context: BuildContext, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag, ...]
-) -> dict[str, Any]:
-    """Return the fields common to all declarations."""
-    (head,) = _heads(context, span, (leaf,), tags)
-    return head
-
-
 def _heads(
     context: BuildContext, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
-    """Return the common fields for each name of a declaration."""
-    shared = {"span": span, "tags": tags, "doc": _doc(context, names[0].span.start)}
+    """Return the fields common to all declarations, for each name; `##` lines before the name document it."""
+    lines = _DOC.finditer(context.source.text, context.documented, names[0].span.start)
+    shared = {"span": span, "tags": tags, "doc": "\n".join(match[1] for match in lines)}
     return [{**shared, "name": own_name(context, leaf), "name_span": leaf.span} for leaf in names]
 
 
-# ------------------------------------------------------------------- declarations
+def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
+    """Return the rule of a declaration of one name, whose further children are the fields `parts`.
+
+    A child of the rule `sort` is the pair of fields `type` and `unit`.
+    """
+
+    def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
+        tags, leaf, *values = children
+        (head,) = _heads(context, span, (leaf,), tags)
+        own = dict(zip(parts, values, strict=True))
+        if "sort" in own:
+            own["type"], own["unit"] = own.pop("sort")
+        if "formals" in own:
+            own["formals"] = own["formals"] or ()
+        return kind(**head, **own)
+
+    return build
 
 
 def _signals(context: BuildContext, span: Span, children: Sequence[Any]) -> tuple[ast.Signal, ...]:
@@ -142,11 +130,6 @@ def _signals(context: BuildContext, span: Span, children: Sequence[Any]) -> tupl
     return tuple(ast.Signal(**head, **own) for head in _heads(context, span, names, tags))
 
 
-def _const(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Const:
-    tags, leaf, (written, unit), value = children
-    return ast.Const(**_head(context, span, leaf, tags), type=written, unit=unit, value=value)
-
-
 def _params(context: BuildContext, span: Span, children: Sequence[Any]) -> tuple[ast.Param, ...]:
     tags, names, (written, unit), domain = children
     own = {"type": written, "unit": unit, "domain": domain}
@@ -161,74 +144,47 @@ def _whole(context: BuildContext, span: Span, children: Sequence[Any]) -> int:
     return -int(value) if minus is not None else int(value)
 
 
-def _member(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[TerminalToken, int | None]:
-    leaf, value = children
-    return leaf, value
-
-
 def _enum(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Enum:
     tags, leaf, *written = children
     members: list[tuple[str, int]] = []
     for name, value in written:
         after = members[-1][1] + 1 if members else 0
         members.append((own_name(context, name), after if value is None else value))
-    return ast.Enum(**_head(context, span, leaf, tags), members=tuple(members))
+    (head,) = _heads(context, span, (leaf,), tags)
+    return ast.Enum(**head, members=tuple(members))
 
 
-def _region(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Region:
-    tags, leaf, value = children
-    return ast.Region(**_head(context, span, leaf, tags), value=value)
-
-
-def _def(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Def:
-    tags, leaf, formals, written, value = children
-    return ast.Def(**_head(context, span, leaf, tags), formals=formals or (), type=written, value=value)
-
-
-def _extern(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Extern:
-    tags, leaf, formals, written, unit = children
-    head = _head(context, span, leaf, tags)
-    return ast.Extern(**head, formals=formals or (), type=written, unit=unit_of(context, unit))
-
-
-def _require(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Require:
-    tags, leaf, formula = children
-    return ast.Require(**_head(context, span, leaf, tags), formula=formula)
-
-
-def _assume(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Assume:
-    tags, leaf, formula = children
-    return ast.Assume(**_head(context, span, leaf, tags), formula=formula)
+def _extern(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
+    *before, unit = children
+    build = _declaration(partial(ast.Extern, unit=unit_of(context, unit)), "formals", "type")
+    extern: ast.Extern = build(context, span, before)
+    return extern
 
 
 DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
     {
-        "start": _several,
-        "spec_name": _spec_name,
+        **dict.fromkeys(("start", "tags", "names", "formals", "member"), several),
+        "spec_name": lambda _, span, children: Pragma("spec", name_of(children[0]), span),
         "system_ref": _system_ref,
         "time_unit": _time_unit,
         "import_": _import,
-        "tags": _several,
         "tag": _tag,
-        "names": _several,
         "sort": _sort,
         "type": _type,
-        "formals": _several,
         "formal": _formal,
         "whole": _whole,
-        "member": _member,
         "signal_decl": _signals,
-        "const_decl": _const,
-        "param_in": _params,
-        "param_from": _params,
+        "const_decl": _declaration(ast.Const, "sort", "value"),
+        **dict.fromkeys(("param_in", "param_from"), _params),
         "enum_decl": _enum,
-        "region_decl": _region,
-        "def_decl": _def,
+        "region_decl": _declaration(ast.Region, "value"),
+        "def_decl": _declaration(ast.Def, "formals", "type", "value"),
         "extern_decl": _extern,
-        "require_decl": _require,
-        "assume_decl": _assume,
+        "require_decl": _declaration(ast.Require, "formula"),
+        "assume_decl": _declaration(ast.Assume, "formula"),
     }
 )
+"""Rule of the grammar -> its function."""
 
 # ---------------------------------------------------------------------- the whole
 
