@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
@@ -27,7 +28,7 @@ _LEXEME = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _NO_PRAGMA = RESERVED | {"from", "as", *ROLES}
-_CLOSES = {"(": ")", "[": "]", "{": "}"}
+CLOSES = MappingProxyType({"(": ")", "[": "]", "{": "}"})
 _TEMPORAL = UNARY_TEMPORAL.keys() | BINARY_TEMPORAL.keys()
 
 
@@ -96,7 +97,7 @@ def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
     for i, lexeme in enumerate(items):
         if lexeme.kind != "sign":
             continue
-        if lexeme.text in _CLOSES:
+        if lexeme.text in CLOSES:
             still_open.append(len(found))
             found.append(Bracket(lexeme, interval=i > 0 and opens_interval(items[i - 1])))
         elif still_open and closes(found[still_open[-1]], lexeme.text):
@@ -112,4 +113,4 @@ def opens_interval(before: Lexeme) -> bool:
 
 def closes(bracket: Bracket, text: str) -> bool:
     """True if `text` closes an open bracket."""
-    return text == _CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))
+    return text == CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.parse.builder import near_unit
-from stlc.grammar.scan import Lexeme, brackets, closes
+from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
@@ -43,6 +43,8 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
 )
 _REPAIRS = ("COLON", "COMMA", "EQUAL", "RPAR", "RSQB", "RBRACE", "_DOTS", "_ARROW", "_IN", "_FN")
 _CLOSING = ("RPAR", "RSQB", "RBRACE")
+_TEMPORAL = UNARY_TEMPORAL | BINARY_TEMPORAL
+_LETTERS = frozenset(word for word in _TEMPORAL if len(word) == 1)
 _POSTFIX = frozenset({"LPAR", "LSQB", "DOT"})
 _BEFORE_FORMULA = frozenset(
     {":", "and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "not", "!"}
@@ -55,7 +57,8 @@ def expected(failure: ParseFailure) -> Diagnostic:
     if repair is not None:
         return repair
     words = _words(failure)
-    message = f"expected {_joined(words)}{_context(failure)}, found {_found(failure)}"
+    choice = f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
+    message = f"expected {choice}{_context(failure)}, found {_found(failure)}"
     label = "" if failure.found is not None else f"expected {words[0]} here"
     advice = _product(failure)
     return Diagnostic("E010", message, failure.span, label, _labels(failure), advice, _notes(failure))
@@ -133,7 +136,7 @@ def wrong_name(failure: ParseFailure) -> Diagnostic | None:
         found = failure.follower if same_line else None
     if found is None or found.text not in RESERVED:
         return None
-    meaning = UNARY_TEMPORAL.get(found.text) or BINARY_TEMPORAL.get(found.text)
+    meaning = _TEMPORAL.get(found.text)
     means = f" (it means `{meaning}`)" if meaning not in (None, found.text) else ""
     span = failure.of(found)
     return Diagnostic(
@@ -183,28 +186,17 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
     for terminal in _REPAIRS:
         if terminal not in failure.accepts or (terminal == "_IN" and failure.wants_operator):
             continue
-        sign = _closing(failure) or _SIGNS[terminal] if terminal in _CLOSING else _SIGNS[terminal]
+        bracket = failure.open_brackets[-1] if failure.open_brackets and terminal in _CLOSING else None
+        sign = _SIGNS[terminal] if bracket is None else CLOSES[bracket.opening.text]
         glued = sign in ":,)]}"
         inserted = sign if glued else f" {sign}"
-        sure = terminal not in _CLOSING or not _open_interval(failure)
+        sure = bracket is None or not bracket.interval  # `]` and `)` close intervals with different meanings
         if failure.piece.repaired_by(previous.end, previous.end, inserted):
             return _missing(failure, sign, previous.end, previous.end, inserted, sure=sure)
         if found is not None and failure.piece.repaired_by(found.start, found.end, sign):
             start = previous.end if glued else found.start
             return _missing(failure, sign, start, found.end, sign, sure=sure)
     return None
-
-
-def _open_interval(failure: ParseFailure) -> bool:
-    """True inside an unclosed interval, which `]` and `)` close with different meanings."""
-    return bool(failure.open_brackets) and failure.open_brackets[-1].interval
-
-
-def _closing(failure: ParseFailure) -> str | None:
-    """Return the closing bracket that matches the innermost open one."""
-    if not failure.open_brackets:
-        return None
-    return {"(": ")", "[": "]", "{": "}"}.get(failure.open_brackets[-1].opening.text)
 
 
 def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
@@ -325,17 +317,12 @@ def _found(failure: ParseFailure) -> str:
 
 
 def _notes(failure: ParseFailure) -> tuple[str, ...]:
-    if not failure.wants_operand:
+    """Return the meaning of a letter such as `F` that the author may have used as a name."""
+    near = (failure.found, failure.previous) if failure.wants_operand else ()
+    name = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
+    if name is None:
         return ()
-    for lexeme in (failure.found, failure.previous):
-        if lexeme is not None and lexeme.text in ("F", "G", "U"):
-            name, meaning = lexeme.text, UNARY_TEMPORAL.get(lexeme.text, "until")
-            return (f"`{name}` means `{meaning}`; a name of your own is written `` `{name}` ``",)
-    return ()
-
-
-def _joined(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+    return (f"`{name}` means `{_TEMPORAL[name]}`; a name of your own is written `` `{name}` ``",)
 
 
 def _shortened(text: str) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+from stlc.grammar.parse.tables import acceptable, parses
 from stlc.grammar.scan import Bracket, Lexeme, brackets, lexemes
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Source, Span
@@ -20,29 +20,22 @@ class Piece:
         start: offset of the first character.
         end: offset after the last character.
         rule: start rule of the grammar, `start` or `expr`.
-        accepts: text -> terminals accepted where its parse fails.
-        parses: text -> whether it parses.
     """
 
     source: Source
     start: int
     end: int
     rule: str
-    accepts: Callable[[str, str], frozenset[str]]
-    parses: Callable[[str, str], bool]
 
     @property
     def text(self) -> str:
         """Text of the piece."""
         return self.source.text[self.start : self.end]
 
-    def edited(self, start: int, end: int, replacement: str) -> str:
-        """Return the text of the piece with the characters from `start` to `end` replaced."""
-        return self.text[: start - self.start] + replacement + self.text[end - self.start :]
-
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """True if the piece parses after that edit."""
-        return self.parses(self.edited(start, end, replacement), self.rule)
+        """True if the piece parses with the characters from `start` to `end` replaced."""
+        text = self.text[: start - self.start] + replacement + self.text[end - self.start :]
+        return parses(text, self.rule)
 
 
 @dataclass(frozen=True)
@@ -87,7 +80,7 @@ class ParseFailure:
     @cached_property
     def accepts(self) -> frozenset[str]:
         """Terminals accepted here."""
-        return self.piece.accepts(self.piece.text, self.piece.rule)
+        return acceptable(self.piece.text, self.piece.rule, even_broken=True) or frozenset()
 
     @property
     def wants_operand(self) -> bool:

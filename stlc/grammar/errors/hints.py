@@ -19,7 +19,7 @@ from stlc.grammar.errors.expected import (
     wrong_name,
 )
 from stlc.grammar.errors.failure import ParseFailure, Piece
-from stlc.grammar.errors.unicode import replacement, unexpected_character
+from stlc.grammar.errors.unicode import apart, replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Span
@@ -72,10 +72,8 @@ def _character(failure: ParseFailure) -> Diagnostic | None:
     named = f"`{char}`" if char.isprintable() else f"U+{ord(char):04X} (invisible)"
     message = f"unexpected character {named}"
     advice = replacement(char)
-    if advice is None:
-        return Diagnostic("E001", message, span)
-    if advice.text is None:
-        return Diagnostic("E001", message, span, help=(advice.help,))
+    if advice is None or advice.text is None:
+        return Diagnostic("E001", message, span, help=() if advice is None else (advice.help,))
     edits = _all_replacements(failure, found)
     fix = Fix(tuple((failure.piece.source.span(low, high), text) for low, high, text in edits))
     return Diagnostic("E001", message, span, help=(f"{advice.help}:  {failure.line_with(*edits)}",), fix=fix)
@@ -90,12 +88,7 @@ def _all_replacements(failure: ParseFailure, found: Lexeme) -> list[tuple[int, i
         advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
         if advice is None or advice.text is None or source.position(lexeme.start)[0] != line:
             continue
-        text = advice.text
-        if text[-1].isalpha() and source.text[lexeme.start + 1 : lexeme.start + 2].isalnum():
-            text += " "
-        if text[0].isalpha() and lexeme.start and source.text[lexeme.start - 1].isalnum():
-            text = f" {text}"
-        edits.append((lexeme.start, lexeme.start + 1, text))
+        edits.append((lexeme.start, lexeme.start + 1, apart(advice.text, source.text, lexeme.start)))
     return edits
 
 
@@ -128,28 +121,18 @@ def _bars(failure: ParseFailure) -> Diagnostic | None:
 def _unclosed(failure: ParseFailure) -> Diagnostic | None:
     if failure.found is not None or not failure.open_brackets:
         return None
-    bracket = failure.open_brackets[-1]
-    opening = bracket.opening
+    opening = failure.open_brackets[-1].opening
     labels: tuple[Label, ...] = ()
     if failure.follower is not None:
         labels = (Label(failure.of(failure.follower), "the next declaration starts here"),)
-    return Diagnostic(
-        "E011",
-        f"this `{opening.text}` is never closed",
-        failure.of(opening),
-        "opened here",
-        labels,
-        note=_closed_inside(failure, bracket),
-    )
-
-
-def _closed_inside(failure: ParseFailure, outer: Bracket) -> tuple[str, ...]:
+    note: tuple[str, ...] = ()
     for inner in brackets(failure.before):
-        same = inner.opening.text == outer.opening.text and inner.opening.start > outer.opening.start
-        if same and inner.closing is not None:
+        same = inner.opening.text == opening.text and inner.opening.start > opening.start
+        if same and inner.closing is not None and not note:
             line, column = failure.piece.source.position(inner.opening.start)
-            return (f"the inner `{inner.opening.text}` on line {line}, column {column} is closed",)
-    return ()
+            note = (f"the inner `{opening.text}` on line {line}, column {column} is closed",)
+    message = f"this `{opening.text}` is never closed"
+    return Diagnostic("E011", message, failure.of(opening), "opened here", labels, note=note)
 
 
 # ----------------------------------------------------------- E012: chains of until

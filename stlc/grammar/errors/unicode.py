@@ -49,12 +49,9 @@ _SPELLED = {
 _ADVICE: Mapping[str, Replacement] = MappingProxyType(
     {
         **{char: Replacement(f"write `{text}`", text) for text, chars in _SPELLED.items() for char in chars},
-        "'": Replacement('texts stand in double quotes: "…"'),
-        "‘": Replacement('texts stand in double quotes: "…"'),
-        "’": Replacement('texts stand in double quotes: "…"'),
+        **dict.fromkeys("'‘’", Replacement('texts stand in double quotes: "…"')),
         "?": Replacement("write `if … then … else …`"),
-        "‖": Replacement("write `norm(…)`"),
-        "∥": Replacement("write `norm(…)`"),
+        **dict.fromkeys("‖∥", Replacement("write `norm(…)`")),
         "∪": Replacement("write `union(a, b)`"),
         "∩": Replacement("write `intersect(a, b)`"),
     }
@@ -74,6 +71,13 @@ def unexpected_character(lexeme: Lexeme) -> bool:
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"
 
 
+def apart(word: str, text: str, at: int) -> str:
+    """Return a replacement of the character at an offset, with blanks where it would join other words."""
+    before = " " if word[0].isalpha() and at and text[at - 1].isalnum() else ""
+    behind = " " if word[-1].isalpha() and text[at + 1 : at + 2].isalnum() else ""
+    return f"{before}{word}{behind}"
+
+
 def plain_text(text: str) -> str:
     """Return the text with symbols such as `□`, `≤`, `∧` replaced, except in comments and quoted names."""
     parts: list[str] = []
@@ -82,12 +86,6 @@ def plain_text(text: str) -> str:
         advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
         if advice is None or advice.text is None:
             continue
-        behind = text[lexeme.start + 1 : lexeme.start + 2]
-        word = advice.text
-        if word[0].isalpha() and lexeme.start and text[lexeme.start - 1].isalnum():
-            word = f" {word}"
-        if word[-1].isalpha() and behind.isalnum():
-            word = f"{word} "
-        parts += [text[done : lexeme.start], word]
+        parts += [text[done : lexeme.start], apart(advice.text, text, lexeme.start)]
         done = lexeme.start + 1
     return "".join([*parts, text[done:]])

@@ -6,7 +6,7 @@ independent errors. Trees are folded bottom-up without recursion, so that no tex
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import islice
 from types import MappingProxyType
 from typing import Any
@@ -46,7 +46,7 @@ def parse(source: Source) -> ast.Spec:
         if skip_line and source.position(start)[0] == skip_line:
             continue
         skip_line = 0
-        piece = Piece(source, start, end, "start", accepts=_accepts, parses=_parses)
+        piece = Piece(source, start, end, "start")
         try:
             items.extend(_build(piece, context))
         except _PieceError as error:
@@ -68,7 +68,7 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
     end = len(source.text) if end is None else end
     _check_size(source, start, end)
     context = BuildContext(source)
-    piece = Piece(source, start, end, "expr", accepts=_accepts, parses=_parses)
+    piece = Piece(source, start, end, "expr")
     try:
         expr: ast.Expr = _build(piece, context)
     except _PieceError as error:
@@ -144,29 +144,3 @@ def _child(
             )
         case _:
             return values[id(child)]
-
-
-# -------------------------------------------------------------------------- lark
-
-
-def _accepts(text: str, rule: str) -> frozenset[str]:
-    """Terminals accepted where the parse of a text fails."""
-    interactive = load_parser().parse_interactive(text, start=rule)
-    try:
-        for _ in interactive.iter_parse():
-            pass
-    except UnexpectedInput:
-        pass
-    accepted: set[str] = interactive.accepts()  # type: ignore[no-untyped-call]
-    return frozenset(accepted)
-
-
-def _parses(text: str, rule: str) -> bool:
-    try:
-        load_parser().parse(text, start=rule)
-    except UnexpectedInput:
-        return False
-    return True
-
-
-__all__: Sequence[str] = ("MAX_DEPTH", "MAX_ERRORS", "MAX_LEXEMES", "MAX_TEXT", "parse", "parse_expr")

@@ -30,12 +30,12 @@ _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, 
 def load_parser() -> lark.Lark:
     """Return the parser of the language, with the start rules `start` and `expr`."""
     grammar = grammar_text()
-    kept, name = persistent(), cache_name(grammar)
-    parser = None if kept is None else _read(kept.read(name))
+    store, name = persistent(), cache_name(grammar)
+    parser = None if store is None else _read(store.read(name))
     if parser is None:
         parser = build_parser(grammar)
-        if kept is not None:
-            kept.write(name, _dumped(parser).encode())
+        if store is not None:
+            store.write(name, _dumped(parser).encode())
     return parser
 
 
@@ -84,18 +84,29 @@ def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
 
 
-def acceptable(text: str, rule: str = "start") -> frozenset[str] | None:
-    """Return the terminals that may follow `text`, or None if `text` itself does not parse.
+def acceptable(text: str, rule: str = "start", *, even_broken: bool = False) -> frozenset[str] | None:
+    """Return the terminals that may follow `text`; None if `text` itself does not parse.
 
     Args:
         text: the beginning of a declaration, or of an expression.
-        rule: the start rule, `start` or `expr`.
+        rule: start rule of the grammar, `start` or `expr`.
+        even_broken: for a text that does not parse, return the terminals accepted at its first error.
     """
     interactive = load_parser().parse_interactive(text, start=rule)
     try:
         for _ in interactive.iter_parse():
             pass
-        accepted: set[str] = interactive.accepts()  # type: ignore[no-untyped-call]
     except UnexpectedInput:
-        return None
-    return frozenset(accepted)
+        if not even_broken:
+            return None
+    terminals: set[str] = interactive.accepts()  # type: ignore[no-untyped-call]
+    return frozenset(terminals)
+
+
+def parses(text: str, rule: str) -> bool:
+    """True if the whole text matches the start rule."""
+    try:
+        load_parser().parse(text, start=rule)
+    except UnexpectedInput:
+        return False
+    return True
