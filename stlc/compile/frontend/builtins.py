@@ -64,9 +64,7 @@ FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Region:
     """Return the region that a call constructs. Raises Failed (E105 arguments, E205 sorts)."""
     if name not in FORMALS:
-        for arg in call.args:
-            if arg.name is not None:
-                scope.fail(Diagnostic("E105", f"`{name}` has no argument called `{arg.name}`", arg.span))
+        _positional(name, call, scope)
         pairs = [(arg.value, value) for arg, value in zip(call.args, values, strict=True)]
         return _polygon_of(call, pairs, scope) if name == "polygon" else _combined(name, call, pairs, scope)
     given = _bound(name, call, values, scope)
@@ -180,12 +178,13 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
     """Evaluate a `STEPPING` function with a valid number of arguments. Raises Failed (E201, E205)."""
     value, expr = values[0], call.args[0].value
     match name:
-        case "rise":
-            return typed.Edge(call.span, "rise", as_formula(value, expr, Expectation("`rise`"), scope))
-        case "fall":
-            return typed.Edge(call.span, "fall", as_formula(value, expr, Expectation("`fall`"), scope))
+        case "rise" | "fall":
+            return typed.Edge(call.span, name, as_formula(value, expr, Expectation(f"`{name}`"), scope))
         case "sweep":
-            return Swept(_swept_point(value, expr, Expectation("`sweep` follows a point"), scope), call.span)
+            if not isinstance(value, VectorValue):
+                number = as_number(value, expr, Expectation("`sweep` follows a point"), scope)
+                value = VectorValue((number,), expr.span)
+            return Swept(value, call.span)
         case "delta":
             return _delta(value, expr, call.span, scope)
     delay = typed.Time(steps=Fraction({"next": 1, "prev": -1}.get(name, 0)))
@@ -235,12 +234,6 @@ def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
     return broadcast("sub", (now, before), span, scope)
 
 
-def _swept_point(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> VectorValue:
-    if isinstance(value, VectorValue):
-        return value
-    return VectorValue((as_number(value, expr, need, scope),), expr.span)
-
-
 def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
     """Delay as a number of samples (`3`, `-1`, `3 steps`), or as a time (`0.1 s`), before discretization.
 
@@ -248,14 +241,13 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
     """
     match value:
         case TimeExpr(end=False):
-            time = typed.Time(value.seconds, value.steps, value.horizons, expr.span)
+            time = value.on(expr.span)
         case Number(bare=True, exact=known) if known is not None:
             time = typed.Time(steps=known, span=expr.span)
         case Number(bare=False, flexible=False) if value.constant is not None and same_dims(
             value.unit, _SECOND
         ):
-            found = moment(expr, value, scope)
-            time = typed.Time(found.seconds, found.steps, found.horizons, expr.span)
+            time = moment(expr, value, scope).on(expr.span)
         case _:
             message = "`shift` goes a whole number of samples, known at compile time"
             return scope.fail(no_delay(message, expr.span))
@@ -268,7 +260,8 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
 
 def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return a call of a function of the system. Raises Failed (E105, E202, E205)."""
-    _check_arguments(entry, call, scope)
+    _positional(entry.name, call, scope, "give its arguments in order")
+    count_arguments(entry.name, call, len(entry.arguments), len(entry.arguments), scope)
     flat: list[ir.Num] = []
     for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
         need = Expectation(
@@ -294,18 +287,6 @@ def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
     return Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind)
 
 
-def _check_arguments(entry: External, call: ast.Call, scope: Scope) -> None:
-    given, count = len(call.args), len(entry.arguments)
-    named = next((arg for arg in call.args if arg.name is not None), None)
-    if named is not None:
-        message = f"`{entry.name}` has no argument called `{named.name}`"
-        scope.fail(Diagnostic("E105", message, named.span, help=("give its arguments in order",)))
-    if given != count:
-        were = "was" if given == 1 else "were"
-        message = f"`{entry.name}` takes {count} argument{'s' if count != 1 else ''}, {given} {were} given"
-        scope.fail(Diagnostic("E105", message, call.span))
-
-
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return `name(values)` for a built-in function. Raises Failed; E101 for an unknown function."""
     if name in REGIONS:
@@ -326,7 +307,8 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
         assert isinstance(call.func, ast.Name)
         return scope.unknown(call.func, called=True)
     if function.kind == "sampler" and not scope.samplers:
-        scope.fail(_no_samplers(name, call, scope))
+        message = f"`{name}` draws at random, which only initial states and events can"
+        scope.fail(Diagnostic("E205" if scope.in_spec else "S201", message, call.span))
     return _function(name, call, values, scope)
 
 
@@ -352,15 +334,12 @@ def count_arguments(name: str, call: ast.Call, least: int, most: int | None, sco
     scope.fail(Diagnostic("E105", f"`{name}` takes {wants}, {given} {were} given", call.span))
 
 
-def _positional(name: str, call: ast.Call, scope: Scope) -> None:
+def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
+    """Raise Failed (E105) for an argument with a name."""
     for arg in call.args:
         if arg.name is not None:
-            scope.fail(Diagnostic("E105", f"`{name}` has no argument called `{arg.name}`", arg.span))
-
-
-def _no_samplers(name: str, call: ast.Call, scope: Scope) -> Diagnostic:
-    message = f"`{name}` draws at random, which only initial states and events can"
-    return Diagnostic("E205" if scope.in_spec else "S201", message, call.span)
+            message = f"`{name}` has no argument called `{arg.name}`"
+            scope.fail(Diagnostic("E105", message, arg.span, help=help_))
 
 
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:

@@ -12,7 +12,6 @@ from stlc.compile.frontend.coerce import Expectation, as_number
 from stlc.compile.frontend.evaluate import evaluate_all
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.scope import (
-    TIME_WORDS,
     Definition,
     Entry,
     External,
@@ -28,6 +27,7 @@ from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
+from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest
 from stlc.signature import Column, Kind, Role
 from stlc.source import Span
@@ -38,7 +38,7 @@ def check_names(entry: Definition, scope: Scope) -> None:
     """Report every name in a macro's body that nothing declares (E101)."""
     functions = {*callable_names(), *sampler_names()}
     for name, called in _free(entry.body, frozenset(entry.formals)):
-        if name.name in scope.entries or (name.name in TIME_WORDS and not name.quoted):
+        if name.name in scope.entries or (name.name in BUILT_IN and not name.quoted):
             continue
         if called and name.name in functions:
             continue

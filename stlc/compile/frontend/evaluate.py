@@ -7,13 +7,13 @@ arguments are values), unrolls quantifiers and collects independent findings.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from stlc.compile.frontend import comparisons
 from stlc.compile.frontend import intervals as moments
@@ -21,7 +21,7 @@ from stlc.compile.frontend.arithmetic import agree, broadcast, negate, refuse_po
 from stlc.compile.frontend.builtins import builtin, outside, unsupported
 from stlc.compile.frontend.coerce import Expectation, as_formula, as_number, as_state_formula, loose_number
 from stlc.compile.frontend.macros import arguments, cycle, finished, outgrown
-from stlc.compile.frontend.scope import TIME_WORDS, Cost, Definition, External, Failed, Scope, reserved
+from stlc.compile.frontend.scope import Cost, Definition, External, Failed, Scope, reserved
 from stlc.compile.frontend.values import (
     Number,
     Operand,
@@ -72,10 +72,7 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
     )
 
 
-Branches = tuple[Value, Value, Value]
-
-
-def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
+def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
     """Return a choice between formulas, numbers or vectors; between bools, a number and a formula.
 
     Args:
@@ -87,8 +84,8 @@ def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
         Failed: the condition is not a formula (E201), or for numbers not a state formula (E202), or the
             branches disagree (E203, E205).
     """
-    cond = as_formula(values[0], expr.cond, Expectation("`if`"), scope)
-    yes, no = values[1:]
+    decides, yes, no = values
+    cond = as_formula(decides, expr.cond, Expectation("`if`"), scope)
     if isinstance(yes, typed.Node) or isinstance(no, typed.Node):
         return _choice_of_formulas(expr, cond, (yes, no), scope)
     if _is_bool(yes) and _is_bool(no) and not is_state(cond):
@@ -134,6 +131,7 @@ def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Va
     return replace(blank, num=num, kind=kind, labels=labels, formula=formula)
 
 
+T = TypeVar("T")
 _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%": "divides", "^": "raises"}
 
 
@@ -169,18 +167,6 @@ def _measured(value: Fraction, unit_text: str) -> Number | None:
     if not math.isfinite(nearest(exact)):
         return None
     return replace(literal(exact), unit=unit, flexible=False, bare=False, kind="real")
-
-
-def _bool(expr: ast.Bool, _values: Sequence[Value], _scope: Scope) -> Value:
-    return typed.Truth(expr.span, expr.value)
-
-
-def _string(expr: ast.String, _values: Sequence[Value], scope: Scope) -> Value:
-    return scope.fail(Diagnostic("E205", "a text has no value here", expr.span))
-
-
-def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
-    return TimeExpr(end=True, span=expr.span)
 
 
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
@@ -250,10 +236,6 @@ def _refuse_products(
         scope.fail(Diagnostic("E205", f"`{expr.op}` does not take a vector on its right", place))
 
 
-def _compare(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> Value:
-    return comparisons.comparison(expr, values, scope)
-
-
 def _membership(expr: ast.Member, values: Sequence[Value], scope: Scope) -> Value:
     region = expr.region
     item, rest = Operand(expr.item, values[0]), values[1:]
@@ -275,11 +257,6 @@ def _member_parts(expr: ast.Member) -> Sequence[ast.Expr]:
     return (expr.item, region)
 
 
-def _if(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
-    cond, yes, no = values
-    return choose(expr, (cond, yes, no), scope)
-
-
 def _nothing(_expr: ast.Expr) -> Sequence[ast.Expr]:
     return ()
 
@@ -287,16 +264,19 @@ def _nothing(_expr: ast.Expr) -> Sequence[ast.Expr]:
 OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
     {
         ast.Quantity: Operation(_nothing, _quantity),
-        ast.String: Operation(_nothing, _string),
-        ast.Bool: Operation(_nothing, _bool),
-        ast.Inf: Operation(_nothing, _inf),
+        ast.String: Operation(
+            _nothing,
+            lambda expr, _, scope: scope.fail(Diagnostic("E205", "a text has no value here", expr.span)),
+        ),
+        ast.Bool: Operation(_nothing, lambda expr, *_: typed.Truth(expr.span, expr.value)),
+        ast.Inf: Operation(_nothing, lambda expr, *_: TimeExpr(end=True, span=expr.span)),
         ast.Vector: Operation(lambda expr: expr.items, _vector),
         ast.Index: Operation(lambda expr: (expr.base, expr.index), _index),
         ast.Neg: Operation(lambda expr: (expr.operand,), _neg),
         ast.Binary: Operation(lambda expr: (expr.left, expr.right), _binary),
-        ast.Compare: Operation(lambda expr: expr.operands, _compare),
+        ast.Compare: Operation(lambda expr: expr.operands, comparisons.comparison),
         ast.Member: Operation(_member_parts, _membership),
-        ast.IfThenElse: Operation(lambda expr: (expr.cond, expr.yes, expr.no), _if),
+        ast.IfThenElse: Operation(lambda expr: (expr.cond, expr.yes, expr.no), choose),
     }
 )
 """Node class -> evaluation rule."""
@@ -326,15 +306,21 @@ def _value(expr: ast.Expr, scope: Scope) -> Value:
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
     """Return the values of independent expressions, each evaluated even if another failed."""
-    values: list[Value] = []
-    for expr in exprs:
+    return _all(partial(evaluate, expr, scope) for expr in exprs)
+
+
+def _all(steps: Iterable[Callable[[], T]]) -> list[T]:
+    """Return the result of each step. Raises Failed after all steps if one of them did."""
+    results: list[T] = []
+    failed = False
+    for step in steps:
         try:
-            values.append(evaluate(expr, scope))
+            results.append(step())
         except Failed:
-            continue
-    if len(values) < len(exprs):
+            failed = True
+    if failed:
         raise Failed
-    return values
+    return results
 
 
 def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
@@ -344,15 +330,7 @@ def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
 
 def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> list[typed.Formula]:
     """Return independent expressions as formulas. Raises Failed."""
-    found: list[typed.Formula] = []
-    for expr, need in exprs:
-        try:
-            found.append(formula(expr, need, scope))
-        except Failed:
-            continue
-    if len(found) < len(exprs):
-        raise Failed
-    return found
+    return _all(partial(formula, expr, need, scope) for expr, need in exprs)
 
 
 # ------------------------------------------------------------------------ names
@@ -363,8 +341,8 @@ def _name(expr: ast.Name, scope: Scope) -> Value:
         value, cost = scope.locals[expr.name]
         _charge(cost, expr.span, scope)
         return value
-    if scope.in_spec and expr.name in TIME_WORDS and not expr.quoted:
-        return moments.time_word(expr.name, expr.span)
+    if scope.in_spec and expr.name in moments.TIME_WORDS and not expr.quoted:
+        return moments.TIME_WORDS[expr.name]
     return _named(expr, scope, scope)
 
 
@@ -415,23 +393,21 @@ def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
     return found[0]
 
 
+def _measured_value(expr: ast.Expr, scope: Scope) -> tuple[Value, Cost]:
+    with scope.meter.measured() as cost:
+        value = evaluate(expr, scope)
+    return value, cost
+
+
 def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
     """Expand a macro declared in `home`."""
     if home.cache.get(entry.name, entry) is None:
         raise Failed
     if entry.name in home.open:
         scope.fail(cycle(entry, home))
-    bound: dict[str, tuple[Value, Cost]] = {}
-    failed = False
-    for formal, expr in arguments(entry, call, scope).items():
-        try:
-            with scope.meter.measured() as cost:
-                value = evaluate(expr, scope)
-            bound[formal] = (value, cost)
-        except Failed:
-            failed = True
-    if failed:
-        raise Failed
+    given = arguments(entry, call, scope)
+    measured = _all(partial(_measured_value, expr, scope) for expr in given.values())
+    bound = dict(zip(given, measured, strict=True))
     inner = replace(home, locals=bound, open=(*home.open, entry.name))
     with _traced(entry, call, scope):
         return finished(entry, evaluate(entry.body, inner), inner)
@@ -531,11 +507,8 @@ def _temporal(expr: ast.Temporal, scope: Scope) -> Value:
 def _until(expr: ast.Until, scope: Scope) -> Value:
     after = expr.interval.span if expr.interval is not None else expr.right.span
     place = comparisons.sign_span(expr.alias or expr.op, expr.left.span, after)
-    sides = [
-        (expr.left, Expectation(f"`{expr.op}`", span=place)),
-        (expr.right, Expectation(f"`{expr.op}`", span=place)),
-    ]
-    return _timed(expr, sides, place, scope)
+    need = Expectation(f"`{expr.op}`", span=place)
+    return _timed(expr, [(expr.left, need), (expr.right, need)], place, scope)
 
 
 def _timed(

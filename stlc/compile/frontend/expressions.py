@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 from stlc.compile.frontend.arithmetic import difference_for_point, in_unit, rebased
@@ -28,6 +30,17 @@ from stlc.signature import Column
 from stlc.units import Unit, nearest, same_dims
 
 
+@contextmanager
+def _raising(scope: Scope) -> Iterator[None]:
+    """Resolve one expression: raise `scope.error` with its errors where resolution fails."""
+    before = len(scope.sink)
+    try:
+        with scope.meter.fresh():
+            yield
+    except Failed:
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+
+
 def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condition") -> ir.Formula:
     """Return the expression as a state formula in negation normal form.
 
@@ -39,16 +52,11 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
     Raises:
         StlcError: `scope.error`, with the findings.
     """
-    before = len(scope.sink)
-    try:
-        with scope.meter.fresh():
-            value = evaluate(expr, scope)
-            formula = _formula(value, expr, what, scope)
-            if not is_state(formula):
-                scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
-            return condition(formula)
-    except Failed:
-        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+    with _raising(scope):
+        formula = _formula(evaluate(expr, scope), expr, what, scope)
+        if not is_state(formula):
+            scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
+        return condition(formula)
 
 
 def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
@@ -57,15 +65,11 @@ def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
     Raises:
         StlcError: `scope.error`, with the findings.
     """
-    before = len(scope.sink)
-    try:
-        with scope.meter.fresh():
-            value = evaluate(expr, scope)
-            if not isinstance(value, REGION_TYPES):
-                scope.fail(Diagnostic("E205", f"a region is needed, this is {noun(value)}", expr.span))
-            return value
-    except Failed:
-        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+    with _raising(scope):
+        value = evaluate(expr, scope)
+        if not isinstance(value, REGION_TYPES):
+            scope.fail(Diagnostic("E205", f"a region is needed, this is {noun(value)}", expr.span))
+        return value
 
 
 def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement") -> typed.Formula:
@@ -87,9 +91,6 @@ def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.For
     return as_formula(value, expr, Expectation(what), scope)
 
 
-__all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
-
-
 def resolve_number(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> Number:
@@ -108,7 +109,9 @@ def resolve_number(
     numbers = resolve_numbers(expr, scope, expected=expected, what=what)
     if len(numbers) == 1:
         return numbers[0]
-    finding = Diagnostic(_code(scope), f"{what} is one number, this is a vector of {len(numbers)}", expr.span)
+    finding = Diagnostic(
+        scope.sort_error, f"{what} is one number, this is a vector of {len(numbers)}", expr.span
+    )
     scope.report(finding)
     raise scope.error(finding)
 
@@ -117,14 +120,10 @@ def resolve_numbers(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> tuple[Number, ...]:
     """Return the components of a vector expression; a number is a vector of one. See `resolve_number`."""
-    before = len(scope.sink)
-    try:
-        with scope.meter.fresh():
-            value = evaluate(expr, scope)
-            items: tuple[Value, ...] = value.items if isinstance(value, VectorValue) else (value,)
-            return tuple(_stored_value(item, expr, expected, what, scope) for item in items)
-    except Failed:
-        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+    with _raising(scope):
+        value = evaluate(expr, scope)
+        items: tuple[Value, ...] = value.items if isinstance(value, VectorValue) else (value,)
+        return tuple(_stored_value(item, expr, expected, what, scope) for item in items)
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
@@ -136,10 +135,6 @@ def stored(number: Number, unit: Unit) -> ir.Num:
     if value is None:
         return ir.Op("div", (number.num, ir.Const(unit.scale)))
     return ir.Const(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
-
-
-def _code(scope: Scope) -> str:
-    return "E205" if scope.in_spec else "S203"
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
@@ -178,11 +173,11 @@ def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Num
         if not fits and number.kind != "int":
             names = ", ".join(f"`{name}`" for name, _ in column.labels) or "`true` and `false`"
             message = f"`{column.name}` is one of {names}, this is {noun(number)}"
-            scope.fail(Diagnostic(_code(scope), message, expr.span))
+            scope.fail(Diagnostic(scope.sort_error, message, expr.span))
         return replace(number, kind=column.kind, labels=column.labels)
     if number.kind == "enum":
         scope.fail(
-            Diagnostic(_code(scope), f"`{column.name}` is a number, this is an enum member", expr.span)
+            Diagnostic(scope.sort_error, f"`{column.name}` is a number, this is an enum member", expr.span)
         )
     if number.bare:
         return in_unit(number, column.unit, scope)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from fractions import Fraction
+from types import MappingProxyType
 
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Number, Operand, TimeExpr, Value, noun
@@ -18,29 +18,22 @@ from stlc.units import SYMBOLS, parse_unit
 _SECOND = SYMBOLS["s"]
 
 
-def time_word(name: str, span: Span) -> TimeExpr:
-    """Return the time `T`, `dt` or `end`."""
-    match name:
-        case "T":
-            return TimeExpr(horizons=Fraction(1), span=span)
-        case "dt":
-            return TimeExpr(steps=Fraction(1), span=span)
-        case _:
-            return TimeExpr(end=True, span=span)
+TIME_WORDS = MappingProxyType(
+    {
+        "T": TimeExpr(horizons=Fraction(1)),
+        "dt": TimeExpr(steps=Fraction(1)),
+        "end": TimeExpr(end=True),
+    }
+)
+"""Built-in time -> its value."""
 
 
 def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
     """Return a sum with, or a multiple of, a time on the grid."""
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
-        sign = 1 if op == "+" else -1
         if not (a.end or b.end):
-            return TimeExpr(
-                a.seconds + sign * b.seconds,
-                a.steps + sign * b.steps,
-                a.horizons + sign * b.horizons,
-                span=span,
-            )
+            return a.plus(b, 1 if op == "+" else -1)
     times, factor = (left, right) if isinstance(left.value, TimeExpr) else (right, left)
     if isinstance(factor.value, Number) and factor.value.constant is None:
         scope.fail(out_of_place(times.expr.span))
@@ -53,7 +46,7 @@ def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) ->
         share = _factor(*factor, scope)
         if op == "/" and share == 0:
             scope.fail(Diagnostic("E401", "division by zero", factor.expr.span, "is 0"))
-        return _scaled(times.value, 1 / share if op == "/" else share, span)
+        return times.value.times(1 / share if op == "/" else share)
     help_ = ("a bound is a sum of times, each times a plain number: `T / 2 - 1 s`",)
     return scope.fail(Diagnostic("E205", f"`{op}` does not apply to these times", span, help=help_))
 
@@ -65,14 +58,10 @@ def out_of_place(span: Span) -> Diagnostic:
 
 
 def negative(value: TimeExpr, span: Span, scope: Scope) -> TimeExpr:
-    """`-value`."""
+    """Return `-value`. Raises Failed (E205) for `end`."""
     if value.end:
         scope.fail(Diagnostic("E205", "`end` has no sign", span))
-    return _scaled(value, Fraction(-1), span)
-
-
-def _scaled(value: TimeExpr, factor: Fraction, span: Span) -> TimeExpr:
-    return TimeExpr(value.seconds * factor, value.steps * factor, value.horizons * factor, span=span)
+    return value.times(Fraction(-1))
 
 
 def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
@@ -171,23 +160,10 @@ def interval(
         scope.fail(Diagnostic("E303", "an interval cannot start at the end of the trace", node.lo.span))
     if _sign(low) < 0 or (not high.end and _sign(high) < 0):
         scope.fail(_negative(op, node, (low, high), body))
-    if not high.end and _sign(_difference(high, low)) < 0:
+    if not high.end and _sign(high.plus(low, -1)) < 0:
         scope.fail(_reversed(node))
-    lo, hi = _time(low), None if high.end else _time(high)
+    lo, hi = low.on(low.span), None if high.end else high.on(high.span)
     return typed.Interval(lo, hi, node.lo_open, node.hi_open, node.clock, node.span)
-
-
-def _time(value: TimeExpr) -> typed.Time:
-    return typed.Time(value.seconds, value.steps, value.horizons, value.span)
-
-
-def _difference(left: TimeExpr, right: TimeExpr) -> TimeExpr:
-    return replace(
-        left,
-        seconds=left.seconds - right.seconds,
-        steps=left.steps - right.steps,
-        horizons=left.horizons - right.horizons,
-    )
 
 
 def _sign(value: TimeExpr) -> int:

@@ -90,7 +90,6 @@ class Meter:
             self.nodes, self.level, self.deepest = saved
 
 
-TIME_WORDS = ("T", "end", "dt")
 _MAX_PAIRS = 20_000
 """Limit on comparisons of unknown names with candidates for "did you mean"."""
 
@@ -208,6 +207,11 @@ class Scope:
         """True in a specification, where `T`, `end` and `dt` are keywords."""
         return not issubclass(self.error, SystemFileError)
 
+    @property
+    def sort_error(self) -> str:
+        """Code of an error about the sort of a value: E205 in a specification, S203 in a system file."""
+        return "E205" if self.in_spec else "S203"
+
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
         """Return the scope with further names; `samplers` sets whether random draws are allowed."""
         return replace(
@@ -219,9 +223,9 @@ class Scope:
 
     def as_products(self) -> Scope:
         """Return the scope under `@product`, with an empty cache of definitions."""
-        broken = {name: None for name, value in self.cache.items() if value is None}
+        broken = dict.fromkeys(name for name, value in self.cache.items() if value is None)
         modules = {alias: module.as_products() for alias, module in self.modules.items()}
-        return replace(self, product=True, cache=dict(broken), modules=modules)
+        return replace(self, product=True, cache=broken, modules=modules)
 
     def report(self, finding: Diagnostic) -> None:
         """Add a finding unless present (a macro used twice is reported once)."""

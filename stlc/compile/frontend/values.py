@@ -89,6 +89,22 @@ class TimeExpr:
     end: bool = False
     span: Span | None = field(default=None, compare=False, repr=False)
 
+    def plus(self, other: TimeExpr, factor: int) -> TimeExpr:
+        """Return the sum with `factor` times another time; `end` and the span are dropped."""
+        return TimeExpr(
+            self.seconds + factor * other.seconds,
+            self.steps + factor * other.steps,
+            self.horizons + factor * other.horizons,
+        )
+
+    def times(self, factor: Fraction) -> TimeExpr:
+        """Return the multiple; `end` and the span are dropped."""
+        return TimeExpr(self.seconds * factor, self.steps * factor, self.horizons * factor)
+
+    def on(self, span: Span | None) -> typed.Time:
+        """Return the time as a bound written at `span`."""
+        return typed.Time(self.seconds, self.steps, self.horizons, span)
+
 
 class Operand(NamedTuple):
     """Operand as written, with its value."""
