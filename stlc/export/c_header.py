@@ -91,7 +91,7 @@ _CLOSING = """
 
 
 def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
-    """Texts of a header's files with every name prefixed, and without constructs unknown to C++11.
+    """Return the texts of the header files, with every name prefixed, as valid C99 and C++11.
 
     Args:
         texts: name of a file -> its text; names that one declares are prefixed in all.
@@ -119,7 +119,7 @@ def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
 
 
 def _framed(text: str, guard: str) -> str:
-    """The file with include guard and compiler directives around it; other files unchanged."""
+    """Insert the compiler directives after the include guard; a text without the guard is unchanged."""
     if guard not in text:
         return text
     body, end = text.replace(guard, guard + _OPENING, 1).rsplit("#endif", 1)
@@ -130,7 +130,7 @@ def _framed(text: str, guard: str) -> str:
 
 
 def weights(network: PlanNetwork) -> str:
-    """`centre` and `scale` of the observation, and a `weight_0` (in, out) and a `bias_0` per layer."""
+    """Return a network as C: `centre` and `spread` of inputs, `weight_i` (in, out) and `bias_i` of layers."""
     lines = ["/* float32, row by row; generated */"]
     lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
     lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
@@ -357,7 +357,7 @@ def _added(task: Task) -> dict[str, object]:
     tables = [
         (_in_its_unit("parameter, the caller's", each.column), each.column) for each in system.parameters
     ]
-    tables += [(_holds(timer), timer.column) for timer in system.timers]
+    tables += [(_description(timer), timer.column) for timer in system.timers]
     place = first + len(system.parameters)
     listed = [f"     {c_comment(column.name)}: {c_comment(text)}" for text, column in tables]
     return {
@@ -375,7 +375,7 @@ def _added(task: Task) -> dict[str, object]:
     }
 
 
-def _holds(timer: Timer) -> str:
+def _description(timer: Timer) -> str:
     """Description of a state that the specification adds."""
     match timer.kind:
         case "status":
@@ -407,6 +407,6 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 
 
 def _falling(motion: Motion, plan: Plan) -> list[str]:
-    """`fall`: the least robustness of phi_safe on a prefix; row STATES is positive beyond its end."""
+    """C function `fall`: robustness of phi_safe on a prefix, beyond whose end column STATES is positive."""
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

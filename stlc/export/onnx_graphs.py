@@ -15,7 +15,7 @@ from torch import nn
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
-from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
+from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
-    """The states under a plan, exact switching.
+    """Return the states under plans, with exact switching.
 
     Args:
         step: one step of the system.
@@ -63,15 +63,15 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
     """
     require_numbers([*(num for _, num in step.lets), *step.next.values()])
     steps = len(next(iter(controls.values())))
-    film = _Film(start, controls, step.next.keys(), steps)
+    rollout = _Rollout(start, controls, step.next.keys(), steps)
     for stage in schedule(step):
-        film.run(stage)
-    still = {name: value.spread(steps + 1, value.shape[1]) for name, value in start.items()}
-    return still | film.states
+        rollout.run(stage)
+    still = {name: value.expand(steps + 1, value.shape[1]) for name, value in start.items()}
+    return still | rollout.states
 
 
-class _Film:
-    """Values computed so far: moving states, and numbers at all steps or, in one row, constant ones."""
+class _Rollout:
+    """Values of a rollout: states that change, and numbers, (steps, batch) or, if constant, (1, batch)."""
 
     def __init__(
         self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
@@ -102,7 +102,7 @@ class _Film:
 
     def _full(self, name: str) -> Value:
         value = self.now[name]
-        return value.spread(self.steps, value.shape[1])
+        return value.expand(self.steps, value.shape[1])
 
     def _loop(self, stage: RolloutStage) -> None:
         """Execute a stage with feedback, step by step."""
@@ -116,14 +116,14 @@ class _Film:
         kept = list(dict.fromkeys((*sources, *stage.lets)))
 
         def turn(
-            sheet: Sheet, now: Sequence[Value], rows: Sequence[Value]
+            sheet: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
         ) -> tuple[Sequence[Value], Sequence[Value]]:
             env = {name: self.now[name].on(sheet) for name in steady}
             env |= dict(zip(timed, rows, strict=False))
             env |= dict(zip(moving, now, strict=True))
             for block in blocks:
                 env.update(block(env, ONNX))
-            later = [env[name].spread(1, BATCH, like=now[0]) for name in sources]
+            later = [env[name].expand(1, BATCH, like=now[0]) for name in sources]
             return later, [env[name] for name in kept]
 
         carried = [self.start[name] for name in moving]
@@ -138,7 +138,7 @@ class _Film:
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
-    """Numbers computed from columns, with which they broadcast.
+    """Evaluate numbers on columns: name -> value, of a shape that broadcasts with the columns.
 
     Raises:
         Untranslatable: one calls a function of Python.
@@ -179,7 +179,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
 def _folded(
     task: Task, network: PlanNetwork, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
-    """States reflected to the side of the mirror that the network was trained on, and which are images."""
+    """States on the side of the mirror on which the network was trained, and the mask of reflected ones."""
     if network.mirror is None:
         return state, None
     moved = assigned(state_images(task), state)
@@ -194,7 +194,7 @@ def _observed(task: Task, state: Mapping[str, Value]) -> Value:
     numbers = observation(task)
     seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
     like = next(iter(state.values()))
-    rows = [seen[str(place)].spread(1, BATCH, like=like) for place in range(len(numbers))]
+    rows = [seen[str(place)].expand(1, BATCH, like=like) for place in range(len(numbers))]
     return joined(rows).T.cast("float32")
 
 
@@ -277,7 +277,7 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
     controls = inputs_of(plans, task)
     states = rolled(task.system.exact_step, start, controls)
     margins = written([rule.formula for rule in task.rules], states)
-    margins = [margin.spread(1, BATCH, like=like) for margin in margins]
+    margins = [margin.expand(1, BATCH, like=like) for margin in margins]
     broken = _broken(task, plans, states, margins)
     each = tuple(ONNX_OPS.where(broken, -math.inf, margin) for margin in margins)
     by_name = dict(zip((rule.name for rule in task.rules), each, strict=True))
@@ -289,7 +289,7 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
     """The weighted minimum, (1, batch); +inf without rules."""
     if not rules:
-        return like.sheet.constant([[math.inf]]).spread(1, BATCH, like=like)
+        return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
     weighed = [
         each[rule.name] if rule.weight == rule.scale else each[rule.name] * (rule.weight / rule.scale)
         for rule in rules
@@ -303,7 +303,7 @@ def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) 
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
-    wide = [column.spread(column.shape[0], BATCH, like=like) for column in (*moving, *margins)]
+    wide = [column.expand(column.shape[0], BATCH, like=like) for column in (*moving, *margins)]
     together = joined([nothing, *wide])
     lost = together.apply("IsNaN", kind="bool").cast("float32")
     return _reduced("ReduceMax", lost, (0,)).apply("Greater", 0.5, kind="bool")
@@ -348,21 +348,21 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
         if term.goal is not None:
             env[MARGIN.name] = written([term.goal], states, count=rows)[0]
         each = assigned({"each": term.number}, env)["each"]
-        each = each.spread(rows, each.shape[1])
+        each = each.expand(rows, each.shape[1])
         reduced = ONNX_OPS.amax(each) if term.greatest else _reduced("ReduceMean", each, (0,))
         value = term.value
         if term.condition is not None:
             value = ir.Where(term.condition, value, ir.Const(0.0))
         parts.append(assigned({"value": value}, {**once, REDUCED.name: reduced})["value"])
-    return reduce(ONNX_OPS.add, parts).spread(1, BATCH, like=rho)
+    return reduce(ONNX_OPS.add, parts).expand(1, BATCH, like=rho)
 
 
 def deepened(task: Task, states: States) -> Value:
-    """`Promises.deepened`, (1, batch) booleans; there is at least one promise."""
+    """`PendingGoals.deepened` of a task with at least one goal, (1, batch) booleans."""
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
     for margin in written([each.body for each in task.promises.items], soon, count=2):
-        now, next_ = margin.spread(2, margin.shape[1])[:1], margin.spread(2, margin.shape[1])[1:]
+        now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
         held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
         found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
     return reduce(ONNX_OPS.either, found)
@@ -374,24 +374,24 @@ def deepened(task: Task, states: States) -> Value:
 def falls(task: Task, start: States, plans: Value) -> Value:
     """`stlc.controller.guard.safe_prefix.prefix_robustness`, (T + 1, batch).
 
-    Every prefix is a trajectory of its own, as there: columns are (T + 1, prefixes * batch).
+    Every prefix is a separate trajectory: columns are (T + 1, prefixes * batch).
     """
     rows = task.horizon + 1
     states = rolled(task.system.exact_step, start, inputs_of(plans, task))
     like = next(iter(start.values()))
     prefixes = [[[1.0 if k > end else -1.0] for end in range(rows)] for k in range(rows)]
-    beyond = like.sheet.constant(prefixes).spread(rows, rows, BATCH, like=like)
+    beyond = like.sheet.constant(prefixes).expand(rows, rows, BATCH, like=like)
     columns = {
-        name: column.spread(rows, BATCH, like=like)
+        name: column.expand(rows, BATCH, like=like)
         .reshaped(rows, 1, BATCH)
-        .spread(rows, rows, BATCH, like=like)
+        .expand(rows, rows, BATCH, like=like)
         for name, column in states.items()
     }
     columns[BEYOND] = beyond
     flat = {name: column.reshaped(rows, BATCH) for name, column in columns.items()}
     formulas = [open_ended(anchored(rule.formula)) for rule in task.compiled.safety]
     margins = written(formulas, flat)
-    least = ONNX_OPS.join([margin.spread(1, BATCH, like=flat[BEYOND]) for margin in margins], "min")
+    least = ONNX_OPS.join([margin.expand(1, BATCH, like=flat[BEYOND]) for margin in margins], "min")
     found: Value = least.reshaped(rows, BATCH)
     return found
 
@@ -408,7 +408,7 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
     Raises:
         Untranslatable: a part of the task has no ONNX form.
     """
-    state = Sheet().input("state", (BATCH, len(task.system.names)))
+    state = OnnxGraph().input("state", (BATCH, len(task.system.names)))
     plans = proposed(task, network, columns_of(state, task.system.names))
     table = _table(task, state, plans)
     return _shown(_picked(table, _best(table["rank"]))) | _added(task, state)
@@ -424,7 +424,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     Raises:
         Untranslatable: a part of the task has no ONNX form.
     """
-    sheet = Sheet()
+    sheet = OnnxGraph()
     state = sheet.input("state", (BATCH, len(task.system.names)))
     begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
     fresh = proposed(task, network, columns_of(state, task.system.names))
@@ -445,7 +445,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     """`rank`, `plan` and verdicts of several plans (batch, count, T, m) of every agent: (batch, count, …)."""
     names = task.system.names
     count, steps, controls = plans.shape[1:]
-    each = state.T.reshaped(len(names), BATCH, 1).spread(len(names), BATCH, count, like=state.T)
+    each = state.T.reshaped(len(names), BATCH, 1).expand(len(names), BATCH, count, like=state.T)
     starts = dict(zip(names, each.reshaped(len(names), BATCH).rows(), strict=True))
     found = judged(task, starts, plans.reshaped(BATCH, steps, controls))
     rows = {"rank": rank(found), "rho": found.rho, "safe": found.safe, "cost": found.cost}
@@ -457,13 +457,13 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
 
 
 def _best(score: Value) -> Value:
-    """Index of the plan that ranks first, (batch, 1)."""
+    """Index of the plan of highest rank, (batch, 1)."""
     (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
     return best
 
 
 def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
-    """One row of the table of every agent, by (batch, 1): (batch, …)."""
+    """The row `index` (batch, 1) of each agent's table: (batch, count, …) -> (batch, …)."""
     outputs = {}
     for name, values in table.items():
         shape = (BATCH, *values.shape[2:])
@@ -478,7 +478,7 @@ def _shown(picked: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _one(values: Value, place: int) -> Value:
-    """The same plan of every agent: (batch, count, …) -> (batch, …)."""
+    """Row `place` of every agent: (batch, count, …) -> (batch, …)."""
     shape = (BATCH, *values.shape[2:])
     index = values.sheet.constant(place, "int64")
     (out,) = values.sheet.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
@@ -492,7 +492,7 @@ def _added(task: Task, state: Value) -> dict[str, Value]:
     now = columns_of(state, task.system.names)
     later = now | assigned({timer.name: timer.update for timer in task.system.timers}, now)
     like = now[task.system.names[0]]
-    rows = [later[column.name].spread(1, BATCH, like=like) for column in task.system.added]
+    rows = [later[column.name].expand(1, BATCH, like=like) for column in task.system.added]
     return {"added": joined(rows).T}
 
 
@@ -508,7 +508,7 @@ def judging(task: Task) -> dict[str, Value]:
     found = judged(task, start, plans)
     like = next(iter(start.values()))
     rows = task.horizon + 1
-    wide = [found.states[name].spread(rows, BATCH, like=like) for name in task.system.names]
+    wide = [found.states[name].expand(rows, BATCH, like=like) for name in task.system.names]
     outputs = {"rho": found.rho, "safe": found.safe, "cost": found.cost}
     outputs = {name: value.reshaped(BATCH) for name, value in outputs.items()}
     outputs["requirements"] = joined(found.each).T
@@ -528,7 +528,7 @@ def falling(task: Task) -> dict[str, Value]:
 
 
 def _asked(task: Task) -> tuple[Mapping[str, Value], Value]:
-    sheet = Sheet()
+    sheet = OnnxGraph()
     state = sheet.input("state", (BATCH, len(task.system.names)))
     plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.decl.controls)))
     return columns_of(state, task.system.names), plans

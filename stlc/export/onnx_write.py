@@ -1,4 +1,4 @@
-"""ONNX files of a controller, and the facts stored beside them."""
+"""ONNX files of a controller, and `controller.json` with its description."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from onnx import GraphProto, NodeProto, TensorProto, ValueInfoProto
 
-    from stlc.compile.backends.onnx.sheet import GraphNode, Sheet
+    from stlc.compile.backends.onnx.sheet import GraphNode, OnnxGraph
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
 
@@ -76,8 +76,8 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
     return data
 
 
-def _graph(sheet: Sheet, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
-    """The nodes on which the outputs depend, under their public names."""
+def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
+    """Graph of the nodes on which the outputs depend; outputs have their public names."""
     from onnx import helper
 
     shown = list(outputs)
@@ -212,10 +212,10 @@ def _states(task: Task) -> list[ControllerQuantity]:
 def timed(task: Task, folder: Path) -> Latency:
     """Decision times of the runtime in random states, after a warm-up."""
     controller = Controller.load(folder)
-    taken = []
+    times = []
     for state in task.sample(TIMED, seed=8, dtype=torch.float64).numpy():
-        begun = time.perf_counter()
+        started = time.perf_counter()
         controller.decide(state)
-        taken.append(1e3 * (time.perf_counter() - begun))
-    median, p99 = np.percentile(taken[10:], (50, 99))
+        times.append(1e3 * (time.perf_counter() - started))
+    median, p99 = np.percentile(times[10:], (50, 99))
     return Latency(float(median), float(p99))

@@ -43,7 +43,7 @@ class Deciding(nn.Module):
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         flat = plans.reshape(-1, steps, controls)
-        judged = judged_openly(self._task, starts, flat)
+        judged = judged_by_torch(self._task, starts, flat)
         score = rank(judged.rho, self._task.cost(judged), judged.safe).view(-1, count)
         rows = (flat, judged.rho, judged.safe, judged.requirements)
         split = [row.reshape(-1, count, *row.shape[1:]) for row in rows]
@@ -51,7 +51,7 @@ class Deciding(nn.Module):
         return plan, rho, safe, each
 
 
-def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
+def judged_by_torch(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
     """`Task.judge` in torch operations only, which can be exported."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
@@ -64,7 +64,7 @@ def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
 
 
 @contextmanager
-def unmoved() -> Iterator[None]:
+def without_deprecations() -> Iterator[None]:
     """Suppress the deprecation warnings that torch's export raises about torch itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
@@ -79,7 +79,7 @@ def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
 
 def _exported(module: nn.Module, *inputs: Tensor) -> ExportedProgram:
     module.eval()
-    with torch.no_grad(), unmoved():
+    with torch.no_grad(), without_deprecations():
         module(*inputs)  # cached constants are created here, not while exporting
         batch = torch.export.Dim("batch", min=1)
         shapes = tuple({0: batch} for _ in inputs)
@@ -90,14 +90,14 @@ def _exported(module: nn.Module, *inputs: Tensor) -> ExportedProgram:
 
 
 AT_ONCE = 32_768
-"""Greatest number of plans of one state evaluated at once."""
+"""Maximum number of plans of one state that are evaluated in one batch."""
 
 _NOTHING: tuple[Tensor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans of one T0: (states, choices, …); `falls` (states, choices, T+1) only for the last T0."""
+    """Plans of one prefix length T0 and verdicts, (states, choices, …) each; `falls` only for the last T0."""
 
     plans: Tensor
     rho: Tensor
@@ -124,7 +124,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose as the stages of the paper's guard do without a previous plan."""
+        """Choose a plan as the stages of the paper's guard do in the absence of a previous plan."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
@@ -164,7 +164,7 @@ class Guarding(nn.Module):
         reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.system.names], 1)
         tail = finite(self.deciding(reached)[0], self._task)
         plans = torch.cat((head, tail[:, : self._task.horizon - length]), 1)
-        judged = judged_openly(self._task, starts, plans)
+        judged = judged_by_torch(self._task, starts, plans)
         rows = [plans, judged.rho, judged.safe, judged.requirements, self._task.cost(judged)]
         if falls:
             rows.append(prefix_robustness(self._formulas, judged.columns).t())
@@ -172,7 +172,7 @@ class Guarding(nn.Module):
 
 
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """The plan with the longest safe prefix; ties go to the most robust, the latest to fail."""
+    """Index of the plan with the longest safe prefix; ties: highest robustness, then latest violation."""
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)
     longest = samples == samples.amax(1, keepdim=True)
@@ -186,7 +186,7 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """The result of a shorter prefix where there is one, elsewhere the present one."""
+    """Results of shorter prefixes where they are decided, elsewhere the results `here`."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)

@@ -16,7 +16,7 @@ from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import rank
 from stlc.diagnostics import Diagnostic, RunError
-from stlc.export.programs import unmoved
+from stlc.export.programs import without_deprecations
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
@@ -51,12 +51,12 @@ class Agreement:
 
 
 def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
-    """Compare both in random states.
+    """Compare an export with its policy in random states.
 
     Args:
         policy: the original.
-        decide: the export, of states (B, n) float64.
-        states: how many.
+        decide: function of the export, of states (B, n) float64.
+        states: number of random states.
         seed: of the states.
 
     Raises:
@@ -68,12 +68,12 @@ def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int
 
 
 def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer) -> Agreement:
-    """Agreement of an answer in states (B, n) in which the original chooses `plan` (B, T, m)."""
-    mine, rho, safe, each = answer
+    """Agreement of the export's `answer` with the `plan` (B, T, m) of the policy in states (B, n)."""
+    exported, rho, safe, each = answer
     judged = task.judge(x, plan)
     width = (task.system.control_high - task.system.control_low).double()
-    far = ((mine - plan).abs() / width).amax((1, 2))
-    again = task.judge(x, mine)
+    far = ((exported - plan).abs() / width).amax((1, 2))
+    again = task.judge(x, exported)
     score = [rank(one.rho, task.cost(one), one.safe) for one in (judged, again)]
     same = far <= PLAN
     ties = ~same & ((score[0] - score[1]).abs() <= PLAN)
@@ -96,13 +96,13 @@ def _disagreement(how: str) -> Diagnostic:
 
 
 def _distance(a: Tensor, b: Tensor) -> float:
-    """The largest distance; equal infinities are 0 apart."""
+    """Largest distance of two tensors; the distance of equal infinities is 0."""
     return float(torch.where(a == b, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
 
 
 def by_torch(path: Path) -> Callable[[Tensor], Answer]:
-    """The program in a file."""
-    with unmoved():
+    """Return the decisions of a torch program."""
+    with without_deprecations():
         module = torch.export.load(path).module()
 
     def decide(x: Tensor) -> Answer:
@@ -120,7 +120,7 @@ def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11)
     """
     task = policy.task
     x = task.sample(states, seed=seed, dtype=torch.float64)
-    with unmoved():
+    with without_deprecations():
         module = torch.export.load(path).module()
     with torch.no_grad():
         wanted = StagedSearch(task, policy, "paper").search(x, policy.plan(x))
@@ -132,7 +132,7 @@ def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11)
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
-    """The graphs of a folder, as the runtime runs them."""
+    """Return the decisions of graphs, as the runtime evaluates them."""
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
@@ -141,23 +141,23 @@ def _answer(judged: JudgedPlans) -> Answer:
     return plan, rho, safe, each
 
 
-def kept_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Compare both one step later, with the previous plans.
+def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
+    """Compare the graphs with the policy one step later, given the previous plans.
 
     Raises:
         RunError: R105, they disagree.
     """
     guard, task = Guard(policy.task, policy, "none"), policy.task
     x = task.sample(states, seed=seed, dtype=torch.float64)
-    begun = guard.decide(x)
-    x, left = task.system.step(x, begun.action), begun.later()
+    first = guard.decide(x)
+    x, left = task.system.step(x, first.action), first.later()
     wanted = guard.decide(x, left)
     judged, _ = graphs.followed(x.numpy(), left.plan.numpy())
     return _compared(task, x, wanted.plan, _answer(judged))
 
 
 def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:
-    """The largest distance between the verdicts of both on random plans: robustness, cost, states, prefixes.
+    """Return the largest distance of verdicts on random plans: robustness, cost, states, prefixes.
 
     Raises:
         RunError: R105, they disagree.
@@ -168,16 +168,16 @@ def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> 
     drawn = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     plans = low + (high - low) * drawn
     wanted = task.judge(x, plans)
-    mine, said = graphs.judged(x.numpy(), plans.numpy())
+    exported, outputs = graphs.judged(x.numpy(), plans.numpy())
     columns = torch.stack([wanted.columns[name].t() for name in task.system.names], 2)
     formulas = [rule.formula for rule in task.compiled.safety]
     falls = prefix_robustness(formulas, wanted.columns).t()
     pairs = [
-        (mine.rho, wanted.rho),
-        (mine.safe, wanted.safe),
-        (mine.each, wanted.requirements),
-        (mine.cost, task.cost(wanted)),
-        (said["states"], columns),
+        (exported.rho, wanted.rho),
+        (exported.safe, wanted.safe),
+        (exported.each, wanted.requirements),
+        (exported.cost, task.cost(wanted)),
+        (outputs["states"], columns),
         (graphs.falls(x.numpy(), plans.numpy()), falls),
     ]
     off = max(_distance(torch.from_numpy(a), b) for a, b in pairs)
@@ -195,7 +195,7 @@ class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
 
 
 def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
-    """The example program of a folder, compiled to `built`.
+    """Return the decisions of the example program of a folder, compiled to `built`.
 
     Raises:
         Unchecked: there is no working compiler.

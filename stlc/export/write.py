@@ -24,7 +24,7 @@ from stlc.export.verify import (
     by_c,
     by_onnx,
     by_torch,
-    kept_agreement,
+    previous_plan_agreement,
     same_verdicts,
 )
 from stlc.files import write_atomic
@@ -46,8 +46,8 @@ class Exported:
     """Result of an export.
 
     Attributes:
-        folder: where.
-        files: names in it.
+        folder: of the files.
+        files: their names.
         agreement: with the run; None where there is no compiler to verify it with.
         latency: of a decision in the Python runtime, where it was measured.
         unchecked: reason why there is no agreement.
@@ -71,12 +71,12 @@ def target_of(word: str) -> Target:
 
 
 def export(run: Run, target: Target, folder: Path) -> Exported:
-    """Write a run's controller.
+    """Export the controller of a run, and verify it.
 
     Args:
         run: with a checkpoint.
         target: the form of the export.
-        folder: where to; files of the same names are replaced.
+        folder: destination; files of the same names are replaced.
 
     Raises:
         RunError: R105, the export disagrees with the run; nothing is written.
@@ -117,7 +117,7 @@ def _onnx(run: Run, folder: Path) -> Checked:
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
-    kept = kept_agreement(run.policy, graphs, states=STATES)
+    kept = previous_plan_agreement(run.policy, graphs, states=STATES)
     off = max(fresh.rho, kept.rho, same_verdicts(run.task, graphs, states=STATES // 4))
     found = Agreement(STATES, max(fresh.plan, kept.plan), off, fresh.ties + kept.ties)
     return found, timed(run.task, folder)

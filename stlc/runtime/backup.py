@@ -18,7 +18,7 @@ POLICY, BACKUP, SAFEST = range(3)
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One plan for a state: `source` is the rule that chose it, `t0` the length of its prefix."""
+    """Plan for one state: `source` is the rule that chose it, `t0` the length of its prefix."""
 
     judged: JudgedPlans
     source: int
@@ -26,7 +26,7 @@ class Found:
 
 
 def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
-    """A better plan for a state whose policy plan is violated.
+    """Search a plan for a state in which the plan of the policy is violated.
 
     T0 grows until a plan satisfies phi, or else phi_safe; if none does, the longest safe prefix decides.
 
@@ -34,16 +34,16 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
         graphs: of the controller.
         x: (n,).
         plan: (T, m), of the policy; entries that are not finite are replaced.
-        rest: (T, m), the rest of the previous plan.
+        rest: (T, m), remainder of the previous plan.
 
     Returns:
-        The plan, in one row.
+        The plan found, as one row.
     """
     own, grid = finite(plan, graphs.facts.controls), graphs.facts.grid
-    begun = [] if rest is None else [graphs.judged(x[None], finite(rest, graphs.facts.controls)[None])[0]]
+    previous = [] if rest is None else [graphs.judged(x[None], finite(rest, graphs.facts.controls)[None])[0]]
     candidates = None
     for length in grid.lengths:
-        candidates = joined([_candidates(graphs, x, own, length), *begun])
+        candidates = joined([_candidates(graphs, x, own, length), *previous])
         good = candidates.rho >= -TOLERANCE
         allowed = good if good.any() else candidates.safe >= -TOLERANCE
         if allowed.any():
@@ -74,7 +74,7 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
 
 
 def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
-    """The plan with the longest safe prefix; ties go to the most robust, the latest to fail."""
+    """Index of the plan with the longest safe prefix; ties: highest robustness, then latest violation."""
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(
         [
@@ -88,7 +88,7 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
 
 
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """The allowed choice that is best by the keys in order."""
+    """Index of the allowed choice that is best by the keys, in lexicographic order."""
     for key in keys:
         value = np.where(allowed & ~np.isnan(key), key, -np.inf)
         allowed = allowed & (value >= value.max() - TOLERANCE)

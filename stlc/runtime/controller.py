@@ -28,11 +28,11 @@ class ControlDecision:
     Attributes:
         control: (m,), physical units.
         rule: "policy", "kept" (the previous plan is continued), "backup" or "safest".
-        plan: (T, m) that the control begins.
-        rho: robustness of the plan; satisfied from -1e-6 on.
+        plan: (T, m), whose first action is the control.
+        rho: robustness of the plan; satisfied if >= -1e-6.
         safe: robustness of the safety requirements alone.
         robustness: robustness of each requirement, by name.
-        source: origin of the plan: `rule`, or for a kept one its `source` when it was new.
+        source: `rule` by which the plan was first chosen.
         t0: length of the backup's prefix; 0 for the policy's own plan.
         policy_rho: robustness of the policy's plan; -inf where that is not a number.
     """
@@ -49,8 +49,8 @@ class ControlDecision:
 
 
 @dataclass(slots=True)
-class _Followed:
-    """The chosen plans: verdicts, sources, and which of them are previous plans."""
+class _ChosenPlans:
+    """Chosen plans: verdicts, sources, prefix lengths, and the mask of continued plans."""
 
     judged: JudgedPlans
     source: NDArray[np.int64]
@@ -90,7 +90,7 @@ class Controller:
         if guard == "paper":
             self._graphs.prepare()
         self._parameters = dict(parameters or {})
-        self._begun: _Followed | None = None
+        self._previous: _ChosenPlans | None = None
         self._added: Numbers | None = None
 
     @classmethod
@@ -129,7 +129,7 @@ class Controller:
 
     def reset(self) -> None:
         """Forget the previous plans, and restart the mission."""
-        self._begun = self._added = None
+        self._previous = self._added = None
 
     def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> ControlDecision:
         """Return the decision for a state.
@@ -148,22 +148,22 @@ class Controller:
                 plan is not a number.
         """
         x, single = self._read(state, elapsed)
-        if self._begun is not None and len(self._begun.source) != len(x):
-            raise _misfit(f"{len(x)} agents where {len(self._begun.source)} were", "`reset` begins anew")
-        before = self._begun
-        followed, said = self._followed(x, elapsed)
-        fresh = said.get("policy_plan", said["plan"])
-        policy_rho = said.get("policy_rho", said["rho"]).copy()
+        if self._previous is not None and len(self._previous.source) != len(x):
+            raise _invalid(f"{len(x)} agents where {len(self._previous.source)} were", "`reset` begins anew")
+        previous = self._previous
+        followed, outputs = self._followed(x, elapsed)
+        fresh = outputs.get("policy_plan", outputs["plan"])
+        policy_rho = outputs.get("policy_rho", outputs["rho"]).copy()
         if self.guard == "paper":
-            rest = None if before is None else _later(before.judged.plan, elapsed)
+            rest = None if previous is None else _continued(previous.judged.plan, elapsed)
             for row in np.flatnonzero(~(followed.judged.rho >= -TOLERANCE)):
                 left = None if rest is None else rest[row]
                 found = search(self._graphs, x[row], fresh[row], left)
                 followed.put(int(row), found)
         if not np.isfinite(followed.judged.plan[:, 0]).all():
             raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
-        self._begun = followed
-        self._added = said.get("added")
+        self._previous = followed
+        self._added = outputs.get("added")
         command = followed.judged.plan[:, 0].copy()
         if self.facts.feedback is not None:
             command = self.facts.feedback(x, command)
@@ -174,27 +174,27 @@ class Controller:
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
         """The states (agents, n), and whether it is one agent."""
         if elapsed < 0:
-            raise _misfit(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
+            raise _invalid(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
         named = self._named(state) if isinstance(state, Mapping) else None
         try:
             stacked = state if named is None else np.stack(np.broadcast_arrays(*named), -1)
             given = np.asarray(stacked, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise _misfit(
+            raise _invalid(
                 f"the state is no array of numbers: {error}",
                 "numbers in the units of the system, one row an agent",
             ) from None
         single, x = given.ndim == 1, np.atleast_2d(given)
         known = len(self.facts.states) - len(self.facts.added)
         if x.ndim != 2 or x.shape[1] not in (known, len(self.facts.states)):
-            raise _misfit(f"a state of shape {given.shape}", f"the columns are {', '.join(self.states)}")
+            raise _invalid(f"a state of shape {given.shape}", f"the columns are {', '.join(self.states)}")
         if x.shape[1] == known and self.facts.added:
-            x = np.concatenate((x, self._remembered(len(x), elapsed)), 1)
+            x = np.concatenate((x, self._added_states(len(x), elapsed)), 1)
         if not np.isfinite(x).all():
             names = [
                 name for name, column in zip(self.states, x.T, strict=True) if not np.isfinite(column).all()
             ]
-            raise _misfit(f"{', '.join(names)} is not a finite number", "hold the last control, or stop")
+            raise _invalid(f"{', '.join(names)} is not a finite number", "hold the last control, or stop")
         return np.ascontiguousarray(x), single
 
     def _named(self, state: Mapping[str, ArrayLike]) -> list[ArrayLike]:
@@ -202,20 +202,22 @@ class Controller:
         names = [name for name in self.states if name not in added or name in state]
         wrong = (set(names) ^ set(state)) or (added - set(names) if added & set(state) else set())
         if wrong:
-            raise _misfit(f"states by name: {', '.join(sorted(wrong))}", f"they are {', '.join(self.states)}")
+            raise _invalid(
+                f"states by name: {', '.join(sorted(wrong))}", f"they are {', '.join(self.states)}"
+            )
         return [state[name] for name in names]
 
-    def _remembered(self, agents: int, elapsed: int) -> Numbers:
+    def _added_states(self, agents: int, elapsed: int) -> Numbers:
         """States that the specification adds: as predicted by the model, or as at the start of a mission."""
         if self._added is not None:
             if elapsed != 1 or len(self._added) != agents:
-                raise _misfit("timers follow from every step", "give them as the last columns of the state")
+                raise _invalid("timers follow from every step", "give them as the last columns of the state")
             return self._added
         row = []
         for each in self.facts.added:
             value = self._parameters.get(each.name, each.initial)
             if value is None:
-                raise _misfit(
+                raise _invalid(
                     f"the parameter `{each.name}` has no value", "give it to `load`, or in the state"
                 )
             row.append(float(value))
@@ -223,20 +225,20 @@ class Controller:
 
     # ------------------------------------------------------------------------ plans
 
-    def _followed(self, x: Numbers, elapsed: int) -> tuple[_Followed, Mapping[str, Numbers]]:
-        """The policy's plans, or the rest of the previous ones, and the graph's other outputs."""
-        before = self._begun
-        if before is None:
-            judged, said = self._graphs.decided(x)
+    def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
+        """The policy's plans, or remainders of the previous ones, and the graph's other outputs."""
+        previous = self._previous
+        if previous is None:
+            judged, outputs = self._graphs.decided(x)
             zero = np.zeros(len(x), dtype=np.int64)
-            return _Followed(judged, zero + POLICY, zero, zero > 0), said
-        judged, said = self._graphs.followed(x, _later(before.judged.plan, elapsed))
-        kept = said["kept"].astype(bool)
-        source, t0 = np.where(kept, before.source, POLICY), np.where(kept, before.t0, 0)
-        return _Followed(judged, source, t0, kept), said
+            return _ChosenPlans(judged, zero + POLICY, zero, zero > 0), outputs
+        judged, outputs = self._graphs.followed(x, _continued(previous.judged.plan, elapsed))
+        kept = outputs["kept"].astype(bool)
+        source, t0 = np.where(kept, previous.source, POLICY), np.where(kept, previous.t0, 0)
+        return _ChosenPlans(judged, source, t0, kept), outputs
 
     def _decision(
-        self, followed: _Followed, control: Numbers, policy_rho: Numbers, *, single: bool
+        self, followed: _ChosenPlans, control: Numbers, policy_rho: Numbers, *, single: bool
     ) -> ControlDecision:
         judged = followed.judged
         source = np.array(RULES)[followed.source]
@@ -258,11 +260,11 @@ class Controller:
         )
 
 
-def _later(plans: Numbers, steps: int) -> Numbers:
-    """The rest of plans after so many steps, extended by their last actions."""
+def _continued(plans: Numbers, steps: int) -> Numbers:
+    """Remainder of plans after `steps` steps, extended by their last actions."""
     last = plans.shape[1] - 1
     return np.ascontiguousarray(plans[:, np.minimum(np.arange(last + 1) + steps, last)])
 
 
-def _misfit(message: str, advice: str) -> RunError:
+def _invalid(message: str, advice: str) -> RunError:
     return RunError(Diagnostic("R107", f"no decision: {message}", help=(advice,)))

@@ -27,10 +27,10 @@ class ControllerQuantity:
 
     Attributes:
         name: as in the system file.
-        unit: of its numbers; empty where they have none.
-        low: lower end of its range; None where it has none. Those of states are nominal.
+        unit: of its values; "" if dimensionless.
+        low: lower end of its range, nominal for states; None without a range.
         high: upper end.
-        added: "parameter" or "timer" where the specification adds this state, else empty.
+        added: "parameter" or "timer" for a state that the specification adds, else "".
         initial: value of a timer at the start of a mission.
     """
 
@@ -76,7 +76,7 @@ class Facts:
     Attributes:
         spec: name and hash of the specification.
         system: name and hash of the system.
-        states: in order, those that the specification adds last.
+        states: in order; states that the specification adds are last.
         controls: in order.
         requirements: names, in order.
         dt: seconds per step.

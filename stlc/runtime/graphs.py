@@ -35,7 +35,7 @@ class JudgedPlans:
     each: Numbers
 
     def of(self, rows: Any) -> JudgedPlans:
-        """Some rows: indices or a mask."""
+        """Return the rows of an index or a mask."""
         return JudgedPlans(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
@@ -77,12 +77,12 @@ class Graphs:
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Verdicts of plans from states; `states` (rows, T + 1, n) is among the graph's outputs."""
+        """Verdicts of plans, and all outputs of the graph, among them `states` (rows, T + 1, n)."""
         found = _run(self._judge, {"state": x, "plan": plans})
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
-        """The least robustness of phi_safe on every prefix, (rows, T + 1); +inf without such requirements."""
+        """Robustness of phi_safe on every prefix, (rows, T + 1); +inf without safety requirements."""
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)
         return _run(self._fall, {"state": x, "plan": plans})["falls"]

@@ -11,7 +11,7 @@ from helpers.exported import CART, exported, mission, untrained
 from helpers.sheets import computed
 
 from stlc.compile.backends.onnx import sheet as sheets
-from stlc.compile.backends.onnx.sheet import BATCH, Sheet
+from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.model.algebra import substitute
@@ -19,7 +19,7 @@ from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled
-from stlc.export.verify import kept_agreement, same_verdicts
+from stlc.export.verify import previous_plan_agreement, same_verdicts
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
@@ -31,7 +31,7 @@ def test_promises_deepen_as_the_task_says() -> None:
     x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
     wanted = run.task.promises.deepened(run.task.judge(x, plans).columns)
-    sheet = Sheet()
+    sheet = OnnxGraph()
     start = columns_of(sheet.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
     given = sheet.input("plan", (BATCH, run.task.horizon, 1))
     found = deepened(run.task, judged(run.task, start, given).states)
@@ -43,7 +43,7 @@ def test_promises_deepen_as_the_task_says() -> None:
 
 def test_a_begun_plan_is_gone_on_with_where_the_guard_does() -> None:
     run, folder = mission()
-    found = kept_agreement(run.policy, Graphs(read_facts(folder)), states=100)
+    found = previous_plan_agreement(run.policy, Graphs(read_facts(folder)), states=100)
     assert found.plan <= 1e-5
     assert found.rho <= 1e-9
 
@@ -78,7 +78,7 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("written_out", [True, False])
 def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
+    monkeypatch.setattr(sheets, "UNROLLED_NODES", 10**9 if written_out else 0)
     x, y, z, u = (ir.Signal(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
     step = ModelStep(
@@ -91,7 +91,7 @@ def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.
             "c": ir.Const(4.0),
         },
     )
-    sheet = Sheet()
+    sheet = OnnxGraph()
     names = ("x", "y", "z", "w", "c", "s")
     start = {name: sheet.input(name, (1, BATCH)) for name in names}
     controls = {"u": sheet.input("u", (5, BATCH))}
@@ -133,7 +133,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}
     step = ModelStep(tuple(lets), {name: state[name] for name in ("angle", "speed")})
-    sheet = Sheet()
+    sheet = OnnxGraph()
     start = {name: sheet.input(name, (1, BATCH)) for name in ("angle", "speed")}
     states = rolled(step, start, {"push": sheet.input("push", (40, BATCH))})
     assert len(sheet.needed(list(states.values()))) < 30

@@ -22,7 +22,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
 from stlc.diagnostics import RunError, UsageError
-from stlc.export.programs import unmoved
+from stlc.export.programs import without_deprecations
 from stlc.export.verify import BUILT, agreement, answers
 from stlc.export.write import export, target_of
 from stlc.runtime.prefixes import SAMPLINGS
@@ -143,7 +143,7 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     done = export(run, "torch", tmp_path / "out")
     assert done.files == ("backup.pt2", "controller.json", "decide.pt2")
-    with unmoved():
+    with without_deprecations():
         module = torch.export.load(done.folder / "decide.pt2").module()
         backup = torch.export.load(done.folder / "backup.pt2").module()
     for count in (1, 70):

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import onnxruntime
 
-from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value
+from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value
 from stlc.export.onnx_write import model_of
 
 
-def columns_on(sheet: Sheet, names: tuple[str, ...], rows: int) -> dict[str, Value]:
+def columns_on(sheet: OnnxGraph, names: tuple[str, ...], rows: int) -> dict[str, Value]:
     """Columns (rows, batch) that are given."""
     return {name: sheet.input(name, (rows, BATCH)) for name in names}
 

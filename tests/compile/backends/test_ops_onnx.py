@@ -12,7 +12,7 @@ from helpers.sheets import columns_on, computed
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.onnx.ops import ONNX
-from stlc.compile.backends.onnx.sheet import Sheet
+from stlc.compile.backends.onnx.sheet import OnnxGraph
 from stlc.compile.ir import nodes as ir
 
 ROWS = 7
@@ -20,7 +20,7 @@ ROWS = 7
 
 def _agree(numbers: dict[str, ir.Num], env: dict[str, np.ndarray], tolerance: float = 1e-13) -> None:
     program = ArrayProgram(numbers)
-    found = computed(program(columns_on(Sheet(), tuple(env), len(env["x"])), ONNX), env)
+    found = computed(program(columns_on(OnnxGraph(), tuple(env), len(env["x"])), ONNX), env)
     for name, wanted in program(env, NUMPY).items():
         value = np.broadcast_to(found[name], wanted.shape)
         np.testing.assert_allclose(value, wanted, rtol=tolerance, atol=tolerance, err_msg=name)
@@ -57,7 +57,7 @@ def test_angles_are_exact_at_the_edges() -> None:
         "angle": ir.Op("atan2", (ir.Signal("y"), ir.Signal("x"))),
         "slope": ir.Op("atan", (ir.Signal("y"),)),
     }
-    found = computed(ArrayProgram(numbers)(columns_on(Sheet(), ("y", "x"), 1), ONNX), {"y": y, "x": x})
+    found = computed(ArrayProgram(numbers)(columns_on(OnnxGraph(), ("y", "x"), 1), ONNX), {"y": y, "x": x})
     np.testing.assert_allclose(found["angle"], np.where(known, np.arctan2(y, x), np.nan), rtol=1e-15)
     np.testing.assert_allclose(found["slope"], np.arctan(y), rtol=1e-15)
 
@@ -72,7 +72,7 @@ def test_remainders_have_the_sign_of_the_divisor() -> None:
 def test_nan_is_not_lost() -> None:
     env = _env(2)
     env["x"][3, ::2] = math.nan
-    x, y, _ = columns_on(Sheet(), NAMES, ROWS).values()
+    x, y, _ = columns_on(OnnxGraph(), NAMES, ROWS).values()
     outputs = {
         "least": ONNX.amin(x),
         "most": ONNX.amax(x),

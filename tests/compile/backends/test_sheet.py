@@ -7,14 +7,14 @@ import pytest
 from helpers.sheets import computed
 
 from stlc.compile.backends.onnx import sheet as sheets
-from stlc.compile.backends.onnx.sheet import BATCH, Sheet, joined
+from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, joined
 
 ARRAY = np.arange(15.0).reshape(5, 3) - 4.0
 
 
 def test_cutting_and_shaping_is_that_of_numpy() -> None:
-    x = Sheet().input("x", (5, BATCH))
-    wide = x[:1].spread(4, BATCH)
+    x = OnnxGraph().input("x", (5, BATCH))
+    wide = x[:1].expand(4, BATCH)
     outputs = {
         "slice": x[1:4],
         "back": x[::-1],
@@ -26,7 +26,7 @@ def test_cutting_and_shaping_is_that_of_numpy() -> None:
         "wide": wide * 2.0,
         "sums": 1.0 - x * 3.0 / 2.0 + (-x),
         "inverse": 2.0 / (x + 0.5),
-        "constant": x.sheet.constant([[7.0], [8.0]]).spread(2, BATCH, like=x),
+        "constant": x.sheet.constant([[7.0], [8.0]]).expand(2, BATCH, like=x),
     }
     found = computed(outputs, {"x": ARRAY})
     expected = {
@@ -51,7 +51,7 @@ def test_cutting_and_shaping_is_that_of_numpy() -> None:
 
 
 def test_equal_operations_are_one_node_and_unused_ones_none() -> None:
-    x = Sheet().input("x", (5, BATCH))
+    x = OnnxGraph().input("x", (5, BATCH))
     first, second = x + 1.0, x + 1.0
     assert first is second
     unused = x * 2.0
@@ -60,7 +60,7 @@ def test_equal_operations_are_one_node_and_unused_ones_none() -> None:
 
 
 def test_shapes_that_do_not_fit_are_not_written() -> None:
-    sheet = Sheet()
+    sheet = OnnxGraph()
     with pytest.raises(AssertionError, match="5"):
         sheet.input("x", (5, BATCH)) + sheet.input("y", (4, BATCH))
 
@@ -69,8 +69,8 @@ def test_shapes_that_do_not_fit_are_not_written() -> None:
 def test_a_loop_is_the_same_written_out_and_as_a_node(
     written_out: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
-    sheet = Sheet()
+    monkeypatch.setattr(sheets, "UNROLLED_NODES", 10**9 if written_out else 0)
+    sheet = OnnxGraph()
     x, first = sheet.input("x", (5, BATCH)), sheet.input("first", (1, BATCH))
     factor, unread = first * 0.5, first + 9.0
 

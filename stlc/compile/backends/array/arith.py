@@ -289,21 +289,21 @@ def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops
         if name == ir.ELAPSED:
             return ops.counted(run.start, run.count, next(iter(env.values())))
         if name in program.shifted:
-            return _beside(env[program.shifted[name].name], program.shifted[name], run, ops)
-        return _cut(env[name], run.start, run.count)
+            return _shifted_rows(env[program.shifted[name].name], program.shifted[name], run, ops)
+        return _rows(env[name], run.start, run.count)
 
     return {name: read(name) for name in program.columns or list(env)[:1]}
 
 
-def _cut(column: Array, start: int, count: int) -> Array:
+def _rows(column: Array, start: int, count: int) -> Array:
     return column if start == 0 and len(column) == count else column[start : start + count]
 
 
-def _beside(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
+def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
     """Return a shifted column; a clamped one repeats its first and last row beyond the ends of the trace."""
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
     if not before and not after:
-        return _cut(column, start, count)
+        return _rows(column, start, count)
     inside = [column[max(start, 0) : min(start + count, samples)]] if before + after < count else []
     return ops.cat([*[column[:1]] * before, *inside, *[column[-1:]] * after])

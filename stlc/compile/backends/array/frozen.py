@@ -49,7 +49,7 @@ class Freezer:
 
     def values(self, node: ir.Freeze, run: IndexRange) -> Array:
         """Robustness of the node at the instants `run`, `(count, batch)`."""
-        bound = within(_together(node, self.domain), run, self.domain)
+        bound = within(_combined_reach(node, self.domain), run, self.domain)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
         else:
@@ -62,7 +62,9 @@ class Freezer:
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
         """Evaluate instants with undefined bound values: their readers are unknown, false on a cut trace."""
-        for missing, instants in groupby(range(run.start, run.start + run.count), partial(self._lost, node)):
+        for missing, instants in groupby(
+            range(run.start, run.start + run.count), partial(self._undefined, node)
+        ):
             first, *more = instants
             kept = tuple((name, num) for name, num in node.bindings if name not in missing)
             body = without(node.body, missing, self.domain)
@@ -73,7 +75,7 @@ class Freezer:
             else:
                 yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
-    def _lost(self, node: ir.Freeze, instant: int) -> frozenset[str]:
+    def _undefined(self, node: ir.Freeze, instant: int) -> frozenset[str]:
         """Names of the bound values that are undefined at an instant."""
         domain, run = self.domain, spanning(instant, 1)
         return frozenset(
@@ -100,30 +102,30 @@ class Freezer:
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
             chosen = np.arange(chunk.start, chunk.last + 1)
             rows = np.arange(-back, ahead + 1)[:, None] + chosen
-            env = {n: x[rows].reshape(length, -1) for n, x in self._read(node).items()}
-            env |= self._held(node, chunk, length)
+            env = {n: x[rows].reshape(length, -1) for n, x in self._columns_read(node).items()}
+            env |= self._bound_values(node, chunk, length)
             yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
     def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
         """Evaluate arbitrary instants, each on its own copy of the surrounding trace."""
         ops, batch = self.ops, self._batch
-        for chunk in _chunks(run, _edge(_MOST // batch, back + ahead, self.domain.samples)):
+        for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
             start = max(chunk.start - back, 0)
             stop = min(chunk.last + ahead + 1, self.domain.samples)
             begin, length = int(start), int(stop) - int(start)
             blank = ops.full((1, chunk.count, 1), 0.0, self._like)
             env = {
                 name: (x[begin : begin + length][:, None] + blank).reshape(length, -1)
-                for name, x in self._read(node).items()
+                for name, x in self._columns_read(node).items()
             }
-            env |= self._held(node, chunk, length)
+            env |= self._bound_values(node, chunk, length)
             ends = self.domain.stop
             domain = replace(self.domain, samples=length, stop=None if ends is None else ends - begin)
             there = self.judge(node.body, env, spanning(chunk.start - begin, chunk.count), domain)
             each = np.arange(chunk.count)
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
-    def _held(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
+    def _bound_values(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
         """Bound values of each instant of `run`, constant along time: `(length, count * batch)`."""
         program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
@@ -131,7 +133,7 @@ class Freezer:
         rows = self.ops.full((run.count, self._batch), 0.0, self._like)
         return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
 
-    def _read(self, node: ir.Freeze) -> dict[str, Array]:
+    def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
         """Columns and enclosing frozen values that the body reads; at least one."""
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
@@ -146,7 +148,7 @@ class Freezer:
         return int(self._like.shape[1])
 
 
-def _together(node: ir.Freeze, domain: TraceDomain) -> Reach:
+def _combined_reach(node: ir.Freeze, domain: TraceDomain) -> Reach:
     reaches = [reads(num, domain) for _, num in node.bindings]
     return Reach(max(r.past for r in reaches), max(r.future for r in reaches))
 
@@ -161,7 +163,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     return math.inf if back else past, math.inf if uses_end(body) else future
 
 
-def _edge(most: int, width: float, samples: int) -> int:
+def _chunk_size(most: int, width: float, samples: int) -> int:
     """Largest chunk c >= 1 with c (c + width) <= `most`; for infinite width, c * samples <= `most`."""
     if math.isinf(width):
         return max(most // samples, 1)

@@ -88,15 +88,15 @@ class NumpyOps:
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:
-        """Minimum over axis 0, kept."""
+        """Minimum over axis 0, kept with length 1."""
         return x.min(axis=0, keepdims=True)
 
     def amax(self, x: Array) -> Array:
-        """Maximum over axis 0, kept."""
+        """Maximum over axis 0, kept with length 1."""
         return x.max(axis=0, keepdims=True)
 
     def sum(self, x: Array) -> Array:
-        """Sum over axis 0, kept."""
+        """Sum over axis 0, kept with length 1."""
         return x.sum(axis=0, keepdims=True)
 
     def cummin(self, x: Array) -> Array:
@@ -123,7 +123,7 @@ class NumpyOps:
         return _by_kernel((left, right), pick, window) if wide else None
 
     def softmax(self, x: Array, k: float) -> Array:
-        """Smooth extremum over axis 0, kept."""
+        """Smooth extremum over axis 0, kept with length 1."""
         top = self.amax(x) if k > 0 else self.amin(x)
         finite = np.where(np.isfinite(top), top, 0.0)
         with self.quiet():
@@ -131,7 +131,7 @@ class NumpyOps:
             return top + np.log(total) / k
 
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
-        """Smooth extremum of two."""
+        """Smooth extremum of two arrays."""
         top = np.maximum(a, b) if k > 0 else np.minimum(a, b)
         with self.quiet():
             gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
@@ -142,7 +142,7 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Constant key: floats take the dtype of the other operand."""
+        """None: all arrays share constants, since floats take the dtype of the other operand."""
         return None
 
     def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002

@@ -107,13 +107,13 @@ def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, .
             elif inside.count > 0:
                 wanted.setdefault(_signed(step.node), []).append((inside, index))
     grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
-    for num, asked in wanted.items():
-        for stretch, indices in _stretches(asked):
-            grouped.setdefault(stretch, {})[num] = indices
+    for num, ranges in wanted.items():
+        for merged, indices in _merged(ranges):
+            grouped.setdefault(merged, {})[num] = indices
     batches = []
-    for number, (stretch, nums) in enumerate(grouped.items()):
+    for number, (merged, nums) in enumerate(grouped.items()):
         outputs = {str(i): num for i, num in enumerate(nums)}
-        batches.append(Batch(stretch, ArrayProgram(outputs)))
+        batches.append(Batch(merged, ArrayProgram(outputs)))
         for i, indices in enumerate(nums.values()):
             predicates.update({index: StepSource(number, str(i), inside) for inside, index in indices})
     return tuple(batches), predicates
@@ -123,10 +123,10 @@ def _signed(atom: ir.Predicate) -> ir.Num:
     return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
 
 
-def _stretches(asked: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
+def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
     """Merge overlapping and adjacent ranges."""
     out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
-    for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
+    for run, index in sorted(ranges, key=lambda item: (item[0].start, item[0].count)):
         if out and run.start <= out[-1][0].last + 1:
             whole, indices = out[-1]
             out[-1] = (IndexRange(whole.start, max(whole.last, run.last)), [*indices, (run, index)])

@@ -126,7 +126,7 @@ class Windows:
             held = self.extrema(left, dual(pick), count=count, width=lo)
             return self.semantics.pair(held, reached, dual(pick), self.ops)
         if width >= rows and (tiles := self._tiles(left, min(count, rows), 1)):
-            return self.padded(self._until_from_behind(left, right, pick, tiles), count, neutral(pick))
+            return self.padded(self._until_by_tiles(left, right, pick, tiles), count, neutral(pick))
         if tiles := self._tiles(left, count, width):
             out = self.ops.empty((count, *left.shape[1:]), left)
             for asked, seen in tiles:
@@ -200,20 +200,20 @@ class Windows:
         rows = out[: -count - 1 : -1]
         return rows[0] if count == 1 else self.ops.cat(rows)
 
-    def _until_from_behind(
+    def _until_by_tiles(
         self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
     ) -> Array:
         """`until` to the end of a long recorded trace, tile by tile backward in time."""
         out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
-        behind = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
+        later = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
         for rows, _ in reversed(tiles):
             size = rows.stop - rows.start
             held = self._to_end(left[rows], dual(pick))
             met = self.until(left[rows], right[rows], pick, count=size, width=size)
             out[rows] = self.semantics.pair(
-                met, self.semantics.pair(held, behind, dual(pick), self.ops), pick, self.ops
+                met, self.semantics.pair(held, later, dual(pick), self.ops), pick, self.ops
             )
-            behind = out[rows.start : rows.start + 1]
+            later = out[rows.start : rows.start + 1]
         return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:

@@ -82,7 +82,7 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
         (num, f"gx[{index[name]}][k + 1][j]") for name, num in motion.next.items() if name not in fixed
     ]
     still = [f"gx[{i}][k][j] += gx[{i}][k + 1][j];" for name, i in index.items() if name not in motion.next]
-    return [*writer.pulled(outputs), *still]
+    return [*writer.gradients(outputs), *still]
 
 
 UNCHECK = Frame(

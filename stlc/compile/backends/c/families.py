@@ -65,11 +65,11 @@ def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
     """
     if len(formulas) < LEAST:
         return []
-    alike: dict[ir.Formula, list[int]] = {}
+    groups: dict[ir.Formula, list[int]] = {}
     for place, formula in enumerate(formulas):
-        alike.setdefault(_changed(formula, _blank), []).append(place)
-    groups = [group for group in alike.values() if len(group) >= LEAST]
-    return [_family(formulas, group, first + i) for i, group in enumerate(groups)]
+        groups.setdefault(_changed(formula, _blank), []).append(place)
+    large = [group for group in groups.values() if len(group) >= LEAST]
+    return [_family(formulas, group, first + i) for i, group in enumerate(large)]
 
 
 def _blank(leaf: Entry) -> ir.Num:
@@ -80,21 +80,21 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
     constants: dict[str, tuple[float, ...]] = {}
     columns: dict[str, tuple[str, ...]] = {}
     names: dict[tuple[str, ...], str] = {}
-    stands: list[ir.Num] = []
+    replaced: list[ir.Num] = []
     for rows in zip(*(_entries(formulas[member]) for member in members), strict=True):
         first, key = rows[0], tuple(map(repr, rows))
         if len(set(key)) == 1:
-            stands.append(first)
+            replaced.append(first)
         elif isinstance(first, ir.Const):
             name = names.setdefault(key, f"t{number}_{len(constants)}")
             constants[name] = tuple(row.value for row in rows if isinstance(row, ir.Const))
-            stands.append(ir.FrozenVar(f"{LISTED}{name}"))
+            replaced.append(ir.FrozenVar(f"{LISTED}{name}"))
         else:
             entries = tuple(row.name for row in rows if not isinstance(row, ir.Const))
             name = names.setdefault(entries, f"c{number}_{len(columns)}")
             columns[name] = entries
-            stands.append(replace(first, name=f"{LISTED}{name}"))
-    left = iter(stands)
+            replaced.append(replace(first, name=f"{LISTED}{name}"))
+    left = iter(replaced)
     shape = _changed(formulas[members[0]], lambda _: next(left))
     return Family(tuple(members), shape, FamilyTable(len(members), constants, columns))
 

@@ -317,12 +317,12 @@ def call_of(num: ir.Num) -> CallKey | None:
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
     leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
-    if len(leaves) < len(num.args) or len({_moved(leaf) for leaf in leaves}) > 1:
+    if len(leaves) < len(num.args) or len({_offset(leaf) for leaf in leaves}) > 1:
         return None
     return num.name, tuple(ir.Signal(leaf.name) for leaf in leaves)
 
 
-def _moved(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
+def _offset(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
     return (leaf.steps, leaf.clamped) if isinstance(leaf, ir.ShiftedSignal) else (0, False)
 
 
@@ -348,7 +348,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
         return formula
     if not _large(formula.num):
         return formula
-    num = _raised(formula.num)
+    num = _distributed(formula.num)
     name, args = num.name, num.args
     if name not in ("min", "max", "neg"):
         return formula
@@ -360,7 +360,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
     return ir.BoolOp("and" if both else "or", tuple(replace(formula, num=arg) for arg in args), formula.span)
 
 
-def _raised(num: ir.Op) -> ir.Op:
+def _distributed(num: ir.Op) -> ir.Op:
     """Distribute a sum over an extremum, bit for bit the same, since rounding is monotone."""
     if num.name not in ("add", "sub") or len(num.args) != 2:
         return num

@@ -60,7 +60,7 @@ class StepPrinter:
 
 
 class StepForm(ABC):
-    """C code of one step, forward and adjoint."""
+    """C code of one step of a plan, forward and adjoint."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         self.printer, self.plan, self.step = printer, printer.plan, step
@@ -98,7 +98,7 @@ def _indented(lines: Iterable[str], by: int = 2) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class LeafReader:
     """C expressions of a number's leaves at sample `k`, in lane `j`.
 
     Attributes:
@@ -137,12 +137,12 @@ class Sight:
         return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
-def _pulled(num: ir.Num, seed: str, sight: Sight) -> list[str]:
+def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
     """Statements that propagate the gradient of a number at sample `k` to its leaves.
 
     Leaves may alias one sample: they are accumulated apart from the computing loop, which is vectorized.
     """
-    writer = SlopeWriter(sight, soft=False)
+    writer = SlopeWriter(reader, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
     shares = [f"h{i}" for i in range(len(gathered))]
     return [
@@ -168,14 +168,14 @@ class _Margin(StepForm):
     """Predicate."""
 
     def forward(self) -> list[str]:
-        node, sight = self.node, Sight(self.printer)
-        writer = NumberWriter(sight)
+        node, reader = self.node, LeafReader(self.printer)
+        writer = NumberWriter(reader)
         margin = writer.number(node.num)
         value = margin if node.sign > 0 else f"(-{margin})"
         if node.guard:
             value = f"({value} {'>' if node.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
         body = " ".join([*writer.lines, f"bad[j] += NAN_IN({value});", f"{self.out['k']} = {value};"])
-        return [f"{loop(self.run)} {{ {sight.heads()} LANE {{ {body} }} }}"]
+        return [f"{loop(self.run)} {{ {reader.heads()} LANE {{ {body} }} }}"]
 
     def backward(self) -> list[str]:
         """Propagate the gradient, which is 0 where a number depends only on the sample count."""
@@ -183,9 +183,9 @@ class _Margin(StepForm):
         counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
         if self.node.guard or counted:
             return []
-        sight = Sight(self.printer)
-        inner = _pulled(num, f"{sign}g{self.out['k']}", sight)
-        return [f"{loop(self.run)} {{ {sight.heads()}", *inner, "}"]
+        reader = LeafReader(self.printer)
+        inner = _gradient(num, f"{sign}g{self.out['k']}", reader)
+        return [f"{loop(self.run)} {{ {reader.heads()}", *inner, "}"]
 
 
 class _Call(StepForm):
@@ -208,7 +208,9 @@ class _Call(StepForm):
 
     def backward(self) -> list[str]:
         writer = SlopeWriter(self._place, soft=False)
-        lines = writer.pulled((part, f"g{out['k']}") for out, part in zip(self.outs, self.parts, strict=True))
+        lines = writer.gradients(
+            (part, f"g{out['k']}") for out, part in zip(self.outs, self.parts, strict=True)
+        )
         return [f"{loop(self.run)} LANE {{", *lines, "}"]
 
 
@@ -487,11 +489,11 @@ class _FreezeLoop(_Repeated):
     def _iteration(self) -> list[str]:
         lines = []
         for buffer, num in self.bound:
-            sight = Sight(self.printer)
-            writer = NumberWriter(sight)
+            reader = LeafReader(self.printer)
+            writer = NumberWriter(reader)
             value = writer.number(num)
             body = " ".join([*writer.lines, f"{buffer[0]} = {value};"])
-            lines.append(f"{{ const int k = {self.loop.index}; {sight.heads()} LANE {{ {body} }} }}")
+            lines.append(f"{{ const int k = {self.loop.index}; {reader.heads()} LANE {{ {body} }} }}")
         return [*lines, *self.inner.forward(self.loop.steps)]
 
     def forward(self) -> list[str]:
@@ -503,9 +505,9 @@ class _FreezeLoop(_Repeated):
         index, bound = self.loop.index, []
         seed = f"g{self.out[index]}"
         for buffer, num in self.bound:
-            sight = Sight(self.printer)
-            back = _pulled(num, f"g{buffer[0]}", sight)
-            bound += [f"{{ const int k = {index}; {sight.heads()}", *back, "}"]
+            reader = LeafReader(self.printer)
+            back = _gradient(num, f"g{buffer[0]}", reader)
+            bound += [f"{{ const int k = {index}; {reader.heads()}", *back, "}"]
         return [
             self.head,
             f"int matters = 0; LANE matters |= {seed} != 0.0;",

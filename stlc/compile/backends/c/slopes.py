@@ -54,7 +54,7 @@ class SlopeWriter(NumberWriter):
         gathered = {f"g{place}": f"d{name}" for name, place in self._inputs.items()}
         return lines, gathered
 
-    def pulled(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
+    def gradients(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
         """Return statements that compute numbers and add the gradients of their columns.
 
         Args:

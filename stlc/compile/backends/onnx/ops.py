@@ -155,11 +155,11 @@ class OnnxOps:
         return first.apply("Min" if pick == "min" else "Max", *rest) if rest else first
 
     def amin(self, x: Value) -> Value:
-        """Minimum over axis 0, kept."""
+        """Minimum over axis 0, kept with length 1."""
         return self.join(x.rows(), "min")
 
     def amax(self, x: Value) -> Value:
-        """Maximum over axis 0, kept."""
+        """Maximum over axis 0, kept with length 1."""
         return self.join(x.rows(), "max")
 
     def cummin(self, x: Value) -> Value:
@@ -179,7 +179,7 @@ class OnnxOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: Value) -> Hashable:
-        """Constant key: floats become graph constants where they are used."""
+        """Element type: floats become graph constants where they are used."""
         return like.kind
 
     def constant(self, value: float, like: Value) -> float:  # noqa: ARG002
@@ -189,17 +189,17 @@ class OnnxOps:
     def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
         """A constant array; an unknown batch size is 1, which broadcasts."""
         known = like.sheet.constant(value, like.kind)
-        return known.spread(*(1 if length == BATCH else length for length in shape))
+        return known.expand(*(1 if length == BATCH else length for length in shape))
 
     def counted(self, first: int, count: int, like: Value) -> Value:
         """Integers along time; an unknown batch size is 1, which broadcasts."""
         numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
-        return numbers.spread(count, *(1 if length == BATCH else length for length in like.shape[1:]))
+        return numbers.expand(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 
     def cat(self, parts: Sequence[Value]) -> Value:
         """Concatenation along axis 0."""
         widest = max(parts, key=lambda part: part.shape[-1])
-        return joined([part.spread(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
+        return joined([part.expand(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
 
     def flip(self, x: Value) -> Value:
         """Reversed along axis 0."""
@@ -262,7 +262,7 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
         require_numbers(numbers(formula))
         if not defined(formula, samples)[:count].all():
             raise Untranslatable("a sample outside of the plan")
-    thawed = [_thawed(formula, env) for formula in formulas]
+    thawed = [_without_freeze(formula, env) for formula in formulas]
     found: list[Value] = evaluate(thawed, env, ops=ONNX, count=count)
     return found
 
@@ -275,13 +275,13 @@ def require_numbers(nums: Iterable[ir.Num]) -> None:
                 raise Untranslatable(f"the function `{part.name}`")
 
 
-def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
+def _without_freeze(formula: ir.Formula, env: Columns) -> ir.Formula:
     """Return the formula with each `freeze` replaced by a new column of `env`."""
     if isinstance(formula, ir.Freeze):
         name = f"#frozen{len(env)}"
         env[name] = _frozen(formula, env)
         return ir.Predicate(ir.Signal(name))
-    return map_children(formula, formulas=lambda part: _thawed(part, env))
+    return map_children(formula, formulas=lambda part: _without_freeze(part, env))
 
 
 def _frozen(node: ir.Freeze, env: Columns) -> Value:
@@ -294,8 +294,8 @@ def _frozen(node: ir.Freeze, env: Columns) -> Value:
             rows.append(ONNX.full((1, 1), math.nan, like))
             continue
         held = program(inputs(program, env, spanning(instant, 1), ONNX), ONNX)
-        inner = env | {name: value.spread(samples, value.shape[1]) for name, value in held.items()}
-        body = _thawed(node.body, inner)
+        inner = env | {name: value.expand(samples, value.shape[1]) for name, value in held.items()}
+        body = _without_freeze(node.body, inner)
         rows += evaluate([body], inner, ops=ONNX, start=instant, count=1)
     column: Value = ONNX.cat(rows)
     return column

@@ -21,7 +21,7 @@ Attribute: TypeAlias = "int | tuple[int, ...] | GraphBody"
 BATCH = 1 << 40
 """Axis length known only at run time; all such axes in one operation have the same length."""
 
-WRITTEN_OUT = 600
+UNROLLED_NODES = 600
 """Nodes up to which a loop is unrolled: a `Scan` node costs some microseconds per iteration."""
 
 
@@ -50,7 +50,7 @@ class GraphBody:
         outputs: of an iteration.
     """
 
-    sheet: Sheet
+    sheet: OnnxGraph
     outputs: tuple[Value, ...]
 
     @property
@@ -70,7 +70,7 @@ class GraphBody:
 
 
 @dataclass(slots=True)
-class Sheet:
+class OnnxGraph:
     """ONNX graph under construction.
 
     Attributes:
@@ -134,19 +134,19 @@ class Sheet:
         Returns:
             Outputs of all iterations, (count, …) each.
         """
-        inner, count = Sheet(prefix=f"{self.prefix}s{len(self.nodes)}."), rows[0].shape[0]
+        inner, count = OnnxGraph(prefix=f"{self.prefix}s{len(self.nodes)}."), rows[0].shape[0]
         now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carried)]
         row = [inner.input(f"{inner.prefix}r{i}", each.shape[1:], each.kind) for i, each in enumerate(rows)]
         later, kept = turn(inner, now, [each.reshaped(1, *each.shape) for each in row])
         body = GraphBody(inner, (*later, *kept))
-        if count * len(body.nodes) <= WRITTEN_OUT:
-            return self._written_out(carried, rows, turn)
+        if count * len(body.nodes) <= UNROLLED_NODES:
+            return self._unrolled(carried, rows, turn)
         shapes = [each.shape for each in later] + [(count, *each.shape) for each in kept]
         facts: dict[str, Attribute] = {"body": body, "num_scan_inputs": len(rows)}
         outputs = self.emit("Scan", (*carried, *rows), shapes, carried[0].kind, facts)
         return tuple(each.reshaped(count, *each.shape[2:]) for each in outputs[len(later) :])
 
-    def _written_out(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
+    def _unrolled(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
         history = []
         for row in zip(*(each.rows() for each in rows), strict=True):
             carried, kept = turn(self, carried, row)
@@ -174,12 +174,12 @@ class Value:
         kind: element type.
     """
 
-    sheet: Sheet
+    sheet: OnnxGraph
     name: str
     shape: tuple[int, ...]
     kind: Kind
 
-    def on(self, sheet: Sheet) -> Value:
+    def on(self, sheet: OnnxGraph) -> Value:
         """Return the value as an input to the sheet of a loop body."""
         return Value(sheet, self.name, self.shape, self.kind)
 
@@ -285,7 +285,7 @@ class Value:
         """Transpose of two axes."""
         return self.transposed(1, 0)
 
-    def spread(self, *shape: int, like: Value | None = None) -> Value:
+    def expand(self, *shape: int, like: Value | None = None) -> Value:
         """Expand axes of length 1 to a shape; its `BATCH` is the last axis of `like`."""
         if self.shape == shape:
             return self
@@ -302,7 +302,9 @@ class Value:
         return out
 
 
-Turn: TypeAlias = Callable[[Sheet, Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]]
+Turn: TypeAlias = Callable[
+    [OnnxGraph, Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]
+]
 
 
 def joined(parts: Sequence[Value], axis: int = 0) -> Value:

@@ -164,19 +164,19 @@ def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
         turned = x.flip(0)
         running = torch.cummin(turned, 0) if pick == "min" else torch.cummax(turned, 0)
         return _first(running.values.flip(0), window.count)
-    beside = _beside(x, neutral(pick), window)
-    return beside.amin(dim=-1) if pick == "min" else beside.amax(dim=-1)
+    windows = _gathered(x, neutral(pick), window)
+    return windows.amin(dim=-1) if pick == "min" else windows.amax(dim=-1)
 
 
 def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
     """Exact `until` and `release`: two of `(time, batch)` -> `(count, batch)`."""
-    held, then = _beside(left, neutral(dual(pick)), window), _beside(right, neutral(pick), window)
+    held, then = _gathered(left, neutral(dual(pick)), window), _gathered(right, neutral(pick), window)
     if pick == "max":
         return torch.minimum(torch.cummin(held, -1).values, then).amax(dim=-1)
     return torch.maximum(torch.cummax(held, -1).values, then).amin(dim=-1)
 
 
-def _beside(x: Tensor, fill: float, window: Sliding) -> Tensor:
+def _gathered(x: Tensor, fill: float, window: Sliding) -> Tensor:
     """Gathered windows, `(count, batch, width)`."""
     missing = window.count + window.width - 1 - window.rows
     filled = pad(x, (0, 0, 0, missing), value=fill) if missing > 0 else x

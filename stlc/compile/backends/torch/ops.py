@@ -44,22 +44,22 @@ class _SafeSqrt(torch.autograd.Function):
         return torch.where(root > 0, grad / (2.0 * root), 0.0)
 
 
-class _Kept(torch.autograd.Function):
+class _MaskedRows(torch.autograd.Function):
     """Rows of an array, with a constant in the others."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
         edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
         ctx.runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
-        return _kept(x, ctx.runs, value)
+        return _masked(x, ctx.runs, value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _kept(grad, ctx.runs, 0.0), None, None
+        return _masked(grad, ctx.runs, 0.0), None, None
 
 
-def _kept(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
+def _masked(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
     out = torch.empty_like(x)
     for rows, stay in runs:
         out[rows] = x[rows] if stay else value
@@ -202,15 +202,15 @@ class TorchOps:
         return soft + (hard - soft.detach())
 
     def amin(self, x: Tensor) -> Tensor:
-        """Minimum over axis 0, kept; ties share the gradient."""
+        """Minimum over axis 0, kept with length 1; ties share the gradient."""
         return reduction(x, "min")
 
     def amax(self, x: Tensor) -> Tensor:
-        """Maximum over axis 0, kept; ties share the gradient."""
+        """Maximum over axis 0, kept with length 1; ties share the gradient."""
         return reduction(x, "max")
 
     def sum(self, x: Tensor) -> Tensor:
-        """Sum over axis 0, kept."""
+        """Sum over axis 0, kept with length 1."""
         return x.sum(dim=0, keepdim=True)
 
     def cummin(self, x: Tensor) -> Tensor:
@@ -244,17 +244,17 @@ class TorchOps:
         return by_kernel((left, right), pick, window)
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
-        """Smooth extremum over axis 0, kept."""
+        """Smooth extremum over axis 0, kept with length 1."""
         out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
         return out
 
     def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
-        """Smooth extremum of two of one shape."""
+        """Smooth extremum of two arrays of one shape."""
         out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
         return out
 
     def kind(self, like: Tensor) -> Hashable:
-        """Constant key: dtype and device."""
+        """Dtype and device: arrays that agree in both share constants."""
         return like.dtype, like.device
 
     def constant(self, value: float, like: Tensor) -> Tensor:
@@ -294,7 +294,7 @@ class TorchOps:
         if torch.compiler.is_exporting():
             mask = torch.from_numpy(keep).view(-1, *(1,) * (x.ndim - 1))
             return torch.where(mask, x, value)
-        out: Tensor = _Kept.apply(x, keep, value)  # type: ignore[no-untyped-call]
+        out: Tensor = _MaskedRows.apply(x, keep, value)  # type: ignore[no-untyped-call]
         return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
