@@ -131,14 +131,7 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
 def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
     """The most important requirement: a violated one, else an inconclusive one, else the least robust."""
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
-    return min(rows, key=lambda row: (order[row.status], _number(row.robustness)))
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text.strip("[").split(",")[0].split()[0])
-    except (ValueError, IndexError):
-        return 0.0
+    return min(rows, key=lambda row: (order[row.status], row.least))
 
 
 def _per_requirement(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:

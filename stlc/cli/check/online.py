@@ -66,12 +66,9 @@ def _outcome(
     }
     rows = tuple(_row(rule, tally, online, causes.get(rule), gaps) for rule, tally in tallies.items())
     reasons = [
-        _violation(row.name, tallies[row.name], causes[row.name], color=color)
-        if row.name in causes
-        else f"{visible(row.name)} is inconclusive: {row.why}."
-        for row in rows
-        if row.name in causes or row.status == "inconclusive"
+        f"{visible(row.name)} is inconclusive: {row.why}." for row in rows if row.status == "inconclusive"
     ]
+    reasons += [_violation(rule, tallies[rule], cause, color=color) for rule, cause in causes.items()]
     title = f"{visible(source.name)} on {visible(name)}    1 trace x {online.samples} samples, dt {dt:g} s"
     known = [tally.robustness for tally in tallies.values()]
     share = min(tally.share for tally in tallies.values())
@@ -124,7 +121,8 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None, gaps: Map
         needed = columns(rule.formula)
         why = ", ".join(text for signal, text in gaps.items() if signal in needed)
         why = why or "the trace is too short to say"
-    return VerdictRow(name, tally.status, value, share, where, why)
+    least = tally.low if tally.status == "inconclusive" else tally.robustness
+    return VerdictRow(name, tally.status, value, share, where, why, least)
 
 
 def _moment(online: Online, sample: int) -> str:

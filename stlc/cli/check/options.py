@@ -1,4 +1,4 @@
-"""Options of `stlc check`, and those about traces that `explain` and `plot` share with it."""
+"""Options on traces that `stlc check`, `explain` and `plot` share."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.check.judge import End, Question, time_step
+from stlc.cli.check.judge import Question, time_step
 from stlc.cli.framework.options import (
     RequireOption,
     RunsOption,
@@ -17,41 +17,6 @@ from stlc.cli.framework.options import (
     parse_overrides,
     parse_pairs,
 )
-from stlc.registry import SEMANTICS
-
-Files = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="[SPEC] TRACE…",
-        help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), after a spec.",
-    ),
-]
-When = Annotated[
-    str | None, typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts.")
-]
-Ending = Annotated[End, typer.Option(help="If the trace is too short: bounds, an error, or cut windows.")]
-Robustness = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME", help=f"Reported robustness: {', '.join(SEMANTICS.names)}. Verdicts are exact."
-    ),
-]
-Tolerance = Annotated[
-    float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Write the robustness signals there (.npz, .csv, .mcap); a folder for several traces.",
-    ),
-]
-Junit = Annotated[Path | None, typer.Option(metavar="FILE", help="Write the verdicts there, as JUnit XML.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")]
-Chunk = Annotated[
-    int,
-    typer.Option(min=0, metavar="SAMPLES", help="Read in chunks of this size; 0: only if the file is large."),
-]
 
 
 @dataclass(frozen=True, slots=True)

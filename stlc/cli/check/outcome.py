@@ -33,7 +33,7 @@ EXIT_CODES: dict[Status, int] = {
 
 @dataclass(frozen=True, slots=True)
 class VerdictRow:
-    """Result of a requirement on all traces of a file, as texts.
+    """Result of a requirement on all traces of a file, with texts of the table.
 
     Attributes:
         name: name of the requirement.
@@ -42,6 +42,7 @@ class VerdictRow:
         share: share of the starts at which the requirement holds; "" if there is one start.
         where: trace and time of the least robustness.
         why: reason in one line, if the requirement is not satisfied.
+        least: least robustness, or its lower bound; 0 if there is none.
     """
 
     name: str
@@ -50,6 +51,7 @@ class VerdictRow:
     share: str
     where: str
     why: str = ""
+    least: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

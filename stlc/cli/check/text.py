@@ -82,13 +82,6 @@ def robustness_text(status: Status, low: float, high: float, least: float, unit:
     return "boundary" if abs(least) <= TOLERANCE else in_unit(signed(least), unit)
 
 
-def _robustness(judged: Judgement, cause: Cause | None) -> str:
-    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
-    least = judged.counted(judged.least)
-    unit = judged.unit or ("" if cause is None else cause.unit)
-    return robustness_text(judged.overall, low, high, float(least.min()), unit) if least.size else ""
-
-
 def in_unit(value: str, unit: str) -> str:
     """A robustness with its unit, if any: `+1.500 m`."""
     return f"{value} {visible(unit)}".rstrip()
@@ -126,12 +119,17 @@ def rows_of(result: Checked) -> tuple[VerdictRow, ...]:
     """The rows of the table, with a reason for each unsatisfied requirement."""
     rows = []
     for judged in result.verdict:
-        cause = result.causes.get(judged.name)
-        why = _inconclusive(judged, result) if judged.overall == "inconclusive" else ""
+        cause, status = result.causes.get(judged.name), judged.overall
+        low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
+        robustness, least = "", 0.0
+        if judged.counted(judged.least).size:
+            unit = judged.unit or ("" if cause is None else cause.unit)
+            least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
+            robustness = robustness_text(status, low, high, least, unit)
         share = "" if judged.holds.size == 1 else percent(judged.share)
-        robustness, where = _robustness(judged, cause), _where(judged, result)
-        why = why if cause is None else cause.because
-        rows.append(VerdictRow(judged.name, judged.overall, robustness, share, where, why))
+        why = _inconclusive(judged, result) if status == "inconclusive" else ""
+        why, where = why if cause is None else cause.because, _where(judged, result)
+        rows.append(VerdictRow(judged.name, status, robustness, share, where, why, least))
     return tuple(rows)
 
 

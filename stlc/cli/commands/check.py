@@ -7,16 +7,19 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import Work
+from stlc.cli.check.judge import End, Work
 from stlc.cli.framework.documents import CheckResult
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
 from stlc.files import write_atomic
+from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
     from stlc.cli.check.outcome import Outcome
@@ -29,16 +32,49 @@ if TYPE_CHECKING:
     "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
 )
 def check(
-    files: given.Files,
-    at: given.When = None,
-    end: given.Ending = "open",
-    semantics: given.Robustness = "exact",
-    tolerance: given.Tolerance = 1e-6,
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[SPEC] TRACE…",
+            help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), after a spec.",
+        ),
+    ],
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts."),
+    ] = None,
+    end: Annotated[
+        End, typer.Option(help="If the trace is too short: bounds, an error, or cut windows.")
+    ] = "open",
+    semantics: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help=f"Reported robustness: {', '.join(SEMANTICS.names)}. Verdicts are exact."
+        ),
+    ] = "exact",
+    tolerance: Annotated[
+        float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
+    ] = 1e-6,
     fail_under: FailUnderOption = None,
-    out: given.Out = None,
-    junit: given.Junit = None,
-    jobs: given.Jobs = 1,
-    chunk: given.Chunk = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the robustness signals there (.npz, .csv, .mcap); a folder for several traces.",
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the verdicts there, as JUnit XML.")
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")
+    ] = 1,
+    chunk: Annotated[
+        int,
+        typer.Option(
+            min=0, metavar="SAMPLES", help="Read in chunks of this size; 0: only if the file is large."
+        ),
+    ] = 0,
     reading: given.Traces = given.TRACES,
     json: JsonOption = False,
 ) -> Answer[CheckResult]:

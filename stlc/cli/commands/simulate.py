@@ -45,43 +45,6 @@ GUARDS: dict[Mode, tuple[Mode, ...]] = {
     "full": ("none", "full"),
 }
 
-GuardOption = Annotated[
-    str | None,
-    typer.Option(metavar="none|paper|full", help="Guard of the policy; `full` repairs plans first."),
-]
-LimitOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="TIME",
-        help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
-    ),
-]
-
-WindowsOption = Annotated[bool, typer.Option("--windows", help="Also show the verdict on plans per window.")]
-MarginOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="M|NAME=M|auto",
-        help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
-    ),
-]
-RecordOption = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Also write the trace to this file (.npz, .csv, .mcap).")
-]
-ScenarioOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="An overlay of the system file, `all` of them, or `disturbed`."),
-]
-LiveOption = Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")]
-MarginsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robustness",
-        metavar="FILE",
-        help="Write robustness margins to it, a JSON object per agent and step; `-` prints them.",
-    ),
-]
-
 
 @command(
     "stlc simulate --backup",
@@ -94,10 +57,25 @@ def simulate(
     backup: Annotated[
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,
-    guard: GuardOption = None,
-    time_limit: LimitOption = None,
+    guard: Annotated[
+        str | None,
+        typer.Option(metavar="none|paper|full", help="Guard of the policy; `full` repairs plans first."),
+    ] = None,
+    time_limit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
+        ),
+    ] = None,
     ceiling: Annotated[int, typer.Option(min=0, help="Visited states to check for a feasible plan.")] = 0,
-    margin: MarginOption = None,
+    margin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="M|NAME=M|auto",
+            help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
+        ),
+    ] = None,
     seeds: SeedsOption = "0..9",
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
@@ -105,12 +83,27 @@ def simulate(
     agents: Annotated[
         int | None, typer.Option(min=1, help="Agents in each run; by default the system's.")
     ] = None,
-    record: RecordOption = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write the trace to this file (.npz, .csv, .mcap)."),
+    ] = None,
     fail_under: FailUnderOption = None,
-    scenario: ScenarioOption = None,
-    live: LiveOption = False,
-    margins: MarginsOption = None,
-    windows: WindowsOption = False,
+    scenario: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="An overlay of the system file, `all` of them, or `disturbed`."),
+    ] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")] = False,
+    margins: Annotated[
+        str | None,
+        typer.Option(
+            "--robustness",
+            metavar="FILE",
+            help="Write robustness margins to it, a JSON object per agent and step; `-` prints them.",
+        ),
+    ] = None,
+    windows: Annotated[
+        bool, typer.Option("--windows", help="Also show the verdict on plans per window.")
+    ] = False,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: PicturesOption = True,

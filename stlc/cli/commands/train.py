@@ -43,67 +43,6 @@ if TYPE_CHECKING:
     from stlc.controller.training.launch import Launch
     from stlc.controller.training.tensorboard import Opener
 
-SpecsArgument = Annotated[
-    list[Path] | None,
-    typer.Argument(metavar="SPEC", help="The specification, a .stl file; of several, each is trained for."),
-]
-BudgetOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="TIME", help="Time to train, such as 60s or 5min; planned as steps again and again."
-    ),
-]
-ClockOption = Annotated[
-    str,
-    typer.Option(
-        metavar="wall|processor", help="What a budget counts; processor time as on an idle machine."
-    ),
-]
-StepsOption = Annotated[
-    str | None,
-    typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
-]
-SeedOption = Annotated[
-    int | None,
-    typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
-]
-SeedsOption = Annotated[
-    str | None,
-    typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
-]
-JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs side by side.")]
-ClusterOption = Annotated[
-    str | None,
-    typer.Option(
-        "--cluster",
-        metavar="auto|local|HOST:PORT",
-        help="Train on a Ray cluster, as many as it has cores for.",
-    ),
-]
-MethodOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="|".join(METHODS),
-        help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
-    ),
-]
-ResumeOption = Annotated[
-    str | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names)
-]
-NameOption = Annotated[str | None, typer.Option(help="Name of the run; drawn if not given.")]
-DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
-ThreadsOption = Annotated[int | None, typer.Option(min=1, help="Threads of torch.")]
-PlansOption = Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")]
-RateOption = Annotated[float | None, typer.Option(help="Peak learning rate.")]
-BatchOption = Annotated[int | None, typer.Option(min=1, help="Fresh states a step.")]
-HeldOutOption = Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")]
-DrivesOption = Annotated[
-    int | None, typer.Option(min=0, help="Drives after the training, under one guard at most; 400, 0: none.")
-]
-LogOption = Annotated[
-    str | None, typer.Option(metavar="tensorboard", help="Keep the curves for TensorBoard too.")
-]
-
 
 @command(
     "stlc train specs/traffic.stl --system car.yaml --budget 60s",
@@ -112,26 +51,71 @@ LogOption = Annotated[
     "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
 )
 def train(
-    spec: SpecsArgument = None,
+    spec: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="SPEC", help="The specification, a .stl file; several are trained for one by one."
+        ),
+    ] = None,
     system: SystemOption = None,
-    budget: BudgetOption = None,
-    clock: ClockOption = "wall",
-    steps: StepsOption = None,
-    seed: SeedOption = None,
-    seeds: SeedsOption = None,
-    jobs: JobsOption = 1,
-    cluster: ClusterOption = None,
-    method: MethodOption = None,
-    resume: ResumeOption = None,
-    name: NameOption = None,
-    device: DeviceOption = "cpu",
-    threads: ThreadsOption = None,
-    plans: PlansOption = None,
-    lr: RateOption = None,
-    batch: BatchOption = None,
-    held_out: HeldOutOption = None,
-    drives: DrivesOption = None,
-    log: LogOption = None,
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME", help="Training time, such as 60s or 5min; the number of steps is adapted."
+        ),
+    ] = None,
+    clock: Annotated[
+        str,
+        typer.Option(
+            metavar="wall|processor", help="Clock of the budget; processor time is that of an idle machine."
+        ),
+    ] = "wall",
+    steps: Annotated[
+        str | None,
+        typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
+    ] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs side by side.")] = 1,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            metavar="auto|local|HOST:PORT",
+            help="Train on a Ray cluster, as many runs at a time as it has cores for.",
+        ),
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="|".join(METHODS),
+            help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
+        ),
+    ] = None,
+    resume: Annotated[
+        str | None,
+        typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the run; random words if not given.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,
+    plans: Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")] = None,
+    lr: Annotated[float | None, typer.Option(help="Peak learning rate.")] = None,
+    batch: Annotated[int | None, typer.Option(min=1, help="New states per step.")] = None,
+    held_out: Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")] = None,
+    drives: Annotated[
+        int | None,
+        typer.Option(min=0, help="Closed-loop runs after the training, at most, per guard; 400, 0: none."),
+    ] = None,
+    log: Annotated[
+        str | None, typer.Option(metavar="tensorboard", help="Also write the curves for TensorBoard.")
+    ] = None,
     runs: RunsOption = RUNS,
     pictures: PicturesOption = True,
     set_: SetOption = None,
