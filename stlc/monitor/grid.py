@@ -111,11 +111,11 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     return _declared(spec.system, spec, overrides)[0]
 
 
-def recorded_times(trace: Trace, asked: Times) -> Times:
+def recorded_times(trace: Trace, given: Times) -> Times:
     """Return the times of a trace. Raises TraceError (E602) where they contradict the monitor's time step."""
     dt = as_fraction(trace.dt)
-    if asked.dt is not None and abs(asked.dt - dt) > Fraction(1, 1000) * dt:
-        message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(asked.dt):g} s"
+    if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
+        message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"
         raise TraceError(Diagnostic("E602", message))
     horizon = trace.meta.horizon
     return Times(dt, None if horizon is None else horizon * dt, trace.name)

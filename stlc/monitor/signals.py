@@ -95,12 +95,12 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
     raise UsageError(*(Diagnostic("E107", message.format(n), places.get(n), help=help_) for n in missing))
 
 
-def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
+def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
     """Return the options for reading a file of the signals that `spec` declares.
 
     Args:
         spec: the specification; gives the kinds of the signals and the values of their words.
-        asked: names in the file, of signals or of their columns (`from "…"`), and the grid.
+        requested: names in the file, of signals or of their columns (`from "…"`), and the grid.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}
@@ -119,8 +119,8 @@ def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
         words[name] = {} if item.type is None else worth.get(item.type.name, {})
         if item.type is not None:
             kinds[name] = _KINDS.get(item.type.name, "enum")
-    names = {column(name): there for name, there in asked.names.items()}
-    return replace(asked, names=names, kinds=kinds, words=words)
+    names = {column(name): there for name, there in requested.names.items()}
+    return replace(requested, names=names, kinds=kinds, words=words)
 
 
 # ------------------------------------------------------------------------------- columns

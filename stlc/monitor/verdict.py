@@ -75,7 +75,7 @@ class Monitor:
         overrides: Mapping[str, str] | None = None,
     ) -> None:
         self.spec = spec if isinstance(spec, ast.Spec) else parse(_source(spec))
-        self._asked = given_times(dt, horizon)
+        self._given = given_times(dt, horizon)
         self._overrides = dict(overrides or {})
         self._system, self._interface = Times(), None
         if system is not None:
@@ -83,7 +83,7 @@ class Monitor:
         self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
-        known = Times(self._asked.dt, self._asked.horizon).or_else(self._system)
+        known = Times(self._given.dt, self._given.horizon).or_else(self._system)
         if not self._lacks(known):  # else the first trace may give the time step
             self._compile(known)
 
@@ -214,7 +214,7 @@ class Monitor:
         """
         from stlc.monitor.online.online import Online
 
-        recorded = given_times(dt, None) if like is None else recorded_times(like, self._asked)
+        recorded = given_times(dt, None) if like is None else recorded_times(like, self._given)
         compiled = self._ready(recorded)
         rules = _chosen(compiled.requirements, require)
         if not rules:
@@ -225,7 +225,7 @@ class Monitor:
 
     def _prepare(self, subject: Subject, require: Sequence[str], *, plain: bool = False) -> Prepared:
         given = load_trace(subject, reading_of(self.spec)) if isinstance(subject, (str, Path)) else subject
-        recorded = recorded_times(given, self._asked) if isinstance(given, Trace) else Times()
+        recorded = recorded_times(given, self._given) if isinstance(given, Trace) else Times()
         compiled = self._ready(recorded)
         rules = _chosen(compiled.requirements, require)
         if not rules:
@@ -238,8 +238,8 @@ class Monitor:
 
     def _ready(self, recorded: Times) -> Compiled:
         """Compile for the times of the arguments, the trace, the given system, or else the named one."""
-        step = recorded.or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
-        whole = Times(None, self._asked.horizon).or_else(self._system).or_else(recorded)
+        step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
+        whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)
         known = Times(step.dt, whole.horizon, step.trace)
         if not self._lacks(known):
             return self._compile(known)

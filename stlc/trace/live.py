@@ -296,8 +296,8 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
     missed = (now - wanted) / step
     if missed > 0.5 and abs(missed - round(missed)) <= TOLERANCE:
         return (gap_advice(step),)
-    said = ("--dt TIME  says what the step is; without it the first two samples do",) if measured else ()
-    return (resample_advice(step), *said)
+    advice = ("--dt TIME  says what the step is; without it the first two samples do",) if measured else ()
+    return (resample_advice(step), *advice)
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Kind
 from stlc.trace.recording import ClockGroup, Recording, fit
-from stlc.trace.time_grid import NO_CLOCK, NO_STEP, require_step, snapped
+from stlc.trace.time_grid import NO_CLOCK, NO_STEP, check_finite, require_step, snapped
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -76,10 +76,10 @@ class Spacing:
 def values_on(
     grid: Floats, times: Floats, values: Array, spacing: Spacing, *, held: bool, end: float
 ) -> Floats:
-    """A signal on a grid: NaN where it is unknown.
+    """Return a signal on a grid (points,), NaN where it is unknown.
 
-    It is unknown within gaps that are too long, before its first sample, and, unless it is held, after the
-    last. Samples that are NaN are ignored.
+    A signal is unknown within gaps that are too long, before its first sample, and, unless it is held, after
+    its last one. Samples that are NaN are ignored.
 
     Args:
         grid: instants (points,) in seconds, which increase.
@@ -161,7 +161,7 @@ class Resampled:
 
 
 def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind]) -> Resampled:
-    """The signals of a recording on one grid.
+    """Return the signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
     (zero-order hold), real ones are interpolated; in gaps that are too long both are unknown.
@@ -228,11 +228,7 @@ def _timed(recording: Recording, group: ClockGroup, kinds: Mapping[str, Kind]) -
 
 
 def _check_times(name: str, times: Floats) -> None:
-    if not len(times):
-        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
-    bad = np.flatnonzero(~np.isfinite(times))
-    if len(bad):
-        raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))
+    check_finite(name, times)
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0])

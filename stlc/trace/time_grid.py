@@ -48,7 +48,7 @@ def gap_advice(step: float) -> str:
 def read_clock(
     name: str, clock: NDArray[Any] | None, dt: float | None, samples: int, *, others: Iterable[str] = ()
 ) -> tuple[float, float, int]:
-    """First time, time step and number of samples.
+    """Return first time and time step in seconds, and the number of samples.
 
     Args:
         name: of the trace, for messages.
@@ -73,9 +73,7 @@ def read_clock(
         shape = " x ".join(map(str, clock.shape)) or "a single number"
         raise TraceError(Diagnostic("E605", f"`t` in `{name}` is {shape}; it has one value per sample"))
     times = clock.astype(np.float64, copy=False)
-    if not len(times):
-        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
-    _check_finite(name, times)
+    check_finite(name, times)
     if len(times) == 1:
         if dt is None:
             raise TraceError(
@@ -102,7 +100,10 @@ def require_same_step(name: str, found: float, said: float) -> None:
         raise TraceError(Diagnostic("E602", message, help=help_))
 
 
-def _check_finite(name: str, times: Floats) -> None:
+def check_finite(name: str, times: Floats) -> None:
+    """Raise TraceError where there are no times (E605), or one is not finite (E604)."""
+    if not len(times):
+        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
         raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))

@@ -175,8 +175,8 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
     else:
         kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
         grid = ResampleGrid(reading.resample or reading.dt, reading.max_gap)
-        laid = resampled(_clocked(recording, reading.dt), grid, kinds)
-        trace = _trace(recording, laid.t0, laid.dt, laid.data)
+        on_grid = resampled(_clocked(recording, reading.dt), grid, kinds)
+        trace = _trace(recording, on_grid.t0, on_grid.dt, on_grid.data)
     return trace.renamed(names)
 
 
@@ -206,8 +206,8 @@ def _uniform(recording: Recording, step: float | None) -> Trace:
         help_ = (resample_advice(min((each for each in usual if each > 0), default=0.0)),)
         raise TraceError(Diagnostic("E602", message, help=help_))
     (group,) = groups
-    said = recording.meta.dt if step is None else step
-    t0, dt, samples = read_clock(name, group.clock, said, _longest(group), others=group.arrays)
+    known_step = recording.meta.dt if step is None else step
+    t0, dt, samples = read_clock(name, group.clock, known_step, _longest(group), others=group.arrays)
     if step is not None:
         require_same_step(name, dt, step)
     data = fit(name, group.arrays, samples)

@@ -50,7 +50,7 @@ def test_margins_are_those_of_monitors_side_by_side(formulas: list[str], seed: i
         margins.push({"x": data[k, 0], "y": data[k, 1]})
         for trace, online in enumerate(alone):
             online.push({"x": float(data[k, 0, trace]), "y": float(data[k, 1, trace])})
-        found = margins.look()
+        found = margins.evaluate()
         for rule in compiled.requirements:
             for trace, online in enumerate(alone):
                 known = online.standing(rule.name)
@@ -84,8 +84,8 @@ def test_looking_seldom_counts_the_same(often: int) -> None:
     for k, sample in enumerate(data):
         margins.push({"x": sample[0], "y": sample[1]})
         if k % often == often - 1:
-            margins.look()
-    found = margins.look()
+            margins.evaluate()
+    found = margins.evaluate()
     for rule in compiled.requirements:
         low, high = anew(judge, rule, data)
         assert np.array_equal(found[rule.name].low, low)
@@ -99,7 +99,7 @@ def test_memory_is_bounded_by_the_windows() -> None:
     margins = Margins(compiled.requirements, compiled.grid.horizon)
     for _ in range(1000):
         margins.push({"x": np.ones(2), "y": np.ones(2)})
-        margins.look()
+        margins.evaluate()
     assert margins.samples == 1000
     assert margins.samples - margins._history.first <= 128
 
@@ -108,5 +108,5 @@ def test_a_requirement_of_nothing_has_margins() -> None:
     compiled = Monitor("signal x\nrequire a: true", dt=1, horizon=4).compiled
     margins = Margins(compiled.requirements, compiled.grid.horizon)
     margins.push({"x": np.zeros(2)})
-    assert margins.look()["a"].status(1) == "satisfied"
+    assert margins.evaluate()["a"].status(1) == "satisfied"
     assert margins.requirements == ("a",)

@@ -85,8 +85,8 @@ def test_a_cause_is_remembered_when_its_samples_are_gone(name: str, monkeypatch:
     for k in range(900):
         online.push({signal: float(values[k]) for signal, values in whole.items()})
     wanted, found = explain(monitor.check(whole), "r"), online.cause("r")
-    assert online._recall is not None
-    assert online._recall._kept.samples - online._recall._kept.first <= 202
+    assert online._buffer is not None
+    assert online._buffer._history.samples - online._buffer._history.first <= 202
     assert wanted is not None
     assert found is not None
     assert (found.sample, found.because, found.readings) == (wanted.sample, wanted.because, wanted.readings)

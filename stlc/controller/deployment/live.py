@@ -45,7 +45,7 @@ class LiveMonitor:
     @property
     def margins(self) -> dict[str, Margin]:
         """Margin of every requirement at the present sample."""
-        return self._margins.look()
+        return self._margins.evaluate()
 
     @property
     def time(self) -> float:

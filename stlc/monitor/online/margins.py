@@ -28,9 +28,9 @@ class Margin:
     """Bounds of a requirement at the present sample of every trace, (traces,) each.
 
     Attributes:
-        low: least robustness over all continuations, minimized over the windows that are still open at
-            this sample; of a requirement that is evaluated once, over its one window.
-        high: greatest robustness over all continuations, minimized over the same windows.
+        low: least robustness over all continuations, the least over the windows that contain this sample;
+            for a requirement that is evaluated once, over its one window.
+        high: greatest robustness over all continuations, the least over the same windows.
         violated: number of starts at which it is already violated, whatever follows.
         open: whether a start so far is still undecided.
     """
@@ -54,7 +54,7 @@ class _Watched:
     Attributes:
         rule: the requirement.
         horizon: value of `T`, in steps.
-        whole: its bounds, wherever the traces end.
+        whole: tracker of its bounds, wherever the traces end.
         next: the first start that is not settled.
         violated: settled starts that are violated, (traces,).
         last: the least margins of the windows that closed with the last sample; None before there is one.
@@ -89,7 +89,7 @@ class _Watched:
             return 0
         return max(self.next - history(self.rule.formula), 0)
 
-    def look(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
+    def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
         """The margin at the last of `samples` samples; `env` (stored, traces) begins with sample `first`."""
         if not self.everywhere and self.next:
             assert self.last is not None
@@ -133,9 +133,8 @@ class _Watched:
 class Margins:
     """Robustness margins of every requirement on many traces that grow together.
 
-    Memory is bounded by the windows of the requirements, except those that read the whole trace. `push` is
-    cheap; `look` takes about as long for many traces as for one, and for all samples since the last call as
-    for one.
+    Memory is bounded by the windows of the requirements, except those that read the whole trace. `push` only
+    stores the sample; `evaluate` takes all samples since the last call, and all traces, in one evaluation.
 
     Args:
         rules: compiled requirements.
@@ -164,11 +163,11 @@ class Margins:
         names = self._names or list(signals)[:1]
         self._history.take({name: np.asarray(signals[name])[None] for name in names}, 1)
 
-    def look(self) -> dict[str, Margin]:
+    def evaluate(self) -> dict[str, Margin]:
         """Return the margins of every requirement at the last sample; there has to be one."""
         if self._evaluated != self.samples:
             env, first = self._history.columns(), self._history.first
-            found = [each.look(env, first, self.samples) for each in self._watched]
+            found = [each.evaluate(env, first, self.samples) for each in self._watched]
             self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
             self._history.forget(min([each.needs() for each in self._watched], default=self.samples))
         return self._found

@@ -88,14 +88,18 @@ class Watched:
     tally: Tally = field(default_factory=Tally)
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
-    def grow(self, kept: ColumnHistory) -> None:
+    @property
+    def trackers(self) -> tuple[Tracker, ...]:
+        """The trackers of robustness and, where the tolerance is 0, of truth."""
+        return (self.values,) if self.truths is None else (self.values, self.truths)
+
+    def grow(self, history: ColumnHistory) -> None:
         """Take in new samples."""
-        if self.over or self.values.samples == kept.samples:
+        if self.over or self.values.samples == history.samples:
             return
-        signals = kept.columns()
-        self.values.grow(signals, kept.first, kept.samples)
-        if self.truths is not None:
-            self.truths.grow(signals, kept.first, kept.samples)
+        signals = history.columns()
+        for tracker in self.trackers:
+            tracker.grow(signals, history.first, history.samples)
 
     def due(self, samples: int) -> bool:
         """True if it is due for evaluation after so many samples."""
@@ -103,29 +107,26 @@ class Watched:
 
     @property
     def over(self) -> bool:
-        """True if its only instant is settled."""
+        """True if it is evaluated once and that instant is settled."""
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> JudgedInstants:
-        """Bounds and verdicts at instants while the trace continues."""
-        truths = None if self.truths is None else self.truths.live(start, stop)
-        return self._judged(self.values.live(start, stop), truths)
+        """Return bounds and verdicts at instants while the trace continues."""
+        return self._judged(*(tracker.live(start, stop) for tracker in self.trackers))
 
     def ended(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at instants once the trace has ended."""
-        truths = None if self.truths is None else self.truths.ended(starts)
-        return self._judged(self.values.ended(starts), truths)
+        """Return bounds and verdicts at instants once the trace has ended."""
+        return self._judged(*(tracker.ended(starts) for tracker in self.trackers))
 
-    def _judged(self, bounds: Bounds, truths: Bounds | None) -> JudgedInstants:
+    def _judged(self, bounds: Bounds, truths: Bounds | None = None) -> JudgedInstants:
         low, high = bounds
         if truths is None:
             return JudgedInstants(low, high, low >= -self.tolerance, high < -self.tolerance)
         return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Forget settled instants; returns the first sample that is still needed."""
-        trackers = [self.values] if self.truths is None else [self.values, self.truths]
-        return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in trackers)
+        """Drop settled instants; returns the first sample that is still needed."""
+        return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
 
 
 class Online:
@@ -144,11 +145,11 @@ class Online:
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.gaps: dict[str, Gap] = {}
         """Samples at which signals are unknown."""
-        self._kept = ColumnHistory()
+        self._history = ColumnHistory()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
-        self._recall = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
+        self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
 
     def _watch(self, rule: CompiledRequirement, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
@@ -186,9 +187,9 @@ class Online:
         found: list[Decision] = []
         for watched in self._watched:
             if watched.due(self.samples):
-                watched.grow(self._kept)
+                watched.grow(self._history)
                 self._decide(watched, found)
-        self._count_scope()
+        self._count_settled(self._scope)
         self._trim()
         return tuple(found)
 
@@ -207,12 +208,7 @@ class Online:
             if not np.isfinite(values).all():
                 self._unknown(need, values)
         self._take(columns, laid.samples)
-        for watched in self._watched:
-            if not watched.due(self.samples):
-                continue
-            watched.grow(self._kept)
-            self._count(watched, self._settled(watched))
-        self._count_scope()
+        self._count_settled((*self._watched, *self._scope))
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
@@ -226,20 +222,20 @@ class Online:
         self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
 
     def _take(self, columns: dict[str, Floats], count: int) -> None:
-        """Append columns (time, 1) and bring every requirement up to date."""
+        """Store samples (time, 1) by name; first the causes that need samples which are then dropped."""
         columns = columns or {"": np.zeros((count, 1))}
-        if self._recall is not None:
-            self._recall.take(columns, count)
-        self._kept.take(columns, count)
-        if self._recall is not None and self._recall.full:
+        if self._buffer is not None:
+            self._buffer.take(columns, count)
+        self._history.take(columns, count)
+        if self._buffer is not None and self._buffer.full:
             for watched in self._watched:
                 if (worst := self._worst(watched)) is not None:
-                    self._recall.remember(watched.rule, worst)
-            self._recall.forget()
+                    self._buffer.remember(watched.rule, worst)
+            self._buffer.forget()
 
     def _trim(self) -> None:
         alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
-        self._kept.forget(min((watched.drop() for watched in alive), default=self.samples))
+        self._history.forget(min((watched.drop() for watched in alive), default=self.samples))
 
     # ----------------------------------------------------------------------- verdicts
 
@@ -265,28 +261,26 @@ class Online:
         low, high = float(judged.low[i]), float(judged.high[i])
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
 
-    def _settled(self, watched: Watched) -> JudgedInstants:
-        start, stop = self._pending(watched)
-        return watched.judged(start, min(stop, self._countable(watched)))
-
     def _countable(self, watched: Watched) -> int:
-        """The first instant that cannot be counted yet: unsettled, or without a complete window."""
+        """The first instant that is unsettled, or whose window is incomplete."""
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Count the settled ones of the pending instants; returns how many."""
+        """Count those of the pending instants that are settled; returns how many."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count
 
-    def _count_scope(self) -> None:
-        for watched in self._scope:
+    def _count_settled(self, requirements: Sequence[Watched]) -> None:
+        """Bring requirements up to date, and count their settled instants."""
+        for watched in requirements:
             if watched.due(self.samples):
-                watched.grow(self._kept)
-                self._count(watched, self._settled(watched))
+                watched.grow(self._history)
+                start, stop = self._pending(watched)
+                self._count(watched, watched.judged(start, min(stop, self._countable(watched))))
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; its number where the time step is unknown."""
@@ -311,19 +305,19 @@ class Online:
     @property
     def kept(self) -> int:
         """Number of stored samples of the signals."""
-        return self.samples - self._kept.first
+        return self.samples - self._history.first
 
     @property
     def samples(self) -> int:
         """Number of samples taken in."""
-        return self._kept.samples
+        return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
         """Sample, least and greatest robustness of every start that is not settled yet."""
         watched = self._find(name)
         if watched.over or not self.samples:
             return []
-        watched.grow(self._kept)
+        watched.grow(self._history)
         start, stop = self._pending(watched)
         bounds = watched.values.live(start, min(stop, self.samples))
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
@@ -335,13 +329,13 @@ class Online:
     def _standing(self, watched: Watched) -> Tally:
         if watched.over or not self.samples:
             return watched.tally
-        watched.grow(self._kept)
+        watched.grow(self._history)
         start, stop = self._pending(watched)
         return watched.tally.with_more(watched.judged(start, min(stop, self.samples)))
 
     @property
     def in_scope(self) -> bool | None:
-        """True if the assumptions hold at the first sample: yes, no, or not known yet."""
+        """Whether the assumptions hold at the first sample: True, False, or None where that is undecided."""
         if not self.samples:
             return None if self._scope else True
         found = {self._standing(watched).status for watched in self._scope}
@@ -350,7 +344,7 @@ class Online:
         return True if found <= {"satisfied"} else None
 
     def finish(self) -> dict[str, Tally]:
-        """End the trace; returns what `Monitor.check` gives, by requirement.
+        """End the trace, and return the summary of each requirement by name, as `Monitor.check` gives it.
 
         Raises:
             TraceError: E306 where `end` is "strict" and it is too short; E605, there was no sample.
@@ -374,7 +368,7 @@ class Online:
 
     def _ended(self, watched: Watched, starts: range) -> Tally:
         """Verdict of a requirement once the trace has ended."""
-        watched.grow(self._kept)
+        watched.grow(self._history)
         rest = range(min(watched.tally.next, starts.stop), starts.stop)
         return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
 
@@ -386,14 +380,14 @@ class Online:
         return Worst(tally.high_at, tally.high) if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
-        """The cause of a violation at its worst start so far, as `explain` gives it for a recording.
+        """Return the cause of a violation at its worst start so far, as `explain` does for a recording.
 
-        Causes are stored, however old they are. None without `reasons`, where nothing is violated, and where
-        the samples that show the cause are gone: about two million numbers are stored.
+        None without `reasons`, where nothing is violated, and where the samples that show the cause are
+        dropped: about two million numbers are stored, and causes found before samples are dropped.
         """
         watched = self._find(name)
-        worst = None if self._recall is None else self._worst(watched)
-        return None if self._recall is None or worst is None else self._recall.cause(watched.rule, worst)
+        worst = None if self._buffer is None else self._worst(watched)
+        return None if self._buffer is None or worst is None else self._buffer.cause(watched.rule, worst)
 
     def _find(self, name: str) -> Watched:
         for watched in self._watched:

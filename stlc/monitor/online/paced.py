@@ -1,9 +1,9 @@
 """Evaluation of requirements with wide windows in a stream, at a bounded cost per sample.
 
-Unsettled instants are recomputed at every evaluation: with narrow windows after every sample, with wide ones
-after so many samples that the cost per sample stays bounded. A window that is wider than the stream is long
-reads nothing beyond the samples so far, so it is cut to a few times their number, and lengthened as the
-stream grows: memory follows the samples taken in, not the width of the windows.
+Unsettled instants are recomputed at every evaluation. Requirements with narrow windows are evaluated after
+every sample; those with wide windows only every n samples, so that the cost per sample is bounded. A window
+that is longer than the stream is cut to a few times the number of samples and lengthened as the stream grows:
+memory grows with the number of samples, not with the width of the windows.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class PacedTracker:
         rule: the requirement.
         make: returns the tracker of the requirement, or of one with shorter windows.
         everywhere: it is evaluated at every instant, and not only at the first one.
-        all_kept: all samples are stored for it, and all of them read.
+        stores_all: its tracker stores and reads all samples.
         window: number of samples from each instant to the end of its record, where that is fixed.
         samples: number of samples taken in.
     """
@@ -149,7 +149,7 @@ class PacedTracker:
     rule: CompiledRequirement
     make: Callable[[CompiledRequirement], Tracker]
     everywhere: bool
-    all_kept: bool
+    stores_all: bool
     window: int | None = None
     samples: int = 0
     _inner: Tracker = field(init=False)
@@ -159,7 +159,7 @@ class PacedTracker:
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
         """Return the work of one evaluation of the formula of the requirement over `spanned` samples."""
         many = self.everywhere or _unbounded(formula)
-        found = work(formula, spanned if many else 1, spanned if self.all_kept else 0)
+        found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)
         own = (self.window or 0) * (spanned if self.everywhere else 1)
         return found + PacedWork(own, own, formula) if self.window is not None else found
 
@@ -180,7 +180,7 @@ class PacedTracker:
         self.samples = samples
         formula = self.rule.formula if self._most is None else cut(self.rule.formula, self._most)
         whole_span = sum(span(self.rule.formula)) + (self.window or 0)
-        spanned = samples if self.all_kept else min(self._most or samples, whole_span)
+        spanned = samples if self.stores_all else min(self._most or samples, whole_span)
         rows = self.effort(formula, spanned).rows
         self._pace = max(min(rows // WIDE, min(samples, spanned) // _LATE), 1)
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import history, reach
+from stlc.compile.ir.support import history as lookback
+from stlc.compile.ir.support import reach
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
@@ -48,32 +49,32 @@ class TraceBuffer:
 
     compiled: Compiled
     t0: float
-    _kept: ColumnHistory = field(default_factory=ColumnHistory)
+    _history: ColumnHistory = field(default_factory=ColumnHistory)
     _found: dict[str, tuple[Worst, Cause]] = field(default_factory=dict)
-    _wide: int = 1
+    _width: int = 1
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
         """Store samples."""
-        self._wide = len(columns)
-        self._kept.take(columns, count)
+        self._width = len(columns)
+        self._history.take(columns, count)
 
     @property
     def full(self) -> bool:
         """True if samples have to be dropped."""
-        return (self._kept.samples - self._kept.first) * self._wide > 2 * _MOST
+        return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
     def forget(self) -> None:
         """Drop the older half of the samples; first `remember` the causes that lie there."""
-        self._kept.forget(self._kept.samples - _MOST // self._wide)
+        self._history.forget(self._history.samples - _MOST // self._width)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Store the cause of a violation while its samples are available."""
+        """Store the cause of a violation before its samples are dropped."""
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """The cause of a violation; None where its samples are gone."""
+        """Return the cause of a violation; None where its samples were dropped."""
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
             return known[1]
@@ -99,23 +100,25 @@ class TraceBuffer:
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
         """The number of the first sample, the offset of the start from it, and columns (samples, 1)."""
-        kept = self._kept
+        history = self._history
         formula, horizon = rule.lowered, self.compiled.grid.horizon
         reads = _around(rule, formula, horizon)
-        if reads is None and kept.first:
+        if reads is None and history.first:
             formula = rule.formula
             reads = _around(rule, formula, horizon)
         if reads is None or _endless_always(rule, formula):
-            if kept.first == 0:
-                return 0, worst.start, kept.columns()
+            if history.first == 0:
+                return 0, worst.start, history.columns()
             if reads is None or self.compiled.grid.dt is None:
                 return None
-            start = max(kept.first + reads[0], worst.start)
-            return (kept.first, start - kept.first, kept.columns()) if start < kept.samples else None
+            start = max(history.first + reads[0], worst.start)
+            return (
+                (history.first, start - history.first, history.columns()) if start < history.samples else None
+            )
         first = max(worst.start - reads[0], 0)
-        if first < kept.first or (first and self.compiled.grid.dt is None):
+        if first < history.first or (first and self.compiled.grid.dt is None):
             return None
-        return first, worst.start - first, kept.columns(first, worst.start + reads[1] + 1)
+        return first, worst.start - first, history.columns(first, worst.start + reads[1] + 1)
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
@@ -130,11 +133,8 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Samples before and after a start that explain its failure; None where they are unbounded.
-
-    The requirement is explained as written: beside the part that decides, others are reported, too.
-    """
+    """Numbers of samples before and after a start that explain its violation; None where unbounded."""
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None
-    return history(formula), max(reach(formula).future, window or 0) + looks_on(formula)
+    return lookback(formula), max(reach(formula).future, window or 0) + looks_on(formula)

@@ -292,9 +292,9 @@ class IntervalTracker:
 class PlanningWindowTracker(_ColumnTracker):
     """Tracker of a formula with windows to the end of a planning window, at consecutive instants.
 
-    Every instant reads the record up to the end of its window. Windows of the formula that reach beyond it
-    may still read values that follow from the past: the columns continued from that sample, with all else
-    unknown. Samples are then taken one by one, and a value is stored when its window is complete.
+    Every instant reads the record up to the end of its planning window. Windows of the formula that extend
+    beyond that end may still read known values of past operators: their columns, continued with unknown
+    predicates. Samples are then taken in one by one, and each value is stored when its window is complete.
 
     Attributes:
         window: samples from an instant to the end of its window.
@@ -302,7 +302,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
     window: int = field(kw_only=True)
     _beyond: int = field(default=0, init=False)
-    _kept: list[Bounds] = field(default_factory=list, init=False)
+    _complete: list[Bounds] = field(default_factory=list, init=False)
     _first: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -325,19 +325,19 @@ class PlanningWindowTracker(_ColumnTracker):
                 side.grow(known, first, now)
             self.samples = now
             if self._beyond and self.settled:
-                self._kept.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
+                self._complete.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
 
     def either(self, start: int, stop: int) -> Bounds:
         if not self._beyond:
             return _ColumnTracker.either(self, start, stop)
         middle = min(max(self.settled, start), stop)
-        kept = self._kept[start - self._first : middle - self._first]
+        complete = self._complete[start - self._first : middle - self._first]
         return Bounds(
-            *map(np.concatenate, zip(*kept, _ColumnTracker.either(self, middle, stop), strict=True))
+            *map(np.concatenate, zip(*complete, _ColumnTracker.either(self, middle, stop), strict=True))
         )
 
     def drop(self, start: int) -> int:
-        del self._kept[: start - self._first]
+        del self._complete[: start - self._first]
         self._first = start
         return _ColumnTracker.drop(self, start)
 
@@ -423,7 +423,7 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Forget samples behind the frontier, and before it is reached those no longer read."""
+        """Drop samples before the frontier, or those that are no longer read before it is reached."""
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)
         return first_needed(self.plans["truncate"], self.samples)
@@ -542,7 +542,7 @@ class Trackers:
         found = paced.effort(rule.formula, sum(span(rule.formula)) + (window or 0))
         if found.own > MOST:
             raise UsageError(_too_much(rule, found))
-        if paced.all_kept or found.rows > WIDE:
+        if paced.stores_all or found.rows > WIDE:
             return paced
         return self.plain(rule, options, everywhere=everywhere)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
+from stlc.compile.ir.traverse import map_children
 from stlc.monitor.online.columns import NOTHING, ColumnReader, Side
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, column, endless
 
@@ -106,7 +107,10 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
             met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
             if not lo:
                 return met
-            return _held(op == "until", ir.Temporal("always", ir.Window(0, lo - 1), left), met, steps, found)
+            if endless(left):
+                raise EndlessError
+            before = ir.Temporal("always" if op == "until" else "eventually", ir.Window(0, lo - 1), left)
+            return ir.BoolOp("and" if op == "until" else "or", (_part(before, steps, found), met))
         case _:
             raise EndlessError
 
@@ -117,49 +121,37 @@ def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
     Operators that read the same columns may still differ at the end of the trace: `next (always p)` and
     `always (next p)` are not equal there.
     """
-    for name, known in found.origins.items():
-        if known == origin:
+    return _column_of(origin, found.origins, "!")
+
+
+def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
+    """The name of the column of a formula, added where there is none."""
+    for name, known in columns.items():
+        if known == formula:
             return name
-    name = f"!{len(found.origins)}"
-    found.origins[name] = origin
-    return name
+    columns[f"{prefix}{len(columns)}"] = formula
+    return f"{prefix}{len(columns) - 1}"
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """`until` or `release` without a lower bound: met within the rows, or held throughout and met later."""
+    """`until` without a lower bound: met within the rows, or its left side holds there and it is met later.
+
+    For `release` the dual.
+    """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
-    seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
-    if node.op == "until":
-        held = ir.BoolOp("and", (ir.Temporal("always", _FOREVER, left), rest))
-        found.operators[name] = ir.BoolOp("or", (seen, held))
-    else:
-        freed = ir.BoolOp("or", (ir.Temporal("eventually", _FOREVER, left), rest))
-        found.operators[name] = ir.BoolOp("and", (seen, freed))
+    until = node.op == "until"
+    throughout = ir.Temporal("always" if until else "eventually", _FOREVER, left)
+    later = ir.BoolOp("and" if until else "or", (throughout, column(name)))
+    seen = ir.Until(node.op, _FOREVER, left, right)
+    found.operators[name] = ir.BoolOp("or" if until else "and", (seen, later))
     return found.operators[name]
-
-
-def _held(
-    every: bool, before: ir.Temporal, then: ir.Formula, steps: int, found: UnboundedOperators
-) -> ir.Formula:
-    """The condition of `until` on its left side before its window starts; of `release` the dual."""
-    if endless(before.body):
-        raise EndlessError
-    if not every:
-        before = replace(before, op="eventually")
-    return ir.BoolOp("and" if every else "or", (_part(before, steps, found), then))
 
 
 def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
     if isinstance(formula, ir.Truth):
         return formula
-    moved = DelayedFormula(formula, steps)
-    for name, known in found.parts.items():
-        if known == moved:
-            return column(name)
-    name = f"${len(found.parts)}"
-    found.parts[name] = moved
-    return column(name)
+    return column(_column_of(DelayedFormula(formula, steps), found.parts, "$"))
 
 
 def _neutral(origin: DelayedFormula) -> float:
@@ -268,13 +260,7 @@ def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formu
     if not endless(formula):
         return _part(formula, 0, UnboundedOperators(formula, parts))
     match formula:
-        case ir.BoolOp(op, items):
-            return ir.BoolOp(op, tuple(_outlined(item, parts) for item in items))
-        case ir.Shift(body=body):
-            return replace(formula, body=_outlined(body, parts))
-        case ir.Temporal(op, window, body):
-            return ir.Temporal(op, window, _outlined(body, parts))
-        case ir.Until(op, window, left, right):
-            return ir.Until(op, window, _outlined(left, parts), _outlined(right, parts))
+        case ir.BoolOp() | ir.Shift() | ir.Temporal() | ir.Until():
+            return map_children(formula, formulas=lambda part: _outlined(part, parts))
         case _:
             raise EndlessError

@@ -62,7 +62,7 @@ def value_of(text: str) -> float | None:
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """The numbers of these columns, (lines, columns); None where a cell is not a number, or there is none.
+    """Return the numbers of these columns, (lines, columns); None without lines, or for other cells.
 
     Empty cells are NaN, truth values 0 and 1; quotes around a number are removed.
     """
@@ -213,9 +213,9 @@ def _by_arrow(lines: TableText) -> list[Array] | None:
     except (arrow.ArrowException, ValueError, OverflowError, MemoryError):
         return None
     columns = [np.asarray(column, dtype=np.float64) for column in table.columns]
-    if all(column.null_count for column in table.columns):  # some lines may have nothing in them
-        told = ~np.logical_and.reduce([np.asarray(column.is_null()) for column in table.columns])
-        columns = [column[told] for column in columns]
+    if all(column.null_count for column in table.columns):  # some lines may be empty
+        filled = ~np.logical_and.reduce([np.asarray(column.is_null()) for column in table.columns])
+        columns = [column[filled] for column in columns]
     return columns if len(columns[0]) else None
 
 

@@ -2,7 +2,7 @@
 
 The first line names the columns, with optional units in brackets: `t, x [m], v (km/h)`. A column `trace` or
 `agent` gives the trace of each line, if there are several. A column whose first
-cell is a word holds words; in the others an empty cell is NaN, which the monitor refuses where it is needed.
+cell is a word holds words; in the others an empty cell is NaN, an unknown value.
 """
 
 from __future__ import annotations

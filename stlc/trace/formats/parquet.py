@@ -109,11 +109,11 @@ def _table(path: Path, table: Any) -> Table:
     units: dict[str, str] = {}
     for field, chunked in zip(table.schema, table.columns, strict=True):
         name, unit = split_head(field.name)
-        told = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+        noted = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
         for part, values in _values(path, name, chunked):
             if part in columns:
                 raise TraceError(Diagnostic("E605", f"two columns of `{path}` are called `{part}`"))
-            columns[part], units[part] = values, unit or told
+            columns[part], units[part] = values, unit or noted
     if all(values.dtype.kind == "U" for values in columns.values()) or not table.num_rows:
         raise unreadable(path, "it holds no line of numbers")
     return Table(columns, units)

@@ -357,7 +357,7 @@ def test_which_memory_a_requirement_needs() -> None:
         (watched,) = monitor_of(name).online()._watched
         kinds[name] = type(watched.values)
         if isinstance(watched.values, PacedTracker):
-            assert watched.values.all_kept
+            assert watched.values.stores_all
             kinds[name] = RecomputeTracker
     assert kinds["end_under_a_window"] is RecomputeTracker
     assert {kinds[n] for n in ("always", "response", "infinitely_often", "until", "late_until")} == {
