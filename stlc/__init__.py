@@ -20,6 +20,7 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from stlc.controller.planning.planner import PlanResult, plan
     from stlc.controller.problem.task import Task
     from stlc.controller.training.launch import train_here as train
     from stlc.controller.training.run import Run
@@ -37,6 +38,7 @@ else:
 
 __all__ = [
     "Monitor",
+    "PlanResult",
     "Run",
     "SpecError",
     "StlcError",
@@ -47,17 +49,20 @@ __all__ = [
     "compile",
     "load",
     "parse",
+    "plan",
     "train",
 ]
 
 _HOMES = {
     "Monitor": "stlc.monitor.verdict:Monitor",
+    "PlanResult": "stlc.controller.planning.planner:PlanResult",
     "Run": "stlc.controller.training.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
     "System": "stlc.dynamics.model.system:System",
     "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
+    "plan": "stlc.controller.planning.planner:plan",
     "train": "stlc.controller.training.launch:train_here",
 }
 

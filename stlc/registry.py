@@ -142,7 +142,11 @@ class PackageRegistry(Registry[T]):
         """The default, then the others in alphabetical order."""
         package = find_spec(self._package)
         folders = package.submodule_search_locations if package is not None else None
-        found = sorted(module.name for module in iter_modules(folders) if not module.name.startswith("_"))
+        found = sorted(
+            module.name
+            for module in iter_modules(folders)
+            if not (module.ispkg or module.name.startswith("_"))
+        )
         return tuple(sorted(found, key=lambda name: name != self.default))
 
 
@@ -150,6 +154,11 @@ METHODS: PackageRegistry[Any] = PackageRegistry(
     "method", "stlc.controller.methods", "METHOD", default="guided"
 )
 """Training methods (`stlc.controller.methods.Method`) of `--method` and `train: {method: …}`."""
+
+PLANNERS: PackageRegistry[Any] = PackageRegistry(
+    "planner", "stlc.controller.methods.planners", "PLANNER", default="search"
+)
+"""Planners, `stlc.controller.planning.planner.Planner` each, named by `stlc plan --method`."""
 
 SEMANTICS: PackageRegistry[Any] = PackageRegistry(
     "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"

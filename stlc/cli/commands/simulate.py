@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,13 +14,17 @@ from stlc.cli.framework.options import (
     FailUnderOption,
     JsonOption,
     PicturesOption,
+    PlannerOption,
+    PlannerOptionsOption,
     RunArgument,
     RunsOption,
     SeedsOption,
     SetOption,
+    SystemOption,
     parse_limit,
     parse_overrides,
     parse_seeds,
+    planner_choice,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.guard.candidates import Mode
     from stlc.controller.guard.margins import MarginRequest
+    from stlc.controller.training.config import PlannerChoice
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl
 
@@ -104,6 +110,10 @@ def simulate(
     windows: Annotated[
         bool, typer.Option("--windows", help="Also show the verdict on plans per window.")
     ] = False,
+    method: PlannerOption = None,
+    option: PlannerOptionsOption = None,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Processor time of a planner's plan.")] = "20ms",
+    system: SystemOption = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: PicturesOption = True,
@@ -131,6 +141,8 @@ def simulate(
         check_writable(record)
     require_writable(margins)
     overrides = parse_overrides(set_)
+    if method is not None:
+        run = _planned(run, system, planner_choice(method, option, budget), overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
     decl = opened.task.system.decl
     test = decl.test
@@ -163,6 +175,18 @@ def simulate(
     result: Simulation = made
     missed = fail_under is not None and _satisfied(document, chosen) < fail_under
     return Answer(result, show, int(missed))
+
+
+def _planned(
+    spec: str, system: str | None, choice: PlannerChoice, overrides: Mapping[str, str], runs: Path
+) -> str:
+    """Create a run without training that plans by a planner; return its folder."""
+    from stlc.controller.problem.load import load_task
+    from stlc.controller.training.launch import Launch, open_planner
+
+    task = load_task(spec, system, overrides)
+    launch = Launch(root=runs, overrides=overrides, command=sys.argv[1:])
+    return str(open_planner(task, choice, seed=0, launch=launch).path)
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:

@@ -356,6 +356,32 @@ class LintedFiles(TypedDict):
     fixed: int
 
 
+class PlanRobustness(TypedDict):
+    least: float | str
+    median: float | str
+    greatest: float | str
+
+
+class PlanSeconds(TypedDict):
+    mean: float
+    median: float
+    most: float
+
+
+class Plans(TypedDict):
+    spec: str
+    system: str
+    method: str
+    budget: float
+    starts: int
+    satisfied: int
+    infeasible: int
+    robustness: PlanRobustness
+    seconds: PlanSeconds
+    evaluations: float
+    trace: str
+
+
 class PlottedTrace(TypedDict):
     trace: str
     picture: str
@@ -668,6 +694,7 @@ RESULTS: dict[str, Any] = {
     "fmt": FormattedFiles,
     "init": CreatedFiles,
     "lint": LintedFiles,
+    "plan": Plans,
     "plot": PlottedTrace,
     "report": WrittenReport,
     "runs": RunList | RunComparison | RunContent | RemovedRuns,

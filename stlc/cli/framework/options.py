@@ -11,9 +11,11 @@ import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
 from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.training.budget import Clock
+    from stlc.controller.training.config import PlannerChoice
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
 SystemOption = Annotated[
@@ -63,6 +65,27 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),
 ]
+PlannerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--method",
+        "-m",
+        metavar="PLANNER",
+        help=f"A planner instead of a trained policy, for a specification: {', '.join(PLANNERS)}.",
+    ),
+]
+PlannerOptionsOption = Annotated[
+    list[str] | None,
+    typer.Option("--option", metavar="NAME=VALUE", help="An option of the planner; repeatable."),
+]
+
+
+def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> PlannerChoice:
+    """The planner of `--method`, with `--option` and `--budget`. Raises UsageError (U101)."""
+    from stlc.controller.training.config import PlannerChoice
+
+    options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")
+    return PlannerChoice(name, options, parse_seconds(budget))
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:

@@ -56,6 +56,10 @@ class Policy(ABC):
         plans = self.candidates(x0).to(x0.dtype)
         return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
+    def continuation(self, x0: Tensor) -> Tensor:
+        """Plans from the predicted ends of many prefixes: as `plan`, at less effort if planning is costly."""
+        return self.plan(x0)
+
     def __call__(self, x0: Tensor) -> Tensor:
         """The selected plan, as `plan` returns it."""
         return self.plan(x0)

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, get_args
 import torch
 
 from stlc.controller.training.budget import Clock, StepSchedule, cores
-from stlc.registry import METHODS
+from stlc.registry import METHODS, PLANNERS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from stlc.controller.problem.task import Task
 
 ENGINE_VERSION = 2
@@ -26,6 +28,23 @@ MISSION_HOLD = 0.7
 """Share of steps at peak learning rate on missions, whose training states change as the policy improves."""
 MISSION_MOST = 128
 """Maximum number of repaired states on missions, whose failing states are often infeasible and alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerChoice:
+    """A planner to plan with in closed loop.
+
+    Attributes:
+        name: of `stlc.registry.PLANNERS`.
+        options: of the planner, name -> text.
+        seconds: processor time of a plan.
+        evaluations: judged plans of a plan at most; None for no limit.
+    """
+
+    name: str
+    options: Mapping[str, str]
+    seconds: float
+    evaluations: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +64,7 @@ class TrainConfig:
         batch: fresh states per step.
         held_out: number of held-out states.
         drives: maximum closed-loop runs per guard after the training; 0: none.
+        planner: the planner of the method `plan`.
     """
 
     method: str | None = None
@@ -59,6 +79,7 @@ class TrainConfig:
     held_out: int = HELD_OUT
     clock: Clock = "wall"
     drives: int = DRIVES
+    planner: PlannerChoice | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,18 +147,23 @@ _MOST = {
     "hold": 0.999,
 }
 """Upper bounds on shares and on options that determine memory use."""
+MOST_TEXT = 1000
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 
 
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
     """Return the options unchanged. Raises ValueError where one has the wrong type or is too large."""
-    words = {"method": METHODS.names, "clock": get_args(Clock)}
+    words = {"method": METHODS.names, "clock": get_args(Clock), "planner": PLANNERS.names}
     for field in fields(config):
         value = getattr(config, field.name)
         if field.name in words:
             if value not in words[field.name]:
                 known = ", ".join(words[field.name])
                 raise ValueError(f"`{field.name}` is {value!r:.40}, none of {known}")
+            continue
+        if field.type in ("str", str):
+            if not isinstance(value, str) or len(value) > MOST_TEXT:
+                raise ValueError(f"`{field.name}` is {value!r:.40}")
             continue
         kinds = (int, float) if field.type in ("float", float) else (int,)
         most = _MOST.get(field.name, 1e12)

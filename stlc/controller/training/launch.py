@@ -10,7 +10,7 @@ from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import train
-from stlc.controller.training.run import Run, save_library, spec_hash, system_hash
+from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.dynamics.robots.functions import function_files
 from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import PlannerChoice
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,3 +111,17 @@ def train_here(
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
     return train(task, config, open_folder(task, config)).run
+
+
+def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch) -> RunDir:
+    """Create the folder of a run without training, whose policy is a planner.
+
+    Raises:
+        MissingError: R201, the folder cannot be written.
+        UsageError: U101, there is no such planner or option.
+    """
+    config = TrainConfig(method="plan", planner=choice, seed=seed)
+    folder = open_folder(task, config, launch)
+    save_config(folder, resolve_config(task, config))
+    folder.finish("finished", None)
+    return folder

@@ -99,7 +99,7 @@ class PrefixShooting(GuardStage):
         size = self.grid.batch
         for start, head in zip(torch.split(starts, size), torch.split(heads, size), strict=True):
             reached = self.task.rollout(start, head)[:, -1]
-            tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
+            tail = finite(self.policy.continuation(reached).to(x.dtype), self.task)
             plans = torch.cat((head, tail[:, : self.task.horizon - length]), 1)
             parts.append(Candidates.judged(self.task, start, plans, BACKUP, length, cost=True))
             if agents == 1 and deadline.over:

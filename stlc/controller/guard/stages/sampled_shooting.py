@@ -58,7 +58,7 @@ class SampledPrefixes:
         starts = x.repeat_interleave(count, 0)
         rows = torch.arange(len(starts), device=x.device)
         reached = self.task.rollout(starts, heads)[rows, lengths]
-        tails = finite(self.policy.plan(reached).to(x.dtype), self.task)
+        tails = finite(self.policy.continuation(reached).to(x.dtype), self.task)
         when = torch.arange(self.task.horizon, device=x.device)
         after = (when - lengths[:, None]).clamp(min=0)[..., None].expand(-1, -1, controls)
         plans = tails.gather(1, after)

@@ -1,0 +1,151 @@
+"""`stlc plan`: a satisfying plan for given initial states, without training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stlc.cli.framework.documents import Plans
+from stlc.cli.framework.options import (
+    FailUnderOption,
+    PlannerOptionsOption,
+    SetOption,
+    SystemOption,
+    parse_count,
+    parse_overrides,
+    planner_choice,
+)
+from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
+from stlc.cli.framework.program import command
+from stlc.diagnostics import usage
+from stlc.registry import PLANNERS
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanResult
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import PlannerChoice
+
+
+@command(
+    "stlc plan specs/traffic.stl",
+    'stlc plan specs/reach_n_avoid.stl --from "x=1, v=0" --budget 50ms',
+    "stlc plan specs/ship_safe.stl --starts 1000 --method cem --option population=500",
+)
+def plan(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
+    system: SystemOption = None,
+    from_: Annotated[
+        str,
+        typer.Option("--from", metavar="random|STATE|TRACE", help="Initial states, such as `x=1, v=2 m/s`."),
+    ] = "random",
+    starts: Annotated[int | None, typer.Option(min=1, help="Number of initial states; 1.")] = None,
+    method: Annotated[
+        str, typer.Option("--method", "-m", metavar="|".join(PLANNERS), help="The planner.")
+    ] = PLANNERS.default,
+    option: PlannerOptionsOption = None,
+    budget: Annotated[
+        str, typer.Option(metavar="TIME", help="Processor time per initial state at most.")
+    ] = "1s",
+    evaluations: Annotated[
+        str | None, typer.Option(metavar="N", help="Judged plans per initial state at most.")
+    ] = None,
+    target: Annotated[
+        str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
+    ] = "0",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the planner and of random states.")] = 0,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
+    ] = Path("plan.npz"),
+    fail_under: FailUnderOption = None,
+    set_: SetOption = None,
+) -> Answer[Plans]:
+    """Plan from initial states, without training.
+
+    The best plan found is written as a trace that check and plot read. Every plan is judged exactly in
+    float64. A start without a satisfying plan may still have one, unless the planner proves the opposite
+    (milp). Ctrl-C ends the search and keeps the best plans so far. Exits with 1 if a plan violates the
+    specification, unless --fail-under says otherwise.
+    """
+    from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named
+    from stlc.controller.planning.record import trace_of
+    from stlc.controller.planning.starts import starts_of
+    from stlc.controller.problem.load import load_task
+    from stlc.trace import check_writable, save_trace
+
+    check_writable(output)
+    choice = planner_choice(method, option, budget)
+    judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
+    planner = planner_named(choice.name, **choice.options)
+    task = load_task(spec, system, parse_overrides(set_))
+    show_diagnostics(task.compiled.warnings)
+    states = starts_of(task, from_, starts, seed)
+    search = PlanSearch(task, states, PlanBudget(choice.seconds, judged, _target(target)), seed=seed)
+    with PULSE.doing(f"planning, {method}"):
+        solver = planner.prepare(task)
+        try:
+            solver(search)
+        except KeyboardInterrupt:
+            say("interrupted: the best plans so far are kept")
+    result = search.result
+    save_trace(output, trace_of(task, result, seed))
+    record = _record(task, result, choice, output)
+    missed = record["satisfied"] / record["starts"] < (1.0 if fail_under is None else fail_under)
+    return Answer(record, lambda: emit("\n".join(_lines(record))), int(missed))
+
+
+def _target(text: str) -> float:
+    """The robustness at which a search ends; inf for `max`."""
+    try:
+        return float("inf") if text.strip() == "max" else float(text)
+    except ValueError:
+        raise usage(f"`--target {text}` is no robustness", "--target 0.1 or max") from None
+
+
+def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path) -> Plans:
+    rho, spent = result.rho, result.seconds
+    return {
+        "spec": task.compiled.name,
+        "system": task.system.decl.name,
+        "method": choice.name,
+        "budget": choice.seconds,
+        "starts": len(rho),
+        "satisfied": int(result.satisfied.sum()),
+        "infeasible": int(result.infeasible.sum()),
+        "robustness": {
+            "least": float(rho.min()),
+            "median": float(rho.median()),
+            "greatest": float(rho.max()),
+        },
+        "seconds": {"mean": float(spent.mean()), "median": float(spent.median()), "most": float(spent.max())},
+        "evaluations": float(result.evaluations.double().mean()),
+        "trace": str(output),
+    }
+
+
+def _lines(plans: Plans) -> list[str]:
+    """The result as text."""
+    from stlc.controller.evaluation.held_out import wilson
+    from stlc.view.words import interval, number
+    from stlc.view.words import seconds as duration
+    from stlc.view.words import share as percent
+
+    count, good, spent = plans["starts"], plans["satisfied"], plans["seconds"]
+    least, middle, greatest = (number(float(value)) for value in plans["robustness"].values())  # type: ignore[arg-type]
+    judged, end = f"{plans['evaluations']:,.0f} plans judged", f"trace {plans['trace']}"
+    if count == 1:
+        verdict = f"the plan {'satisfies' if good else 'violates'} it, robustness {least}"
+        if plans["infeasible"]:
+            verdict = "there is no satisfying plan, proved"
+        cost = f"{plans['method']}: {duration(spent['mean'])}, {judged}"
+        return [f"{plans['spec']}: {verdict}", cost, end]
+    proved = f", {plans['infeasible']:,} proved infeasible" if plans["infeasible"] else ""
+    within = f"{percent(good / count)}, 95 % interval {interval(wilson(good / count, count))}"
+    return [
+        f"{plans['spec']}: {good:,} of {count:,} plans satisfy it ({within}){proved}",
+        f"robustness {least} to {greatest}, median {middle}",
+        f"{plans['method']}: {duration(spent['mean'])} of processor time a plan (median "
+        f"{duration(spent['median'])}, most {duration(spent['most'])}), {judged} for each",
+        end,
+    ]

@@ -1,0 +1,597 @@
+"""Encoding of dynamics and formulas of the IR from one initial state, as a mixed-integer linear model.
+
+Columns that no control reaches are numbers and fold away. `Encoding.TIGHT` keeps every condition by a small
+margin, so that its solutions are plans; `Encoding.RELAXED` contains every satisfying plan, so that its
+infeasibility is a proof. Both are exact up to `MARGIN` but for norms, whose circles are polygons with
+`SIDES` sides: inscribed in the one, circumscribed in the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from stlc.compile.backends.milp.model import (
+    ZERO,
+    Affine,
+    Junction,
+    Leaf,
+    Model,
+    Tree,
+    UnencodableError,
+    constant,
+    junction,
+)
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.ir.text import show_number
+from stlc.compile.ir.traverse import leaves, nodes, numbers
+
+MARGIN = 1e-5
+"""Margin of conditions in the tight encoding, and their tolerance in the relaxed one."""
+SIDES = 16
+"""Sides of the polygon that stands for a circle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Greatest:
+    """The greatest of some values; the least is minus the greatest of minus them."""
+
+    items: tuple[Value, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One value where a condition holds, else another.
+
+    Attributes:
+        yes, no: the values.
+        holds: the condition as a tree.
+        fails: its negation as a tree.
+    """
+
+    yes: Value
+    no: Value
+    holds: Tree
+    fails: Tree
+
+
+@dataclass(frozen=True, slots=True)
+class Norm:
+    """The Euclidean norm of affine forms."""
+
+    parts: tuple[Affine, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """The square of a variable."""
+
+    variable: int
+
+
+Atom: TypeAlias = "Greatest | Choice | Norm | Square"
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """An affine form plus atoms with coefficients, which become variables only where they must.
+
+    Attributes:
+        form: the affine part.
+        atoms: (coefficient, atom) pairs.
+    """
+
+    form: Affine
+    atoms: tuple[tuple[float, Atom], ...] = ()
+
+    def plus(self, other: Value, factor: float = 1.0) -> Value:
+        """This value plus `factor` times another."""
+        added = tuple((factor * each, atom) for each, atom in other.atoms)
+        return Value(self.form.plus(other.form, factor), self.atoms + added)
+
+    def times(self, factor: float) -> Value:
+        """This value times a constant."""
+        if not factor:
+            return Value(ZERO)
+        return Value(self.form.times(factor), tuple((factor * each, atom) for each, atom in self.atoms))
+
+    @property
+    def known(self) -> float | None:
+        """The value of a constant; None otherwise."""
+        return None if self.atoms or self.form.terms else self.form.const
+
+
+def number(value: float) -> Value:
+    """A constant."""
+    return Value(constant(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """A formula to hold at the first sample.
+
+    Attributes:
+        formula: of the IR.
+        margin: least value of its predicates, affine; time tests have none.
+    """
+
+    formula: ir.Formula
+    margin: Affine
+
+
+Row: TypeAlias = dict[str, Value]
+"""Columns at one sample: name -> value."""
+
+
+class Encoding:
+    """The model of plans from one initial state.
+
+    Attributes:
+        model: variables and rows.
+        rows: columns at each sample, T + 1 of them.
+        controls: variables of the plan, (T, m).
+    """
+
+    def __init__(self, *, tight: bool) -> None:
+        self.model = Model()
+        self.rows: list[Row] = []
+        self.controls: list[list[Affine]] = []
+        self._tight = tight
+        self._slack = constant(MARGIN if tight else -MARGIN)
+        self._numbers: dict[tuple[int, int], Value] = {}
+        self._trees: dict[tuple[int, int, int], Tree] = {}
+        self._free: set[int] = set()
+
+    # ------------------------------------------------------------------ dynamics
+
+    def roll(
+        self,
+        x0: Mapping[str, float],
+        bounds: Mapping[str, tuple[float, float]],
+        lets: Sequence[tuple[str, ir.Num]],
+        step: Mapping[str, ir.Num],
+        horizon: int,
+        requirements: Sequence[Requirement] = (),
+    ) -> list[Tree]:
+        """Encode the dynamics over a horizon, and requirements at the first sample.
+
+        What a requirement demands of every state bounds the states before the next step is encoded, which
+        decides many of its conditions.
+
+        Args:
+            x0: initial state, column -> value.
+            bounds: control -> its range.
+            lets: intermediate results of a step, in order.
+            step: moving state -> its value one step later.
+            horizon: number of steps.
+            requirements: formulas with the margin of their predicates.
+
+        Returns:
+            The conditions that the requirements hold, not yet required.
+
+        Raises:
+            UnencodableError: an expression has no mixed-integer linear form.
+        """
+        row: Row = {name: number(value) for name, value in x0.items()}
+        once = _read_once(set(bounds), [*(num for _, num in lets), *step.values()])
+        for k in range(horizon):
+            row[ir.ELAPSED] = number(float(k))
+            self._invariants(requirements, row, k)
+            inputs = [self.model.variable(*ends) for ends in bounds.values()]
+            self.controls.append(inputs)
+            self._free = {
+                index
+                for (name, (low, high)), form in zip(bounds.items(), inputs, strict=True)
+                for index in form.terms
+                if name in once and low <= 0.0 <= high
+            }
+            env = row | {name: Value(form) for name, form in zip(bounds, inputs, strict=True)}
+            self.rows.append(env)
+            for name, num in lets:
+                env[name] = Value(self._linear(self._number(num, k), num))
+            moved = {name: Value(self._linear(self._number(num, k), num)) for name, num in step.items()}
+            row = {name: moved.get(name, value) for name, value in row.items()}
+        row[ir.ELAPSED] = number(float(horizon))
+        self._invariants(requirements, row, horizon)
+        self.rows.append(row)
+        return [self._tree(each.formula, 0, each) for each in requirements]
+
+    def _invariants(self, requirements: Sequence[Requirement], row: Row, k: int) -> None:
+        """Bound the states of sample `k` by what requirements demand of it, whatever the plan."""
+        self.rows.append(row)
+        for each in requirements:
+            for body in self._demanded(each.formula, k, each):
+                for part in _conjuncts(self._tree(body, k, each)):
+                    if part is False:
+                        self.model.feasible = False
+                    elif isinstance(part, Leaf):
+                        self.model.tighten(part.form, part.margin.const)
+        self.rows.pop()
+
+    def _demanded(self, formula: ir.Formula, k: int, what: Requirement) -> Iterator[ir.Formula]:
+        """State formulas that hold at sample `k` wherever `formula` holds at the first."""
+        match formula:
+            case ir.Predicate() if k == 0:
+                yield formula
+            case ir.BoolOp("and", items):
+                for item in items:
+                    yield from self._demanded(item, k, what)
+            case ir.BoolOp("or", items):
+                left = [
+                    item for item in items if not _of_state(item) or self._tree(item, 0, what) is not False
+                ]
+                if len(left) == 1:
+                    yield from self._demanded(left[0], k, what)
+            case ir.Temporal("always", window, body) if _of_state(body):
+                if window.lo <= k and (window.hi is None or k <= window.hi):
+                    yield body
+
+    # ------------------------------------------------------------------- formulas
+
+    def _tree(self, formula: ir.Formula, k: int, what: Requirement) -> Tree:
+        """The condition that a part of a requirement holds at sample `k`."""
+        key = id(what), id(formula), k
+        if key not in self._trees:
+            self._trees[key] = self._formula(formula, k, what)
+        return self._trees[key]
+
+    def _formula(self, node: ir.Formula, k: int, margin: Requirement) -> Tree:
+        match node:
+            case ir.Truth(value):
+                return value
+            case ir.Predicate():
+                return self._predicate(node, k, margin.margin.plus(self._slack))
+            case ir.BoolOp(op, items):
+                return junction(op, [self._tree(item, k, margin) for item in items])
+            case ir.AtStart(body):
+                return self._tree(body, 0, margin)
+            case ir.Temporal(op, window, body):
+                samples = self._samples(window, k)
+                return junction(
+                    "and" if op == "always" else "or", [self._tree(body, j, margin) for j in samples]
+                )
+            case ir.PastTemporal(op, window, body):
+                last, first = k - window.lo, 0 if window.hi is None else max(0, k - window.hi)
+                past = [self._tree(body, j, margin) for j in range(first, last + 1)]
+                return junction("and" if op == "historically" else "or", past)
+            case ir.Until(op, window, left, right):
+                return self._until(op == "until", k, self._samples(window, k), left, right, margin)
+            case ir.Shift(steps, body, outside):
+                inside = 0 <= k + steps < len(self.rows)
+                if not inside and outside is None:
+                    raise UnencodableError("a sample outside the horizon")
+                return self._tree(body, k + steps, margin) if inside else bool(outside)
+        raise UnencodableError(f"`{type(node).__name__.lower()}`")
+
+    def _until(
+        self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Requirement
+    ) -> Tree:
+        """`until`, or its dual `release`: min and max exchanged."""
+        inner, outer = ("and", "or") if strong else ("or", "and")
+        found = []
+        for j in samples:
+            kept = [self._tree(left, i, margin) for i in range(k, j + 1)]
+            found.append(junction(inner, [*kept, self._tree(right, j, margin)]))  # type: ignore[arg-type]
+        return junction(outer, found)  # type: ignore[arg-type]
+
+    def _samples(self, window: ir.Window, k: int) -> range:
+        last = len(self.rows) - 1 if window.hi is None else k + window.hi
+        if last >= len(self.rows):
+            raise UnencodableError("a window beyond the horizon")
+        return range(k + window.lo, last + 1)
+
+    def _predicate(self, node: ir.Predicate, k: int, margin: Affine) -> Tree:
+        value = self._number(node.num, k).times(float(node.sign))
+        if value.known is not None and (node.guard or not margin.terms):
+            least = 0.0 if node.guard else margin.const - self._slack.const
+            slack = 0.0 if self._tight or node.guard else MARGIN
+            return value.known > least if node.strict and node.guard else value.known >= least - slack
+        return self._condition(value, ZERO if node.guard else margin, node.num)
+
+    def _decided(self, cond: ir.Formula, k: int, *, holds: bool) -> Tree:
+        """The condition that a state formula holds, or does not, at sample `k`."""
+        match cond:
+            case ir.Truth(truth):
+                return truth == holds
+            case ir.Predicate(num, sign, strict):
+                value = self._number(num, k).times(float(sign))
+                if value.known is not None:
+                    return (value.known > 0.0 if strict else value.known >= 0.0) == holds
+                return self._condition(value if holds else value.times(-1.0), self._slack, num)
+            case ir.BoolOp(op, items):
+                turned = op if holds else ("or" if op == "and" else "and")
+                return junction(turned, [self._decided(item, k, holds=holds) for item in items])
+        raise UnencodableError("a condition over time")
+
+    def _condition(self, value: Value, margin: Affine, num: ir.Num) -> Tree:
+        """`value >= margin` as a tree of affine conditions: extrema and choices are split."""
+        for index, (factor, atom) in enumerate(value.atoms):
+            rest = Value(value.form, value.atoms[:index] + value.atoms[index + 1 :])
+            match atom:
+                case Greatest(items):
+                    parts = [self._condition(rest.plus(item, factor), margin, num) for item in items]
+                    return junction("or" if factor > 0.0 else "and", parts)
+                case Choice(yes, no, holds, fails):
+                    first = self._condition(rest.plus(yes, factor), margin, num)
+                    second = self._condition(rest.plus(no, factor), margin, num)
+                    return junction("and", (junction("or", (fails, first)), junction("or", (holds, second))))
+                case Norm(lengths) if len(value.atoms) == 1:
+                    return self._circle(value.form, factor, lengths, margin)
+        return self._polynomial(value, margin, num)
+
+    def _polynomial(self, value: Value, margin: Affine, num: ir.Num) -> Tree:
+        """`value >= margin` for a value without extrema and choices, quadratic at most."""
+        squares: dict[int, float] = {}
+        for factor, atom in value.atoms:
+            if not isinstance(atom, Square):
+                raise UnencodableError(show_number(num))
+            squares[atom.variable] = squares.get(atom.variable, 0.0) + factor
+        squares = {variable: factor for variable, factor in squares.items() if factor}
+        if not squares:
+            return self._leaf(value.form, margin)
+        if margin.terms:
+            raise UnencodableError(f"the robustness of {show_number(num)}")
+        form = value.form.plus(margin, -1.0)
+        if not set(form.terms) <= set(squares) or len({factor > 0.0 for factor in squares.values()}) > 1:
+            raise UnencodableError(show_number(num))
+        if len(squares) == 1:
+            ((variable, factor),) = squares.items()
+            return self._quadratic(variable, factor, form)
+        return self._ellipse(squares, form)
+
+    def _leaf(self, form: Affine, margin: Affine) -> Tree:
+        needed = form.plus(margin, -1.0)
+        low, high = self.model.bounds(needed)
+        if low >= 0.0:
+            return True
+        return False if high < 0.0 else Leaf(form, margin)
+
+    def _quadratic(self, variable: int, a: float, form: Affine) -> Tree:
+        """`a x^2 + b x + c >= 0`, split at its roots."""
+        b, c = form.terms.get(variable, 0.0), form.const
+        inside = b * b - 4.0 * a * c
+        if inside <= 0.0:
+            return a > 0.0
+        root = math.sqrt(inside)
+        low, high = sorted(((-b - root) / (2.0 * a), (-b + root) / (2.0 * a)))
+        x = Affine({variable: 1.0}, 0.0)
+        below = self._leaf(constant(low).plus(x, -1.0), ZERO), self._leaf(x.plus(constant(-high)), ZERO)
+        between = self._leaf(x.plus(constant(-low)), ZERO), self._leaf(constant(high).plus(x, -1.0), ZERO)
+        return junction("or", below) if a > 0.0 else junction("and", between)
+
+    def _ellipse(self, squares: Mapping[int, float], form: Affine) -> Tree:
+        """`sum of a_i x_i^2 + b_i x_i + c >= 0` with coefficients `a_i` of one sign, as a norm."""
+        sign = 1.0 if next(iter(squares.values())) > 0.0 else -1.0
+        parts, rest = [], sign * form.const
+        for variable, factor in squares.items():
+            a, b = abs(factor), sign * form.terms.get(variable, 0.0)
+            parts.append(Affine({variable: math.sqrt(a)}, b / (2.0 * math.sqrt(a))))
+            rest -= b * b / (4.0 * a)
+        if rest >= 0.0:
+            return sign > 0.0  # an empty or a single-point circle
+        return self._circle(constant(-sign * math.sqrt(-rest)), sign, tuple(parts), ZERO)
+
+    def _circle(self, form: Affine, factor: float, parts: Sequence[Affine], margin: Affine) -> Tree:
+        """`form + factor * norm(parts) >= margin` by a polygon: a sound or a complete one."""
+        if len(parts) == 1:
+            both = (form.plus(parts[0], factor), form.plus(parts[0], -factor))
+            return junction("or" if factor > 0.0 else "and", [self._leaf(each, margin) for each in both])
+        if len(parts) != 2:
+            raise UnencodableError(f"a norm of {len(parts)} numbers")
+        shrink = math.cos(math.pi / SIDES)
+        # inside: directions d with d.p <= r are circumscribed; r cos(pi / n) makes the polygon inscribed
+        scale = (
+            (1.0 if self._tight else 1.0 / shrink) if factor > 0.0 else (1.0 / shrink if self._tight else 1.0)
+        )
+        leaves = []
+        for side in range(SIDES):
+            angle = 2.0 * math.pi * side / SIDES
+            along = parts[0].times(math.cos(angle)).plus(parts[1].times(math.sin(angle)))
+            leaves.append(self._leaf(form.plus(along, factor * scale), margin))
+        return junction("or" if factor > 0.0 else "and", leaves)
+
+    # -------------------------------------------------------------------- numbers
+
+    def _number(self, num: ir.Num, k: int) -> Value:
+        """The value of a number at sample `k`."""
+        key = id(num), k
+        if key not in self._numbers:
+            self._numbers[key] = self._value(num, k)
+        return self._numbers[key]
+
+    def _value(self, num: ir.Num, k: int) -> Value:
+        match num:
+            case ir.Const(value):
+                return number(value)
+            case ir.Signal(name):
+                return self.rows[k][name]
+            case ir.ShiftedSignal(name, steps, clamped):
+                at = min(max(k + steps, 0), len(self.rows) - 1) if clamped else k + steps
+                if not 0 <= at < len(self.rows):
+                    raise UnencodableError("a sample outside the horizon")
+                return self.rows[at][name]
+            case ir.Op(name, args):
+                return self._op(num, name, [self._number(arg, k) for arg in args])
+            case ir.Where(cond, yes, no):
+                return self._choice(cond, k, lambda: self._number(yes, k), lambda: self._number(no, k))
+            case ir.Indicator(cond):
+                return self._choice(cond, k, lambda: number(1.0), lambda: number(0.0))
+        raise UnencodableError(show_number(num))
+
+    def _choice(self, cond: ir.Formula, k: int, yes: Callable[[], Value], no: Callable[[], Value]) -> Value:
+        holds, fails = (self._decided(cond, k, holds=each) for each in (True, False))
+        if fails is False or holds is True:
+            return yes()
+        if holds is False or fails is True:
+            return no()
+        return Value(ZERO, ((1.0, Choice(yes(), no(), holds, fails)),))
+
+    def _op(self, num: ir.Num, name: str, args: list[Value]) -> Value:
+        known = [arg.known for arg in args]
+        fold = FUNCTIONS[name].fold
+        if fold is not None and None not in known:
+            return number(float(fold(*known)))
+        if name in _FORMS:
+            return _FORMS[name](self, args)
+        if name == "norm":
+            return Value(ZERO, ((1.0, Norm(tuple(self._linear(arg, num) for arg in args))),))
+        if name == "mul" or name == "square" or (name == "pow" and known[1] == 2.0):
+            return self._product(num, args[0], args[1] if name == "mul" else args[0])
+        divisor = known[-1]
+        if name == "div" and divisor:
+            return args[0].times(1.0 / divisor)
+        if name == "mod" and divisor:
+            return self._remainder(self._linear(args[0], num), divisor)
+        raise UnencodableError(show_number(num))
+
+    def _clipped(self, args: Sequence[Value]) -> Value:
+        held = self._held(args)
+        if held is not None:
+            return held
+        above = self._greatest(args[:2])
+        return self._greatest([above.times(-1.0), args[2].times(-1.0)]).times(-1.0)
+
+    def _greatest(self, items: Sequence[Value]) -> Value:
+        """The greatest value, without those that the bounds exclude."""
+        ends = [(-math.inf, math.inf) if v.atoms else self.model.bounds(v.form) for v in items]
+        least = max(low for low, _ in ends)
+        left = [i for i, (_, high) in enumerate(ends) if high > least]
+        if not any(ends[i][0] >= least for i in left):
+            left.append(next(i for i, (low, _) in enumerate(ends) if low >= least))
+        if len(left) == 1:
+            return items[left[0]]
+        return Value(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
+
+    def _held(self, args: Sequence[Value]) -> Value | None:
+        """`clip(v + c u, low, high)` without saturation; None if that excludes a value of it.
+
+        A control that is read nowhere else can reach each bound exactly instead of beyond it, wherever v lies
+        within the bounds.
+        """
+        form, low, high = args[0].form, args[1].known, args[2].known
+        free = self._free & form.terms.keys()
+        if args[0].atoms or low is None or high is None or not free:
+            return None
+        least, most = self.model.bounds(
+            Affine({i: c for i, c in form.terms.items() if i not in free}, form.const)
+        )
+        if least < low or most > high:
+            return None
+        ends = self.model.bounds(form)
+        found = self.model.variable(max(low, ends[0]), min(high, ends[1]))
+        self.model.require(form.plus(found, -1.0), 0.0, 0.0)
+        return Value(found)
+
+    def _product(self, num: ir.Num, left: Value, right: Value) -> Value:
+        for one, other in ((left, right), (right, left)):
+            if one.known is not None:
+                return other.times(one.known)
+        for one, other in ((left, right), (right, left)):
+            scaled = _scaled(one, other)
+            if scaled is not None:
+                return scaled
+        first, second = self._linear(left, num), self._linear(right, num)
+        if len(first.terms) == 1 and first.terms.keys() == second.terms.keys():
+            ((variable, a),), ((_, b),) = first.terms.items(), second.terms.items()
+            cross = a * second.const + b * first.const
+            form = Affine({variable: cross} if cross else {}, first.const * second.const)
+            return Value(form, ((a * b, Square(variable)),))
+        raise UnencodableError(show_number(num))
+
+    def _remainder(self, form: Affine, divisor: float) -> Value:
+        """`form` modulo a constant, through a whole number."""
+        low, high = self.model.bounds(form.times(1.0 / divisor))
+        if math.floor(low) == math.floor(high):
+            return Value(form.plus(constant(-divisor * math.floor(low))))
+        whole = self.model.variable(math.floor(low), math.floor(high), integer=True)
+        rest = form.plus(whole, -divisor)
+        self.model.require(rest, min(0.0, divisor), max(0.0, divisor))
+        return Value(rest)
+
+    def _linear(self, value: Value, num: ir.Num) -> Affine:
+        """The value as one variable: extrema and choices get binary variables."""
+        form = value.form
+        for factor, atom in value.atoms:
+            match atom:
+                case Greatest(items):
+                    form = form.plus(self._extremum([self._linear(item, num) for item in items]), factor)
+                case Choice(yes, no, holds, fails):
+                    ends = self._linear(yes, num), self._linear(no, num)
+                    form = form.plus(self._switched(*ends, holds, fails), factor)
+                case _:
+                    raise UnencodableError(show_number(num))
+        return self.model.named(form)
+
+    def _extremum(self, forms: Sequence[Affine]) -> Affine:
+        """A variable that equals the greatest of some forms."""
+        model = self.model
+        ends = [model.bounds(form) for form in forms]
+        found = model.variable(max(low for low, _ in ends), max(high for _, high in ends))
+        total = constant(-1.0)
+        for form, (low, _) in zip(forms, ends, strict=True):
+            binary = model.binary()
+            total = total.plus(binary)
+            model.require(found.plus(form, -1.0))
+            most = model.bounds(found)[1] - low
+            model.require(form.plus(found, -1.0).plus(binary, -most).plus(constant(most)))
+        model.require(total, 0.0, 0.0)
+        return found
+
+    def _switched(self, yes: Affine, no: Affine, holds: Tree, fails: Tree) -> Affine:
+        """A variable that equals one of two forms by a condition."""
+        model, binary = self.model, self.model.binary()
+        model.imply(constant(1.0).plus(binary, -1.0), holds)
+        model.imply(binary, fails)
+        gap = yes.plus(no, -1.0)
+        if not gap.terms:
+            return no.plus(binary, gap.const)
+        return no.plus(model.product(binary, gap))
+
+
+_FORMS: dict[str, Callable[[Encoding, list[Value]], Value]] = {
+    "add": lambda _, args: args[0].plus(args[1]),
+    "sub": lambda _, args: args[0].plus(args[1], -1.0),
+    "neg": lambda _, args: args[0].times(-1.0),
+    "max": lambda to, args: to._greatest(args),
+    "min": lambda to, args: to._greatest([arg.times(-1.0) for arg in args]).times(-1.0),
+    "abs": lambda to, args: to._greatest([args[0], args[0].times(-1.0)]),
+    "relu": lambda to, args: to._greatest([args[0], number(0.0)]),
+    "clip": lambda to, args: to._clipped(args),
+}
+"""Built-in functions that are piecewise linear in all arguments."""
+
+
+def _read_once(names: set[str], nums: Sequence[ir.Num]) -> set[str]:
+    """Which of the columns are read exactly once by some numbers."""
+    reads = [leaf.name for num in nums for leaf in leaves(num) if isinstance(leaf, ir.Signal)]
+    return {name for name in names if reads.count(name) == 1}
+
+
+def _of_state(formula: ir.Formula) -> bool:
+    """True for a formula about one sample."""
+    return all(isinstance(node, ir.Truth | ir.Predicate | ir.BoolOp) for node in nodes(formula)) and not any(
+        isinstance(leaf, ir.ShiftedSignal) for num in numbers(formula) for leaf in leaves(num)
+    )
+
+
+def _conjuncts(tree: Tree) -> Iterator[Tree]:
+    """The conditions whose conjunction a tree is."""
+    if isinstance(tree, Junction) and tree.op == "and":
+        for item in tree.items:
+            yield from _conjuncts(item)
+    else:
+        yield tree
+
+
+def _scaled(one: Value, other: Value) -> Value | None:
+    """The product of a choice between two constants and another value; None if `one` is no such choice."""
+    match one.atoms:
+        case ((factor, Choice(yes, no, holds, fails)),) if not one.form.terms:
+            if yes.known is None or no.known is None:
+                return None
+            chosen = Choice(other.times(factor * yes.known), other.times(factor * no.known), holds, fails)
+            return other.times(one.form.const).plus(Value(ZERO, ((1.0, chosen),)))
+    return None

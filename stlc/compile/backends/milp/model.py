@@ -1,0 +1,264 @@
+"""Mixed-integer linear models: variables with bounds, affine forms, rows, and trees of conditions.
+
+A tree of conditions is required through implications only: a binary variable that is 1 implies its condition.
+Each big-M is the least one that the bounds of its row allow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class UnencodableError(Exception):
+    """An expression without an exact or a bounded mixed-integer linear form."""
+
+
+@dataclass(frozen=True, slots=True)
+class Affine:
+    """A sum of variables with coefficients, and a constant.
+
+    Attributes:
+        terms: index of a variable -> coefficient, never 0.
+        const: the constant.
+    """
+
+    terms: Mapping[int, float]
+    const: float
+
+    def plus(self, other: Affine, factor: float = 1.0) -> Affine:
+        """This form plus `factor` times another."""
+        if not other.terms:
+            return Affine(self.terms, self.const + factor * other.const)
+        terms = dict(self.terms)
+        for index, value in other.terms.items():
+            total = terms.get(index, 0.0) + factor * value
+            if total:
+                terms[index] = total
+            else:
+                terms.pop(index, None)
+        return Affine(terms, self.const + factor * other.const)
+
+    def times(self, factor: float) -> Affine:
+        """This form times a constant."""
+        if factor == 1.0:
+            return self
+        if not factor:
+            return ZERO
+        return Affine({i: factor * value for i, value in self.terms.items()}, factor * self.const)
+
+
+ZERO = Affine({}, 0.0)
+
+
+def constant(value: float) -> Affine:
+    """A constant as an affine form."""
+    return Affine({}, float(value))
+
+
+@dataclass(eq=False, slots=True)
+class Leaf:
+    """The condition `form >= margin`; a time test has no margin.
+
+    Attributes:
+        form: affine.
+        margin: affine, such as the robustness that is maximised.
+        literal: binary variable that implies it; None before one was needed.
+    """
+
+    form: Affine
+    margin: Affine = ZERO
+    literal: int | None = None
+
+
+@dataclass(eq=False, slots=True)
+class Junction:
+    """A conjunction or disjunction of conditions."""
+
+    op: Literal["and", "or"]
+    items: Sequence[Tree]
+    literal: int | None = None
+
+
+Tree: TypeAlias = "Leaf | Junction | bool"
+
+
+def junction(op: Literal["and", "or"], items: Iterable[Tree]) -> Tree:
+    """The conjunction or disjunction of some conditions, constants folded."""
+    found: list[Tree] = []
+    for item in items:
+        if isinstance(item, bool):
+            if item == (op == "or"):
+                return item
+        elif isinstance(item, Junction) and item.op == op and item.literal is None:
+            found.extend(item.items)
+        else:
+            found.append(item)
+    if not found:
+        return op == "and"
+    return found[0] if len(found) == 1 else Junction(op, found)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrays:
+    """A model as arrays, for a solver.
+
+    Attributes:
+        lower, upper: bounds of the variables, (n,).
+        integer: whether a variable is an integer, (n,).
+        starts: first entry of each row, (rows + 1,).
+        indices, values: variables and coefficients of the rows' entries.
+        row_lower, row_upper: bounds of the rows, (rows,).
+        cost: to be minimised, (n,).
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    integer: NDArray[np.bool_]
+    starts: NDArray[np.int32]
+    indices: NDArray[np.int32]
+    values: NDArray[np.float64]
+    row_lower: NDArray[np.float64]
+    row_upper: NDArray[np.float64]
+    cost: NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Model:
+    """A mixed-integer linear model under construction.
+
+    Attributes:
+        feasible: False once a row without variables was violated.
+    """
+
+    feasible: bool = True
+    _lower: list[float] = field(default_factory=list)
+    _upper: list[float] = field(default_factory=list)
+    _integer: list[bool] = field(default_factory=list)
+    _rows: list[tuple[Mapping[int, float], float, float]] = field(default_factory=list)
+
+    def variable(self, lower: float, upper: float, *, integer: bool = False) -> Affine:
+        """A new variable within bounds."""
+        self._lower.append(lower)
+        self._upper.append(upper)
+        self._integer.append(integer)
+        return Affine({len(self._lower) - 1: 1.0}, 0.0)
+
+    def binary(self) -> Affine:
+        """A new binary variable."""
+        return self.variable(0.0, 1.0, integer=True)
+
+    def is_binary(self, index: int) -> bool:
+        """True for a binary variable."""
+        return self._integer[index] and self._lower[index] == 0.0 and self._upper[index] == 1.0
+
+    def bounds(self, form: Affine) -> tuple[float, float]:
+        """Least and greatest value of a form within the variables' bounds."""
+        low = high = form.const
+        for index, value in form.terms.items():
+            ends = value * self._lower[index], value * self._upper[index]
+            low, high = low + min(ends), high + max(ends)
+        return low, high
+
+    def most(self, tree: Tree) -> float:
+        """The greatest value of the forms that a condition compares, by the bounds; +inf where it is true."""
+        if isinstance(tree, bool):
+            return math.inf if tree else -math.inf
+        if isinstance(tree, Leaf):
+            return self.bounds(tree.form)[1]
+        return (min if tree.op == "and" else max)(map(self.most, tree.items))
+
+    def tighten(self, form: Affine, lower: float) -> None:
+        """Require a form of one variable to be at least `lower`, by the variable's bounds; skip others."""
+        if len(form.terms) != 1:
+            return
+        ((index, factor),) = form.terms.items()
+        end = (lower - form.const) / factor
+        if factor > 0.0:
+            self._lower[index] = max(self._lower[index], end)
+        else:
+            self._upper[index] = min(self._upper[index], end)
+        self.feasible &= self._lower[index] <= self._upper[index]
+
+    def limit(self, variable: Affine, upper: float) -> None:
+        """Lower the upper bound of a variable."""
+        (index,) = variable.terms
+        self._upper[index] = max(self._lower[index], min(self._upper[index], upper))
+
+    def require(self, form: Affine, lower: float = 0.0, upper: float = math.inf) -> None:
+        """Add the row `lower <= form <= upper`."""
+        if not form.terms:
+            self.feasible &= lower <= form.const <= upper
+            return
+        self._rows.append((form.terms, lower - form.const, upper - form.const))
+
+    def named(self, form: Affine) -> Affine:
+        """A variable that equals a form; the form itself if it has at most one term."""
+        if len(form.terms) <= 1:
+            return form
+        low, high = self.bounds(form)
+        found = self.variable(low, high)
+        self.require(form.plus(found, -1.0), 0.0, 0.0)
+        return found
+
+    def product(self, binary: Affine, form: Affine) -> Affine:
+        """A variable that equals a binary variable times a form (McCormick; exact)."""
+        low, high = self.bounds(form)
+        found = self.variable(min(low, 0.0), max(high, 0.0))
+        self.require(found.plus(binary, -low))
+        self.require(binary.times(high).plus(found, -1.0))
+        self.require(form.plus(found, -1.0).plus(binary, low).plus(constant(-low)))
+        self.require(found.plus(form, -1.0).plus(binary, -high).plus(constant(high)))
+        return found
+
+    def imply(self, off: Affine, tree: Tree) -> None:
+        """Require a condition wherever `off`, which is a whole number from 0 on, is 0."""
+        if isinstance(tree, bool):
+            if not tree:
+                self.require(off, 1.0)
+        elif isinstance(tree, Leaf):
+            needed = tree.form.plus(tree.margin, -1.0)
+            low, _ = self.bounds(needed)
+            if low < 0.0:
+                self.require(needed.plus(off, -low) if off.terms else needed.plus(off, 0.0))
+        elif tree.op == "and":
+            for item in tree.items:
+                self.imply(off, item)
+        else:
+            total = off
+            for item in tree.items:
+                total = total.plus(self.literal(item))
+            self.require(total, 1.0)
+
+    def literal(self, tree: Leaf | Junction | bool) -> Affine:
+        """A binary variable that implies a condition; one per condition."""
+        if isinstance(tree, bool):
+            return constant(float(tree))
+        if tree.literal is None:
+            binary = self.binary()
+            (tree.literal,) = binary.terms
+            self.imply(Affine({tree.literal: -1.0}, 1.0), tree)
+        return Affine({tree.literal: 1.0}, 0.0)
+
+    def arrays(self, cost: Affine = ZERO) -> Arrays:
+        """The model with a cost to minimise, as arrays."""
+        lengths = [len(terms) for terms, _, _ in self._rows]
+        costs = np.zeros(len(self._lower))
+        for index, value in cost.terms.items():
+            costs[index] = value
+        return Arrays(
+            np.array(self._lower),
+            np.array(self._upper),
+            np.array(self._integer, dtype=bool),
+            np.concatenate(([0], np.cumsum(lengths))).astype(np.int32),
+            np.array([i for terms, _, _ in self._rows for i in terms], dtype=np.int32),
+            np.array([v for terms, _, _ in self._rows for v in terms.values()]),
+            np.array([low for _, low, _ in self._rows]),
+            np.array([high for _, _, high in self._rows]),
+            costs,
+        )

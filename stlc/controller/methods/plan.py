@@ -1,0 +1,67 @@
+"""Planning in closed loop: no training; a planner plans anew whenever the policy is asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from stlc.controller.methods import Method
+from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, planner_named
+from stlc.controller.training.config import ResolvedConfig, base_config
+from stlc.registry import PLANNERS
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import TrainConfig
+    from stlc.rundir import RunDir
+
+
+@dataclass(frozen=True, slots=True)
+class PlanConfig(ResolvedConfig):
+    """Options of a run that plans.
+
+    Attributes:
+        planner: name of the planner.
+        options: its options, as `NAME=VALUE,NAME=VALUE`.
+        seconds: processor time of a plan.
+        evaluations: judged plans of a plan; 0 for no limit.
+    """
+
+    planner: str = PLANNERS.default
+    options: str = ""
+    seconds: float = 0.02
+    evaluations: int = 0
+
+
+class Plan(Method):
+    """Receding-horizon planning: `stlc simulate SPEC --method search`."""
+
+    options = PlanConfig
+
+    def resolve(self, task: Task, config: TrainConfig) -> PlanConfig:
+        """The options of the planner are those of `config.planner`."""
+        found = base_config(task, config, kind=PlanConfig)
+        assert isinstance(found, PlanConfig)
+        asked = config.planner
+        if asked is None:
+            return found
+        options = ",".join(f"{name}={value}" for name, value in asked.options.items())
+        planner_named(asked.name, **asked.options)
+        return replace(
+            found,
+            planner=asked.name,
+            options=options,
+            seconds=asked.seconds,
+            evaluations=asked.evaluations or 0,
+        )
+
+    def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> PlannerPolicy:  # noqa: ARG002
+        """The planner as a policy. Raises UsageError (U101) where it cannot plan for the task."""
+        assert isinstance(config, PlanConfig)
+        given = dict(each.split("=", 1) for each in config.options.split(",") if each)
+        planner = planner_named(config.planner, **given)
+        budget = PlanBudget(config.seconds, config.evaluations or None)
+        return PlannerPolicy(task, planner, budget, seed=config.seed)
+
+
+METHOD = Plan()

@@ -1,0 +1,162 @@
+"""`cem`: the cross-entropy method over plans, or over the parameters of a small policy (Rubinstein 1999).
+
+The paper's settings: `population=10000, elites=100, deviation=1, physical=true, rounds=500` over plans, and
+`over=policy` for navigation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.model.controls import raw_width, squash
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+MOST = 4_000_000
+"""Maximum number of plan entries that are judged at a time."""
+SAME = 1e-5
+"""Change of the elites' mean at which a start has converged; the next round restarts it."""
+
+
+class _Space(Protocol):
+    """What the method samples: vectors that stand for plans."""
+
+    def centre(self, start: Tensor) -> Tensor:
+        """Mean of the first population from initial guesses: (k, T, m) -> (k, d)."""
+
+    def deviation(self, x0: Tensor) -> Tensor:
+        """Standard deviation of the first population: (d,)."""
+
+    def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
+        """Plans of sampled vectors: (k, n), (k, p, d) -> (k, p, T, m)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cem:
+    """Cross-entropy method: a Gaussian is fitted to the most robust of its samples.
+
+    Attributes:
+        population: samples of a round.
+        elites: of which the Gaussian is fitted to this many.
+        deviation: standard deviation of the first population, in half-widths of the control ranges.
+        physical: whether `deviation` is in physical units instead.
+        floor: least standard deviation, in the units of `deviation`.
+        rounds: after which a start is begun anew, at most.
+        over: `plan` samples plans, `policy` the weights of a network with `hidden` ReLU units.
+        hidden: of the network.
+    """
+
+    population: int = 1_000
+    elites: int = 100
+    deviation: float = 0.5
+    physical: bool = False
+    floor: float = 0.01
+    rounds: int = 50
+    over: str = "plan"
+    hidden: int = 16
+
+    def prepare(self, task: Task) -> Solver:
+        """The space to sample. Raises UsageError (U101) for another `over` than `plan` and `policy`."""
+        if self.over not in ("plan", "policy"):
+            raise UsageError(
+                Diagnostic("U101", f"`over={self.over}` of planner `cem` is neither `plan` nor `policy`")
+            )
+        space = _Plans(task, self) if self.over == "plan" else _Policies(task, self)
+        return lambda search: self._run(search, space)
+
+    def _run(self, search: PlanSearch, space: _Space) -> None:
+        entries = search.task.system.horizon * len(search.task.system.control_names) * self.population
+        while len(rows := search.open()):
+            for part in torch.split(rows, max(1, MOST // entries)):
+                self._climb(search, part, space)
+
+    def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
+        """Rounds for some starts, until the last of them has converged or is not open."""
+        mean = space.centre(search.start[rows])
+        wide = space.deviation(search.states[rows]).expand_as(mean).clone()
+        least = wide * self.floor / self.deviation
+        for _ in range(self.rounds):
+            going = torch.isin(rows, search.open()).nonzero()[:, 0]
+            if not len(going):
+                return
+            with search.charged(rows[going]):
+                count = search.affordable(rows[going], self.population)
+                noise = torch.randn(len(going), count, mean.shape[1], generator=search.generator).double()
+                sampled = mean[going, None] + wide[going, None] * noise
+                rho = search.offer(rows[going], space.plans(search.states[rows[going]], sampled))
+                best = torch.nan_to_num(rho, nan=-torch.inf).topk(min(self.elites, count), dim=1).indices
+                chosen = sampled.gather(1, best[..., None].expand(-1, -1, sampled.shape[2]))
+                fitted = chosen.mean(1)
+                same = (fitted - mean[going]).abs().amax(1) <= SAME
+                mean[going] = fitted
+                wide[going] = torch.maximum(chosen.std(1, unbiased=False), least[going])
+            rows, mean, wide, least = (
+                torch.cat((part[going][~same], part[:0])) for part in (rows, mean, wide, least)
+            )
+
+
+class _Plans:
+    """Plans as vectors, (T m,)."""
+
+    def __init__(self, task: Task, how: Cem) -> None:
+        system = task.system
+        low, high = system.control_low.double(), system.control_high.double()
+        unit = torch.ones_like(low) if how.physical else 0.5 * (high - low)
+        self._shape = (task.system.horizon, len(low))
+        self._low, self._high = low, high
+        self._wide = (how.deviation * unit).expand(self._shape).reshape(-1)
+
+    def centre(self, start: Tensor) -> Tensor:
+        return start.flatten(1).clone()
+
+    def deviation(self, x0: Tensor) -> Tensor:  # noqa: ARG002 - the same for all states
+        return self._wide
+
+    def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:  # noqa: ARG002
+        return vectors.view(*vectors.shape[:2], *self._shape).clamp(self._low, self._high)
+
+
+class _Policies:
+    """Weights of a network from the observation to the controls, with one hidden layer, as vectors."""
+
+    def __init__(self, task: Task, how: Cem) -> None:
+        self._task, self._hidden, self._std = task, how.hidden, how.deviation
+        self._inputs, self._outputs = task.system.observed_count, raw_width(task.system.decl.controls)
+        states = task.system.observe(task.sample(1_000, seed=0)).double()
+        self._centre, self._spread = states.mean(0), states.std(0).clamp(min=1e-6)
+
+    def centre(self, start: Tensor) -> Tensor:
+        count = (self._inputs + 1) * self._hidden + (self._hidden + 1) * self._outputs
+        return start.new_zeros(len(start), count)
+
+    def deviation(self, x0: Tensor) -> Tensor:
+        return x0.new_full((1,), self._std)
+
+    def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
+        rows, count = vectors.shape[:2]
+        sizes = (self._inputs, 1, self._outputs, 1)
+        widths = (self._hidden, self._hidden, self._hidden, self._outputs)
+        flat = vectors.flatten(0, 1)
+        lengths = [size * width for size, width in zip(sizes[:2], widths[:2], strict=True)]
+        lengths += [self._hidden * self._outputs, self._outputs]
+        first, shift, last, offset = torch.split(flat, lengths, 1)
+        first = first.view(-1, self._inputs, self._hidden)
+        last = last.view(-1, self._hidden, self._outputs)
+        system, x, actions = self._task.system, x0.repeat_interleave(count, 0), []
+        for _ in range(self._task.system.horizon):
+            seen = (system.observe(x) - self._centre) / self._spread
+            inner = torch.relu(torch.baddbmm(shift[:, None], seen[:, None], first))
+            raw = torch.baddbmm(offset[:, None], inner, last)[:, 0]
+            actions.append(squash(raw, system.decl.controls))
+            x = system.step(x, actions[-1])
+        return torch.stack(actions, 1).view(rows, count, self._task.system.horizon, -1)
+
+
+PLANNER = Cem

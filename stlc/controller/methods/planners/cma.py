@@ -1,0 +1,72 @@
+"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package `cma`; extra `stlc[plan]`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from stlc.diagnostics import Diagnostic, MissingError
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Cma:
+    """CMA-ES with restarts of twice the population (IPOP); controls are scaled to [-1, 1].
+
+    Attributes:
+        sigma: initial standard deviation, in half-widths of the control ranges.
+        population: samples of a generation; 0 for the package's default, 4 + 3 ln(d).
+        diagonal: whether the covariance is diagonal, which is faster for long plans.
+    """
+
+    sigma: float = 0.5
+    population: int = 0
+    diagonal: bool = False
+
+    def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
+        """Load the package. Raises MissingError (R301)."""
+        try:
+            import cma
+        except ModuleNotFoundError:
+            finding = Diagnostic("R301", "planner `cma` needs cma", help=("pip install 'stlc[plan]'",))
+            raise MissingError(finding) from None
+        return partial(self._run, strategy=cma.CMAEvolutionStrategy)
+
+    def _run(self, search: PlanSearch, strategy: Any) -> None:
+        for row in range(len(search.states)):
+            restarts = 0
+            while row in search.open():
+                self._climb(search, row, strategy, restarts)
+                restarts += 1
+
+    def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
+        """One run of the strategy, until it converges or the start is not open."""
+        system, rows = search.task.system, torch.tensor([row])
+        low, high = system.control_low.double(), system.control_high.double()
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        options = {"bounds": [-1.0, 1.0], "verbose": -9, "CMA_diagonal": self.diagonal}
+        options["seed"] = 1 + int(torch.randint(2**31 - 1, (), generator=search.generator))
+        dims = search.start[row].numel()
+        options["popsize"] = (self.population or 4 + int(3 * np.log(dims))) * 2**restarts
+        with search.charged(rows):
+            guess = ((search.start[row] - middle) / half).clamp(-1.0, 1.0).flatten().numpy()
+            if restarts:
+                guess = torch.rand(dims, generator=search.generator).double().mul(2).sub(1).numpy()
+            es = strategy(guess, self.sigma, options)
+        while not es.stop() and row in search.open():
+            with search.charged(rows):
+                asked = es.ask()
+                plans = middle + half * torch.as_tensor(np.array(asked)).view(1, len(asked), -1, len(half))
+                rho = search.offer(rows, plans)[0]
+                cost = torch.nan_to_num(-rho, nan=torch.inf, posinf=1e9, neginf=-1e9)
+                es.tell(asked, cost.tolist())
+
+
+PLANNER = Cma

@@ -1,0 +1,76 @@
+"""`gradient`: gradient steps on the robustness of the plan itself (STL_G of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.dynamics.model.controls import raw_width, squash
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Gradient:
+    """Adam on latent plans, mapped to the control ranges as the policy's outputs are.
+
+    Attributes:
+        objective: `exact`, by the generated adjoint, or `paper`: smooth robustness with tanh switching.
+        steps: after which a start is begun anew from random latent plans.
+        starts: latent plans of each start; the first is 0, the others are drawn.
+        rate: of Adam.
+        slope: backward slope of conditions for `exact`, per unit.
+    """
+
+    objective: str = "exact"
+    steps: int = 50
+    starts: int = 8
+    rate: float = 0.1
+    slope: float = 2.0
+
+    def prepare(self, task: Task) -> Solver:
+        """The objective, without performance terms."""
+        if self.objective == "paper":
+            return partial(self._run, objective=paper_objective(task))
+        gamma = task.system.decl.objective.gamma
+        return partial(self._run, objective=guided_objective(gamma, slope=self.slope, performance_weight=0.0))
+
+    def _run(self, search: PlanSearch, objective: Objective) -> None:
+        first = True
+        while len(rows := search.open()):
+            for part in torch.split(rows, 512):
+                self._descend(search, part, objective, first=first)
+            first = False
+
+    def _descend(self, search: PlanSearch, rows: Tensor, objective: Objective, *, first: bool) -> None:
+        """Gradient steps for some starts, from random latent plans; the `first` time one of them is 0."""
+        task, controls = search.task, search.task.system.decl.controls
+        shape = (len(rows), self.starts, task.system.horizon, raw_width(controls))
+        raw = torch.randn(shape, generator=search.generator)
+        if first:
+            raw[:, 0] = 0.0
+        raw = raw.requires_grad_(True)
+        x0 = search.states[rows].float().repeat_interleave(self.starts, 0)
+        adam = torch.optim.Adam([raw], lr=self.rate)
+        for step in range(self.steps + 1):
+            going = torch.isin(rows, search.open())
+            if not bool(going.any()):
+                return
+            with search.charged(rows[going]):
+                plans = squash(raw, controls)
+                search.offer(rows[going], plans.detach()[going])
+                if step < self.steps:
+                    value = loss(task, objective, x0, plans.flatten(0, 1)).total.sum()
+                    adam.zero_grad(set_to_none=True)
+                    value.backward()  # type: ignore[no-untyped-call]
+                    adam.step()
+
+
+PLANNER = Gradient

@@ -1,0 +1,156 @@
+"""`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018); extra `stlc[plan]`.
+
+For piecewise linear systems, after the big-M encodings of Karaman et al. (2008) and Raman et al. (2014). The
+only planner that can prove that a start is infeasible.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from stlc.compile.backends.milp.encode import Encoding, Requirement
+from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
+from stlc.diagnostics import Diagnostic, MissingError, UsageError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+FOUND, IMPOSSIBLE, UNKNOWN = "found", "impossible", "unknown"
+FINEST = 1e-9
+"""Feasibility tolerance of the solver, well below the margin of the conditions."""
+MOST_RHO = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Milp:
+    """One model per start; a model of all satisfying plans without a solution proves a start infeasible.
+
+    Attributes:
+        gap: relative gap at which the maximisation of robustness ends.
+        prove: whether to prove starts without a plan infeasible, by a second model.
+    """
+
+    gap: float = 1e-3
+    prove: bool = True
+
+    def prepare(self, task: Task) -> Solver:
+        """Encode one start, to learn whether that is possible.
+
+        Raises:
+            UsageError: U101, an expression has no mixed-integer linear form; the finding shows it.
+            MissingError: R301, HiGHS is not installed.
+        """
+        try:
+            import highspy
+        except ModuleNotFoundError:
+            finding = Diagnostic("R301", "planner `milp` needs highspy", help=("pip install 'stlc[plan]'",))
+            raise MissingError(finding) from None
+        for state in task.sample(8, seed=0, dtype=torch.float64):
+            _encoded(task, state, 0.0, tight=True)
+        return partial(self._run, highs=highspy)
+
+    def _run(self, search: PlanSearch, highs: Any) -> None:
+        for row in search.open().tolist():
+            rows = torch.tensor([row])
+            with search.charged(rows):
+                self._solve(search, row, highs)
+            if not len(search.open()):
+                return
+
+    def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
+        """Plan from one start, or prove that there is no plan."""
+        task, state, target = search.task, search.states[row], search.budget.target
+        found, plan = self._solved(task, state, target, search.budget.seconds, highs, tight=True)
+        search.evaluations[row] += 1
+        if plan is not None:
+            search.offer(torch.tensor([row]), plan[None], evaluations=0)
+        elif found == IMPOSSIBLE and self.prove:
+            proof, _ = self._solved(task, state, 0.0, search.budget.seconds, highs, tight=False)
+            search.infeasible[row] = proof == IMPOSSIBLE
+        search.ended[row] = True
+
+    def _solved(
+        self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
+    ) -> tuple[str, Tensor | None]:
+        """Whether a model has a solution, and its plan, (T, m)."""
+        encoding, cost = _encoded(task, state, target, tight=tight)
+        if not encoding.model.feasible:
+            return IMPOSSIBLE, None
+        solver = highs.Highs()
+        options = {"output_flag": False, "threads": 1, "time_limit": seconds, "mip_rel_gap": self.gap}
+        options |= {"mip_feasibility_tolerance": FINEST, "primal_feasibility_tolerance": FINEST}
+        for name, value in options.items():
+            solver.setOptionValue(name, value)
+        solver.passModel(_program(encoding.model.arrays(cost), highs))
+        solver.run()
+        if solver.getModelStatus() == highs.HighsModelStatus.kInfeasible:
+            return IMPOSSIBLE, None
+        if solver.getInfo().primal_solution_status != 2 or not tight:
+            return UNKNOWN, None
+        values = np.array(solver.getSolution().col_value)
+        return FOUND, torch.tensor([[_at(each, values) for each in inputs] for inputs in encoding.controls])
+
+
+def _at(form: Affine, values: Any) -> float:
+    return form.const + sum(factor * float(values[index]) for index, factor in form.terms.items())
+
+
+def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[Encoding, Affine]:
+    """The model of the plans from a state with a robustness of at least `target`, and the cost to minimise.
+
+    Raises:
+        UsageError: U101, an expression has no mixed-integer linear form.
+    """
+    encoding, system = Encoding(tight=tight), task.system
+    step = system.exact_step
+    low, high = system.control_low.tolist(), system.control_high.tolist()
+    bounds = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
+    maximise = math.isinf(target)
+    try:
+        x0 = dict(zip(task.system.names, state.tolist(), strict=True))
+        rho = encoding.model.variable(0.0, MOST_RHO) if maximise else constant(target)
+        factors = [rule.weight / rule.scale for rule in task.rules]
+        wanted = [
+            Requirement(rule.formula, rho.times(1.0 / factor))
+            for rule, factor in zip(task.rules, factors, strict=True)
+        ]
+        trees = encoding.roll(x0, bounds, step.lets, step.next, task.system.horizon, wanted)
+        for tree, factor in zip(trees, factors, strict=True):
+            if maximise:
+                encoding.model.limit(rho, factor * encoding.model.most(tree))
+            encoding.model.imply(ZERO, tree)
+    except UnencodableError as what:
+        finding = Diagnostic(
+            "U101",
+            f"planner `milp` cannot encode {what}",
+            help=("search, cem, cma and gradient plan for any system",),
+        )
+        raise UsageError(finding) from None
+    return encoding, rho.times(-1.0) if maximise else ZERO
+
+
+def _program(arrays: Arrays, highs: Any) -> Any:
+    """The model in the form of the solver."""
+    program, inf = highs.HighsLp(), highs.kHighsInf
+    program.num_col_, program.num_row_ = len(arrays.lower), len(arrays.row_lower)
+    program.col_cost_, program.col_lower_, program.col_upper_ = arrays.cost, arrays.lower, arrays.upper
+    program.row_lower_ = np.where(np.isinf(arrays.row_lower), -inf, arrays.row_lower)
+    program.row_upper_ = np.where(np.isinf(arrays.row_upper), inf, arrays.row_upper)
+    program.a_matrix_.format_ = highs.MatrixFormat.kRowwise
+    program.a_matrix_.start_, program.a_matrix_.index_ = arrays.starts, arrays.indices
+    program.a_matrix_.value_ = arrays.values
+    kinds = highs.HighsVarType.kContinuous, highs.HighsVarType.kInteger
+    program.integrality_ = [kinds[int(each)] for each in arrays.integer]
+    return program
+
+
+PLANNER = Milp

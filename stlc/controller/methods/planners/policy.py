@@ -1,0 +1,42 @@
+"""`policy`: the plans of a trained policy, a run's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stlc.controller.training.run import Run
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyPlans:
+    """The plan that a trained policy selects; one evaluation per start, whatever the budget.
+
+    Attributes:
+        run: folder, number, words or specification of a run, or `latest`.
+        runs: folder of all runs.
+    """
+
+    run: str = "latest"
+    runs: str = "runs"
+
+    def prepare(self, task: Task) -> Solver:
+        """Load the policy. Raises RunError: R101, the run is damaged; U101, it is of another system."""
+        policy = Run.open(self.run, root=Path(self.runs)).policy
+        return partial(self._run, policy=policy.for_task(task))
+
+    def _run(self, search: PlanSearch, policy: Policy) -> None:
+        rows = search.open()
+        with search.charged(rows):
+            search.offer(rows, policy.plan(search.states[rows].float()))
+        search.ended[rows] = True
+
+
+PLANNER = PolicyPlans

@@ -1,0 +1,1 @@
+"""Planning: a plan for each of some given initial states, without training."""

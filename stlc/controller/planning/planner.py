@@ -1,0 +1,295 @@
+"""Planners: a plan for each given initial state of a task, the best so far at any time.
+
+A planner proposes plans; `PlanSearch` judges them exactly in float64, keeps the best of each start, and
+measures time and evaluations against the budget. A planner is one file in
+`stlc.controller.methods.planners`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from time import process_time
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.policies.policy import Policy
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.native import Stop, never
+from stlc.registry import PLANNERS, closest
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+
+SHORT = 64
+"""Evaluations of a plan that continues a prefix."""
+SECONDS = 1.0
+"""Default budget of a start, processor seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanBudget:
+    """Limits of a search for plans; all but `stop` hold for each start by itself.
+
+    Attributes:
+        seconds: processor time, in seconds; a batch shares its time evenly among the starts in it.
+        evaluations: judged plans; None for no limit.
+        target: robustness at which the search of a start ends; inf to maximise until the budget is spent.
+        stop: ends the whole search early; the best plans so far remain.
+    """
+
+    seconds: float = SECONDS
+    evaluations: int | None = None
+    target: float = 0.0
+    stop: Stop = never
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """Plans from given states, judged exactly in float64.
+
+    Attributes:
+        states: initial states, (B, n).
+        plans: the best plan of each, physical units, (B, T, m).
+        rho: its robustness, (B,); -inf where no plan was found whose states stay finite.
+        infeasible: True where the planner proved that no plan satisfies the specification, (B,).
+        seconds: processor time of each start, (B,).
+        evaluations: judged plans of each start, (B,) int64.
+    """
+
+    states: Tensor
+    plans: Tensor
+    rho: Tensor
+    infeasible: Tensor
+    seconds: Tensor
+    evaluations: Tensor
+
+    @property
+    def satisfied(self) -> Tensor:
+        """Mask of the starts whose plan satisfies the specification, (B,)."""
+        return self.rho >= -TOLERANCE
+
+
+class PlanSearch:
+    """The state of a search for plans: the best plan of each start, and what it cost.
+
+    Attributes:
+        task: specification and system.
+        states: initial states, (B, n) float64.
+        budget: limits.
+        generator: random numbers of the planner.
+        start: initial guess, (B, T, m); the middle of every control if none was given.
+        plans: the best plans so far, (B, T, m).
+        rho: their robustness, (B,); -inf before the first plan.
+        infeasible: starts from which no plan satisfies the specification, proved, (B,).
+        ended: starts for which the planner has nothing more to try, (B,).
+        seconds: processor time so far, (B,).
+        evaluations: judged plans so far, (B,) int64.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        states: Tensor,
+        budget: PlanBudget,
+        *,
+        seed: int = 0,
+        start: Tensor | None = None,
+        progress: Callable[[PlanSearch], None] | None = None,
+    ) -> None:
+        self.task, self.budget = task, budget
+        self.states = states.double()
+        self.generator = torch.Generator().manual_seed(seed)
+        middle = 0.5 * (task.system.control_low + task.system.control_high).double()
+        blank = middle.expand(len(states), task.system.horizon, -1) if start is None else start.double()
+        self.start, self.plans = blank, blank.clone()
+        self.rho = torch.full((len(states),), -torch.inf, dtype=torch.float64)
+        self.infeasible = torch.zeros(len(states), dtype=torch.bool)
+        self.ended = torch.zeros(len(states), dtype=torch.bool)
+        self.seconds = torch.zeros(len(states), dtype=torch.float64)
+        self.evaluations = torch.zeros(len(states), dtype=torch.int64)
+        self._progress = progress
+
+    @property
+    def result(self) -> PlanResult:
+        """The best plans so far."""
+        return PlanResult(self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
+
+    def open(self) -> Tensor:
+        """Indices of the starts to go on with, (k,): below the target, within the budget, not ended."""
+        if self.budget.stop():
+            return torch.zeros(0, dtype=torch.int64)
+        target = min(self.budget.target - TOLERANCE, torch.inf)
+        going = (self.rho < target) & ~self.infeasible & ~self.ended & (self.seconds < self.budget.seconds)
+        if self.budget.evaluations is not None:
+            going &= self.evaluations < self.budget.evaluations
+        return going.nonzero()[:, 0]
+
+    def affordable(self, rows: Tensor, most: int) -> int:
+        """Evaluations per start that the budget of all `rows` leaves, at most `most`, at least 1."""
+        left = float(most)
+        if self.budget.evaluations is not None:
+            left = min(left, self.budget.evaluations - int(self.evaluations[rows].max()))
+        spent, judged = float(self.seconds[rows].sum()), int(self.evaluations[rows].sum())
+        if judged and spent:
+            left = min(left, (self.budget.seconds - float(self.seconds[rows].max())) * judged / spent)
+        return max(1, int(left))
+
+    def offer(self, rows: Tensor, plans: Tensor, *, evaluations: int | None = None) -> Tensor:
+        """Judge plans and keep those that are better than the best so far.
+
+        Args:
+            rows: indices of the starts, (k,).
+            plans: physical units, (k, T, m), or several of each start, (k, p, T, m); clipped to the bounds.
+            evaluations: to count for each start, if the planner judged others; by default those judged here.
+
+        Returns:
+            Robustness of the plans, (k,) or (k, p).
+        """
+        each = plans[:, None] if plans.dim() == 3 else plans
+        system = self.task.system
+        each = each.double().clamp(system.control_low.double(), system.control_high.double())
+        count = each.shape[1]
+        x0 = self.states[rows].repeat_interleave(count, 0)
+        rho = self.task.judge(x0, each.flatten(0, 1), states=False).rho.view(-1, count)
+        value, which = rho.max(1)
+        better = (value > self.rho[rows]).nonzero()[:, 0]
+        self.rho[rows[better]] = value[better]
+        self.plans[rows[better]] = each[better, which[better]]
+        self.evaluations[rows] += count if evaluations is None else evaluations
+        return rho if plans.dim() == 4 else rho[:, 0]
+
+    @contextmanager
+    def charged(self, rows: Tensor) -> Iterator[None]:
+        """Charge the processor time of the block to the starts `rows`, (k,), evenly, and report progress."""
+        before = process_time()
+        try:
+            yield
+        finally:
+            self.seconds[rows] += (process_time() - before) / max(1, len(rows))
+        if self._progress is not None:
+            self._progress(self)
+
+
+Solver: TypeAlias = Callable[[PlanSearch], None]
+"""Improves the plans of a search until no start is open."""
+
+
+class Planner(Protocol):
+    """A planner: a dataclass whose fields are its options."""
+
+    def prepare(self, task: Task) -> Solver:
+        """Prepare the planner for a task, once for all starts.
+
+        Raises:
+            UsageError: U101, the planner cannot plan for this task; the finding says why.
+            MissingError: R301, a package is missing.
+        """
+
+
+def planner_named(name: str, **options: Any) -> Planner:
+    """The planner `name` with the given options.
+
+    Args:
+        name: of a file in `stlc.controller.methods.planners`.
+        options: fields of the planner; values may be texts, as on a command line.
+
+    Raises:
+        UsageError: U101, there is no such planner or option, or the value does not fit.
+    """
+    kind = PLANNERS.get(name)
+    known = {each.name: each for each in fields(kind)}
+    values = {}
+    for key, value in options.items():
+        if key not in known:
+            near = closest(key, known)
+            listed = f"options: {', '.join(known)}" if known else "it has none"
+            advice = listed if near is None else f"did you mean `{near}`?  {listed}"
+            raise UsageError(Diagnostic("U101", f"planner `{name}` has no option `{key}`", help=(advice,)))
+        values[key] = _value(name, key, value, type(known[key].default))
+    planner: Planner = kind(**values)
+    return planner
+
+
+def _value(name: str, key: str, value: object, kind: type) -> Any:
+    """An option's value, converted from text."""
+    if not isinstance(value, str) or kind is str:
+        return value
+    try:
+        if kind is bool:
+            return {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}[value]
+        return kind(value)
+    except (ValueError, KeyError):
+        wanted = {bool: "`true` or `false`", int: "a whole number"}.get(kind, "a number")
+        message = f"option `{key}` of planner `{name}` is {wanted}, not `{value}`"
+        raise UsageError(Diagnostic("U101", message)) from None
+
+
+def plan(
+    task: Task,
+    x0: Tensor,
+    method: str = "search",
+    *,
+    budget: PlanBudget | None = None,
+    seed: int = 0,
+    start: Tensor | None = None,
+    progress: Callable[[PlanSearch], None] | None = None,
+    **options: Any,
+) -> PlanResult:
+    """Plan from given states, without training.
+
+    Args:
+        task: specification and system.
+        x0: initial states, (B, n) or (n,), in the order of `task.system.names`.
+        method: name of a planner.
+        budget: limits per start; by default `SECONDS` of processor time.
+        seed: of the planner's random numbers.
+        start: initial guess, (B, T, m).
+        progress: called with the search after each round.
+        options: of the planner.
+
+    Returns:
+        The best plans, judged exactly in float64.
+
+    Raises:
+        UsageError: U101, there is no such planner or option, or it cannot plan for this task.
+        MissingError: R301, the planner needs a package that is not installed.
+    """
+    solver = planner_named(method, **options).prepare(task)
+    given = torch.as_tensor(x0, dtype=torch.float64)
+    states = given if given.dim() == 2 else given[None]
+    search = PlanSearch(task, states, budget or PlanBudget(), seed=seed, start=start, progress=progress)
+    solver(search)
+    return search.result
+
+
+class PlannerPolicy(Policy):
+    """A planner as a policy: it plans anew from each state, within its budget."""
+
+    def __init__(self, task: Task, planner: Planner, budget: PlanBudget, *, seed: int = 0) -> None:
+        super().__init__(task)
+        self._planner, self._budget, self._seed = planner, budget, seed
+        self._prepared = task, planner.prepare(task)
+        self._short: tuple[Task, Solver] | None = None
+
+    def candidates(self, x0: Tensor) -> Tensor:
+        """The best plan found from each state: (B, n) -> (B, 1, T, m)."""
+        if self._prepared[0] is not self.task:
+            self._prepared = self.task, self._planner.prepare(self.task)
+        return self._searched(x0, self._prepared[1], self._budget)
+
+    def continuation(self, x0: Tensor) -> Tensor:
+        """Plans by a short local search, whatever the planner: (B, n) -> (B, T, m)."""
+        if self._short is None or self._short[0] is not self.task:
+            self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
+        return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]
+
+    def _searched(self, x0: Tensor, solver: Solver, budget: PlanBudget) -> Tensor:
+        search = PlanSearch(self.task, x0, budget, seed=self._seed)
+        with torch.enable_grad():
+            solver(search)
+        return search.plans.to(x0.dtype)[:, None]

@@ -1,0 +1,116 @@
+"""The mixed-integer encoding against many plans: no proof is contradicted, every solution is a plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.problem.task import Task
+from stlc.diagnostics import UsageError
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
+
+pytest.importorskip("highspy")
+
+SYSTEM = """
+stlc: 1
+name: cart
+time: {dt: 1 s, horizon: 5 steps, integrator: euler, substeps: 1}
+state:
+  p: {range: [-4, 4]}
+  v: {range: [-2, 2], clamp: true}
+  n: {range: [0, 9]}
+control:
+  a: {range: [-1, 1]}
+flow:
+  p: v
+  v: a
+  n: ind(p > 1)
+jump:
+  - {name: bounce, guard: p > 3, reset: {v: -v}}
+init:
+  mixture:
+    - {name: any, draw: {p: "uniform(-3, 3)", v: "uniform(-2, 2)", n: 0}}
+"""
+
+_numbers = st.integers(-12, 12).map(lambda n: n / 4)
+_linear = st.sampled_from(
+    ["p", "v", "p + v", "p - 0.5 * v", "abs(p)", "max(p, v)", "min(p, -v)", "n - 2", "clip(p, -1, 1)"]
+)
+_atoms = (
+    st.builds("{} > {}".format, _linear, _numbers)
+    | st.builds("{} <= {}".format, _linear, _numbers)
+    | st.builds("abs(p - {}) < {}".format, _numbers, st.sampled_from([0.25, 0.5, 1]))
+    | st.builds("(p - {0}) * (p - {0} - 1) > 0".format, _numbers)
+    | st.builds("p^2 + 4 * v^2 < {}".format, st.sampled_from([1, 4]))
+    | st.builds("norm(p, v) > {}".format, st.sampled_from([0.5, 2]))
+)
+
+
+def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    window = st.sampled_from(["[0 s, 5 s]", "[1 s, 3 s]", "[2 s, 2 s]"])
+    short = _atoms | st.builds("({} and {})".format, _atoms, _atoms)
+    return (
+        st.builds("({} {} {})".format, inner, st.sampled_from(["and", "or", "->"]), inner)
+        | st.builds("{}{} {}".format, st.sampled_from(["always", "eventually"]), window, short)
+        | st.builds("({} until{} {})".format, short, window, short)
+        | st.builds("not {}".format, inner)
+        | st.builds("always[0 s, 3 s] (eventually[0 s, 2 s] {})".format, short)
+        | st.builds("eventually[0 s, 5 s] (once[0 s, 1 s] {})".format, short)
+    )
+
+
+formulas = st.recursive(_atoms, _grown, max_leaves=4)
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory: pytest.TempPathFactory) -> System:
+    path: Path = tmp_path_factory.mktemp("cart") / "cart.yaml"
+    path.write_text(SYSTEM)
+    return System.load(path)
+
+
+def task_of(system: System, text: str) -> Task:
+    return Task.of(parse(Source("cart.stl", f"signal p, v, n\nrequire r: {text}")), system)
+
+
+def tried(task: Task, x0: torch.Tensor) -> torch.Tensor:
+    """Robustness of the best of many plans, (B,): each control at an end or the middle, or random."""
+    task.__dict__["native"] = None  # no C is built for every formula
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0]).double()] * 5)
+    drawn = 2.0 * torch.rand(1_000, 5, generator=torch.Generator().manual_seed(0)).double() - 1.0
+    plans = torch.cat((corners, drawn))[..., None]
+    each = [task.judge(state.expand(len(plans), -1), plans, states=False).rho.max() for state in x0]
+    return torch.stack(each)
+
+
+@given(text=formulas)
+@settings(max_examples=60, deadline=None)
+def test_proofs_and_plans_agree_with_trial(cart: System, text: str) -> None:
+    task = task_of(cart, text)
+    x0 = task.sample(3, seed=0, dtype=torch.float64)
+    best = tried(task, x0)
+    encoded = plan(task, x0, "milp", budget=PlanBudget(5.0))
+    assert not bool(((best >= 0.0) & encoded.infeasible).any()), text
+    clear = (best > 0.01) & ("norm" not in text and "^2" not in text)
+    assert bool((encoded.satisfied | ~clear).all()), text
+
+
+def test_the_greatest_robustness_is_found(cart: System) -> None:
+    """From rest the cart reaches p = 0 + 1 + 2 + 2 + ... under full acceleration."""
+    task = task_of(cart, "eventually[0 s, 3 s] p > 1")
+    x0 = torch.zeros(1, 3, dtype=torch.float64)
+    found = plan(task, x0, "milp", budget=PlanBudget(5.0, target=torch.inf))
+    assert float(found.rho) == pytest.approx(2.0, abs=1e-3)  # p(3) = 0 + 0 + 1 + 2
+    assert plan(task_of(cart, "eventually[0 s, 3 s] p > 3.5"), x0, "milp").infeasible.tolist() == [True]
+
+
+def test_an_expression_that_is_not_linear_is_named(cart: System) -> None:
+    with pytest.raises(UsageError, match=r"cannot encode p \* v"):
+        plan(task_of(cart, "always[0 s, 5 s] p * v < 1"), torch.zeros(1, 3), "milp")

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import stlc
+from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
+from stlc.controller.planning.record import trace_of
+from stlc.controller.planning.starts import starts_of
+from stlc.controller.problem.task import Task
+from stlc.diagnostics import UsageError
+from stlc.monitor.verdict import Monitor
+from stlc.registry import PLANNERS
+from stlc.trace import load_trace, save_trace
+
+NEEDS = {"cma": "cma", "milp": "highspy", "mpc": "casadi"}
+QUICK = {"cem": {"population": 50, "elites": 10}, "gradient": {"steps": 5, "starts": 2}}
+
+
+@pytest.fixture(params=[name for name in PLANNERS.names if name != "policy"])
+def planner(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    return name
+
+
+def planned(task: Task, name: str, x0: torch.Tensor, evaluations: int = 300) -> stlc.PlanResult:
+    return plan(task, x0, name, budget=PlanBudget(5.0, evaluations), **QUICK.get(name, {}))
+
+
+def test_plans_are_judged_exactly_and_within_bounds(car_task: Task, planner: str) -> None:
+    x0 = car_task.sample(4, seed=3, dtype=torch.float64)
+    if planner == "mpc":  # a planner for smooth systems
+        with pytest.raises(UsageError, match="cannot"):
+            planned(car_task, planner, x0)
+        return
+    found = planned(car_task, planner, x0)
+    done = torch.isfinite(found.rho)
+    assert bool(done.any())
+    rho = car_task.judge(x0[done], found.plans[done]).rho
+    assert torch.equal(rho, found.rho[done])
+    system = car_task.system
+    assert bool((found.plans >= system.control_low).all() & (found.plans <= system.control_high).all())
+    assert bool((found.evaluations > 0).all())
+
+
+def test_the_same_seed_gives_the_same_plans(car_task: Task) -> None:
+    x0 = car_task.sample(3, seed=5, dtype=torch.float64)
+    for name in ("search", "cem", "gradient"):
+        first, second = planned(car_task, name, x0), planned(car_task, name, x0)
+        assert torch.equal(first.plans, second.plans), name
+
+
+def test_evaluations_are_a_limit_and_a_target_ends_the_search(car_task: Task) -> None:
+    x0 = car_task.sample(2, seed=1, dtype=torch.float64)
+    most = plan(car_task, x0, "cem", budget=PlanBudget(5.0, 120, torch.inf), population=50, elites=10)
+    assert most.evaluations.tolist() == [120, 120]
+    few = plan(car_task, x0, "search", budget=PlanBudget(5.0))
+    assert bool(few.satisfied.all())
+    stopped = plan(car_task, x0, "search", budget=PlanBudget(5.0, stop=lambda: True))
+    assert stopped.evaluations.tolist() == [0, 0]
+    assert not bool(stopped.satisfied.any())
+
+
+def test_a_plan_is_a_trace_that_the_monitor_judges_alike(car_task: Task, tmp_path: Path) -> None:
+    x0 = car_task.sample(5, seed=2, dtype=torch.float64)
+    found = planned(car_task, "search", x0)
+    save_trace(tmp_path / "plan.npz", trace_of(car_task, found, 2))
+    trace = load_trace(tmp_path / "plan.npz")
+    verdict = Monitor(car_task.compiled.spec).check(trace)
+    assert verdict.satisfied == bool(found.satisfied.all())
+    assert np.allclose(trace.extras["plan_rho"], found.rho.numpy())
+
+
+def test_starts_are_drawn_written_or_recorded(car_task: Task, tmp_path: Path) -> None:
+    given = starts_of(car_task, "x=-5, v = 36 km/h, sign=light", 2, 0)
+    names = car_task.system.names
+    assert given[:, names.index("x")].tolist() == [-5.0, -5.0]
+    assert given[:, names.index("v")].tolist() == [10.0, 10.0]
+    assert given[:, names.index("sign")].tolist() == [1.0, 1.0]
+    found = planned(car_task, "search", given)
+    save_trace(tmp_path / "plan.npz", trace_of(car_task, found))
+    assert torch.equal(starts_of(car_task, str(tmp_path / "plan.npz"), None, 0), given)
+    assert starts_of(car_task, "random", 3, 0).shape == (3, len(names))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("vv=1", "has no state `vv`"),
+        ("v=fast", "not of the form NAME=NUMBER"),
+        ("nowhere.npz", "there is no file `nowhere.npz`"),
+    ],
+)
+def test_starts_that_make_no_sense(car_task: Task, text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        starts_of(car_task, text, None, 0)
+
+
+def test_options_are_checked(planner: str) -> None:
+    kind = PLANNERS.get(planner)
+    assert all(type(each.default) in (bool, int, float, str) for each in fields(kind))
+    with pytest.raises(UsageError, match="has no option `nonsense`"):
+        planner_named(planner, nonsense="1")
+    with pytest.raises(UsageError, match="a whole number, not `many`"):
+        planner_named("cem", population="many")
+    assert planner_named("cem", physical="true", population="7") == planner_named(
+        "cem", physical=True, population=7
+    )
+    with pytest.raises(UsageError, match="unknown planner `serach`"):
+        planner_named("serach")
+
+
+def test_a_planner_is_a_policy(car_task: Task) -> None:
+    policy = PlannerPolicy(car_task, planner_named("search"), PlanBudget(torch.inf, 500))
+    x0 = car_task.sample(6, seed=4)
+    plans, judged = policy.plan_judged(x0)
+    assert plans.dtype == x0.dtype
+    assert float((judged.rho >= -1e-5).double().mean()) >= 0.8
+    assert policy.continuation(x0.repeat(50, 1)).shape == (300, car_task.system.horizon, 1)
+
+
+def test_progress_is_reported(car_task: Task) -> None:
+    seen: list[int] = []
+    x0 = car_task.sample(3, seed=0)
+
+    def note(search: PlanSearch) -> None:
+        seen.append(int(search.evaluations.sum()))
+
+    plan(car_task, x0, "search", budget=PlanBudget(5.0, 4_000, torch.inf), progress=note)
+    assert seen == sorted(seen)
+    assert len(seen) >= 2
