@@ -29,17 +29,17 @@ from stlc.cli.framework.program import command
 from stlc.controller.guard.margins import AUTO
 
 TEXT = """\
-Written by `python -m benchmarks disturbed` from `benchmarks/results/disturbed.json`. Each policy is driven
-as it is and in worlds that are not as its model says (the scenarios of every system), from the same starts:
-without a guard, with the paper's backup policy, with the full guard, and with a full guard that asks safety
-requirements for the robustness margin that is measured there (`--margin auto`). `safe agents` is the share
-of the viable agents which were safe all the time, `safe starts` the share of their instants from which what
-was driven was safe through the window, `satisfied` that of all instants from which it satisfied the
+Written by `python -m benchmarks disturbed` from `benchmarks/results/disturbed.json`. Each policy is simulated
+as it is and under the scenarios of its system, in which the model is wrong, from the same starts: without a
+guard, with the paper's backup policy, with the full guard, and with a full guard that requests the robustness
+margin measured under the scenario (`--margin auto`) of safety requirements. `safe agents` is the share of the
+viable agents that were safe all the time, `safe starts` the share of their instants from which the executed
+trajectory was safe through the window, `satisfied` the share of all instants from which it satisfied the
 specification. Means over deployment seeds with half of their 95 % intervals (Student's t).
 """
 WITHOUT_EVENTS = """\
-Where agents are driven unsafely though the model is right and the full guard acts, the world does what no
-plan accounts for. Of the starts through whose window there was no exogenous event:
+Where agents violate safety although the model is exact and the full guard acts, the cause is an exogenous event
+that no plan accounts for. Results for the starts whose window contains no exogenous event:
 """
 MOST = 0.95
 """Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""

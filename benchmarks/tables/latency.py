@@ -31,8 +31,8 @@ TEXT = """## A decision
 
 Written by `python -m benchmarks latency`. Milliseconds that one decision for one agent takes on one thread,
 in states that are spread evenly over deployments under the paper's guard, and where the guard replaced the
-policy's plan. `policy`: its plan, rollout and verdict. With a guard (also `none`): the verdict on the
-previous plan as well, the choice where the world leaves one (of five stations), and what is tried instead.
+policy's plan. `policy`: its plan, rollout and verdict. A guard (also `none`) adds the verdict on the previous
+plan, the choice among options if the world offers several (five stations), and the search for other plans.
 """
 POLICY = "policy"
 _OUTPUT = Output()

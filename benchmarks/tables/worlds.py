@@ -30,11 +30,11 @@ from stlc.controller.training.run import Run
 TEXT = """\
 Written by `python -m benchmarks worlds` from `benchmarks/results/worlds.json`: one policy for each
 specification, the most accurate of `python -m benchmarks paper`, in its world. `share of feasible` is the
-share of visited states with a known satisfying plan, the followed one or one that a search of up to 80,000
-plans finds, whose followed plan satisfies the specification. `viable` agents were driven safely, or a
-search finds a plan from their start that is safe through the horizon. `model-consistent` are starts from
-which the world did as the model says through the window; some worlds never do. Means over deployment seeds
-with half of their 95 % intervals (Student's t).
+share of satisfying plans among those followed in visited states for which a satisfying plan is known (the
+followed plan, or one that a search of up to 80,000 plans finds). `viable` agents were driven safely, or a
+search finds a plan from their start that is safe through the horizon. From `model-consistent` starts the world
+followed the model through the window; some worlds have none. Means over deployment seeds with half of their
+95 % intervals (Student's t).
 """
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
