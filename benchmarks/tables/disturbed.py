@@ -38,8 +38,8 @@ trajectory was safe through the window, `satisfied` the share of all instants fr
 specification. Means over deployment seeds with half of their 95 % intervals (Student's t).
 """
 WITHOUT_EVENTS = """\
-Where agents violate safety although the model is exact and the full guard acts, the cause is an exogenous event
-that no plan accounts for. Results for the starts whose window contains no exogenous event:
+Where agents violate safety although the model is exact and the full guard acts, the cause is an exogenous
+event that no plan accounts for. Results for the starts whose window contains no exogenous event:
 """
 MOST = 0.95
 """Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""

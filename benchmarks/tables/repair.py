@@ -23,10 +23,10 @@ from stlc.controller.training.run import Run
 TEXT = """## Repair of a plan
 
 Written by `python -m benchmarks repair`: states of deployments under the paper's guard in which neither the
-policy's plan nor the previous one satisfies the specification. `repaired` counts the states for which a method
-finds a satisfying plan, among those for which any method or a search finds one; `safe` counts the same for the
-requirements tagged `@safety`. Milliseconds of processor time for one agent on one thread. A local search tries
-2,000 plans from each of the two rejected plans, a long one 32,000.
+policy's plan nor the previous one satisfies the specification. `repaired` counts the states for which a
+method finds a satisfying plan, among those for which any method or a search finds one; `safe` counts the
+same for the requirements tagged `@safety`. Milliseconds of processor time for one agent on one thread. A
+local search tries 2,000 plans from each of the two rejected plans, a long one 32,000.
 """
 _OUTPUT = Output()
 

@@ -32,9 +32,9 @@ Written by `python -m benchmarks worlds` from `benchmarks/results/worlds.json`: 
 specification, the most accurate of `python -m benchmarks paper`, in its world. `share of feasible` is the
 share of satisfying plans among those followed in visited states for which a satisfying plan is known (the
 followed plan, or one that a search of up to 80,000 plans finds). `viable` agents were driven safely, or a
-search finds a plan from their start that is safe through the horizon. From `model-consistent` starts the world
-followed the model through the window; some worlds have none. Means over deployment seeds with half of their
-95 % intervals (Student's t).
+search finds a plan from their start that is safe through the horizon. From `model-consistent` starts the
+world followed the model through the window; some worlds have none. Means over deployment seeds with half of
+their 95 % intervals (Student's t).
 """
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
