@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from enum import IntEnum
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Any, assert_never
+from typing import Any
 
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN, RESERVED
@@ -64,33 +64,9 @@ def show_expr(expr: ast.Expr) -> str:
     return _SHOWN[type(expr)](expr)
 
 
-def _atom(expr: ast.Quantity | ast.String | ast.Bool | ast.Inf | ast.Name) -> str:
-    match expr:
-        case ast.Quantity(value=value, unit=unit):
-            written = "step" if unit == "steps" and value == 1 else unit
-            return _number(value) + (f" {written}" if written else "")
-        case ast.String(value=text):
-            return f'"{text}"'
-        case ast.Bool(value=truth):
-            return "true" if truth else "false"
-        case ast.Inf():
-            return "inf"
-        case ast.Name(name=name, quoted=quoted):
-            return f"`{name}`" if quoted and name in BUILT_IN else show_name(name)
-        case _:
-            assert_never(expr)
-
-
-def _postfix(expr: ast.Index | ast.Attr | ast.Call) -> str:
-    match expr:
-        case ast.Index(base=base, index=index):
-            return f"{_base(base)}[{show_expr(index)}]"
-        case ast.Attr(base=base, name=name):
-            return f"{_base(base)}.{show_name(name)}"
-        case ast.Call(func=func, args=args):
-            return f"{_base(func)}({show_args(args)})"
-        case _:
-            assert_never(expr)
+def _quantity(expr: ast.Quantity) -> str:
+    unit = "step" if expr.unit == "steps" and expr.value == 1 else expr.unit
+    return _number(expr.value) + (f" {unit}" if unit else "")
 
 
 def _base(expr: ast.Expr) -> str:
@@ -98,58 +74,38 @@ def _base(expr: ast.Expr) -> str:
     return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
 
 
-def _has_unit(expr: ast.Expr) -> bool:
-    return isinstance(expr, ast.Quantity) and bool(expr.unit)
+def _binary(expr: ast.Binary) -> str:
+    if expr.op == "^":
+        measured = isinstance(expr.left, ast.Quantity) and bool(expr.left.unit)
+        base = f"({show_expr(expr.left)})" if measured else show_at(expr.left, Level.POSTFIX)
+        return f"{base}^{show_at(expr.right, Level.SIGN)}"
+    level = _ARITHMETIC[expr.op]
+    return f"{show_at(expr.left, level)} {expr.op} {show_at(expr.right, Level(level + 1))}"
 
 
-def _arithmetic(expr: ast.Neg | ast.Binary | ast.Compare | ast.Member) -> str:
-    match expr:
-        case ast.Neg(operand=operand):
-            return f"-{show_at(operand, Level.SIGN)}"
-        case ast.Binary(op="^", left=left, right=right):
-            base = f"({show_expr(left)})" if _has_unit(left) else show_at(left, Level.POSTFIX)
-            return f"{base}^{show_at(right, Level.SIGN)}"
-        case ast.Binary(op=op, left=left, right=right):
-            level = _ARITHMETIC[op]
-            return f"{show_at(left, level)} {op} {show_at(right, Level(level + 1))}"
-        case ast.Compare(operands=operands, ops=ops):
-            first, *rest = (show_at(operand, Level.SUM) for operand in operands)
-            return first + "".join(f" {op} {operand}" for op, operand in zip(ops, rest, strict=True))
-        case ast.Member(item=item, region=region, negated=negated):
-            place = show_set(region) if isinstance(region, ast.SetLiteral) else show_at(region, Level.SUM)
-            return f"{show_at(item, Level.SUM)} {'not in' if negated else 'in'} {place}"
-        case _:
-            assert_never(expr)
+def _compare(expr: ast.Compare) -> str:
+    first, *rest = (show_at(operand, Level.SUM) for operand in expr.operands)
+    return first + "".join(f" {op} {operand}" for op, operand in zip(expr.ops, rest, strict=True))
 
 
-def _logic(expr: ast.Not | ast.Logic) -> str:
-    match expr:
-        case ast.Not(operand=operand):
-            return f"not {show_at(operand, Level.PREFIX)}"
-        case ast.Logic(op="->", left=left, right=right):
-            return f"{show_at(left, Level.OR)} -> {show_at(right, Level.IMPLIES)}"
-        case ast.Logic(op=op, left=left, right=right):
-            level = _LOGIC[op]
-            return f"{show_at(left, level)} {op} {show_at(right, Level(level + 1))}"
-        case _:
-            assert_never(expr)
+def _member(expr: ast.Member) -> str:
+    region = expr.region
+    place = show_set(region) if isinstance(region, ast.SetLiteral) else show_at(region, Level.SUM)
+    return f"{show_at(expr.item, Level.SUM)} {'not in' if expr.negated else 'in'} {place}"
+
+
+def _logic(expr: ast.Logic) -> str:
+    level = _LOGIC[expr.op]
+    left, right = (Level.OR, level) if expr.op == "->" else (level, Level(level + 1))
+    return f"{show_at(expr.left, left)} {expr.op} {show_at(expr.right, right)}"
 
 
 def _temporal(expr: ast.Temporal | ast.Until) -> str:
+    """Return a temporal operator; a vector behind it gets parentheses, as `[a, b]` is an interval."""
     interval = "" if expr.interval is None else show_interval(expr.interval)
-    match expr:
-        case ast.Temporal(op=op, body=body):
-            return f"{op}{interval} {_body(body, interval)}"
-        case ast.Until(op=op, left=left, right=right):
-            return f"{show_at(left, Level.PREFIX)} {op}{interval} {_body(right, interval)}"
-        case _:
-            assert_never(expr)
-
-
-def _body(expr: ast.Expr, interval: str) -> str:
-    """Return the operand of a temporal operator; a vector gets parentheses: `[a, b]` is an interval."""
-    text = show_at(expr, Level.PREFIX)
-    return f"({text})" if text.startswith("[") and not interval else text
+    left = f"{show_at(expr.left, Level.PREFIX)} " if isinstance(expr, ast.Until) else ""
+    body = show_at(expr.right if isinstance(expr, ast.Until) else expr.body, Level.PREFIX)
+    return f"{left}{expr.op}{interval} {f'({body})' if body.startswith('[') and not interval else body}"
 
 
 def show_interval(interval: ast.Interval) -> str:
@@ -159,39 +115,37 @@ def show_interval(interval: ast.Interval) -> str:
     return f"{clock}{opening}{show_expr(interval.lo)}, {show_expr(interval.hi)}{closing}"
 
 
-def _binder(expr: ast.Quantifier | ast.Freeze | ast.IfThenElse) -> str:
-    match expr:
-        case ast.Quantifier(kind=kind, var=var, domain=domain, body=body):
-            return f"{kind} {own_name(var)} in {_span(domain)}: {show_at(body, Level.PREFIX)}"
-        case ast.Freeze(bindings=bindings, body=body):
-            bound = ", ".join(f"{own_name(name)} = {show_at(value, Level.SUM)}" for name, value in bindings)
-            return f"freeze {bound} in {show_at(body, Level.PREFIX)}"
-        case ast.IfThenElse(cond=cond, yes=yes, no=no):
-            return f"if {show_expr(cond)} then {show_expr(yes)} else {show_at(no, Level.PREFIX)}"
-        case _:
-            assert_never(expr)
+def _quantifier(expr: ast.Quantifier) -> str:
+    if isinstance(expr.domain, ast.SetLiteral):
+        domain = show_set(expr.domain)
+    else:
+        domain = "..".join(show_at(end, Level.SUM) for end in expr.domain)
+    return f"{expr.kind} {own_name(expr.var)} in {domain}: {show_at(expr.body, Level.PREFIX)}"
 
 
-def _span(domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral) -> str:
-    if isinstance(domain, ast.SetLiteral):
-        return show_set(domain)
-    low, high = domain
-    return f"{show_at(low, Level.SUM)}..{show_at(high, Level.SUM)}"
+def _freeze(expr: ast.Freeze) -> str:
+    bound = ", ".join(f"{own_name(name)} = {show_at(value, Level.SUM)}" for name, value in expr.bindings)
+    return f"freeze {bound} in {show_at(expr.body, Level.PREFIX)}"
+
+
+def _if(expr: ast.IfThenElse) -> str:
+    cond, yes = show_expr(expr.cond), show_expr(expr.yes)
+    return f"if {cond} then {yes} else {show_at(expr.no, Level.PREFIX)}"
 
 
 def show_args(args: tuple[ast.Arg, ...]) -> str:
-    """Arguments, without the parentheses around them."""
+    """Return the arguments of a call, without parentheses."""
     named = (f"{show_name(arg.name)} = " if arg.name is not None else "" for arg in args)
     return ", ".join(prefix + show_expr(arg.value) for prefix, arg in zip(named, args, strict=True))
 
 
 def show_set(literal: ast.SetLiteral) -> str:
-    """A set in braces."""
+    """Return a set in braces."""
     return f"{{{show_list(literal.items)}}}"
 
 
 def show_list(items: tuple[ast.Expr, ...]) -> str:
-    """Expressions with commas between them."""
+    """Return expressions separated by commas."""
     return ", ".join(map(show_expr, items))
 
 
@@ -208,13 +162,25 @@ _LEVELS: Mapping[type, Level] = MappingProxyType(
 
 _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
-        **dict.fromkeys((ast.Quantity, ast.String, ast.Bool, ast.Inf, ast.Name), _atom),
+        ast.Quantity: _quantity,
+        ast.String: lambda expr: f'"{expr.value}"',
+        ast.Bool: lambda expr: "true" if expr.value else "false",
+        ast.Inf: lambda _: "inf",
+        ast.Name: lambda expr: own_name(expr.name) if expr.quoted else show_name(expr.name),
         ast.Vector: lambda expr: f"[{show_list(expr.items)}]",
-        **dict.fromkeys((ast.Index, ast.Attr, ast.Call), _postfix),
-        **dict.fromkeys((ast.Neg, ast.Binary, ast.Compare, ast.Member), _arithmetic),
-        **dict.fromkeys((ast.Not, ast.Logic), _logic),
+        ast.Index: lambda expr: f"{_base(expr.base)}[{show_expr(expr.index)}]",
+        ast.Attr: lambda expr: f"{_base(expr.base)}.{show_name(expr.name)}",
+        ast.Call: lambda expr: f"{_base(expr.func)}({show_args(expr.args)})",
+        ast.Neg: lambda expr: f"-{show_at(expr.operand, Level.SIGN)}",
+        ast.Binary: _binary,
+        ast.Compare: _compare,
+        ast.Member: _member,
+        ast.Not: lambda expr: f"not {show_at(expr.operand, Level.PREFIX)}",
+        ast.Logic: _logic,
         **dict.fromkeys((ast.Temporal, ast.Until), _temporal),
-        **dict.fromkeys((ast.Quantifier, ast.Freeze, ast.IfThenElse), _binder),
+        ast.Quantifier: _quantifier,
+        ast.Freeze: _freeze,
+        ast.IfThenElse: _if,
     }
 )
 """Class of expressions -> its text."""
@@ -288,25 +254,29 @@ def _def(item: ast.Def) -> str:
     return f"def {own_name(item.name)}{arguments}{sort} = {show_expr(item.value)}"
 
 
-def _typed(item: ast.Signal | ast.Const | ast.Param | ast.Extern) -> str:
-    name, unit = own_name(item.name), f" [{item.unit}]" if item.unit else ""
+def _typed(item: ast.Signal | ast.Const | ast.Param) -> str:
+    """Return name, sort and unit of a declaration."""
     sort = "" if item.type is None else f" : {_type(item.type)}"
-    match item:
-        case ast.Signal(role=role, domain=domain, column=column):
-            head = f"{role} signal" if role else "signal"
-            limits = "" if domain is None else f" in {_domain(domain)}"
-            source = "" if column is None else f' from "{column}"'
-            return f"{head} {name}{sort}{unit}{limits}{source}"
-        case ast.Const(value=value):
-            return f"const {name}{sort}{unit} = {show_expr(value)}"
-        case ast.Param(domain=domain):
-            drawn = isinstance(domain, tuple | ast.SetLiteral)
-            limits = f"in {_domain(domain)}" if drawn else f"~ {show_at(domain, Level.POSTFIX)}"  # type: ignore[arg-type]
-            return f"param {name}{sort}{unit} {limits}"
-        case ast.Extern(formals=formals, type=written):
-            return f"extern fn {name}({', '.join(map(show, formals))}) -> {_type(written)}{unit}"
-        case _:
-            assert_never(item)
+    return f"{own_name(item.name)}{sort}" + (f" [{item.unit}]" if item.unit else "")
+
+
+def _signal(item: ast.Signal) -> str:
+    head = f"{item.role} signal" if item.role else "signal"
+    limits = "" if item.domain is None else f" in {_domain(item.domain)}"
+    source = "" if item.column is None else f' from "{item.column}"'
+    return f"{head} {_typed(item)}{limits}{source}"
+
+
+def _param(item: ast.Param) -> str:
+    if isinstance(item.domain, tuple | ast.SetLiteral):
+        return f"param {_typed(item)} in {_domain(item.domain)}"
+    return f"param {_typed(item)} ~ {show_at(item.domain, Level.POSTFIX)}"
+
+
+def _extern(item: ast.Extern) -> str:
+    unit = f" [{item.unit}]" if item.unit else ""
+    formals = ", ".join(map(show, item.formals))
+    return f"extern fn {own_name(item.name)}({formals}) -> {_type(item.type)}{unit}"
 
 
 def _type(written: ast.TypeRef) -> str:
@@ -347,7 +317,10 @@ def _formal(formal: ast.Formal) -> str:
 
 _DECLARED: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
-        **dict.fromkeys((ast.Signal, ast.Const, ast.Param, ast.Extern), _typed),
+        ast.Signal: _signal,
+        ast.Const: lambda item: f"const {_typed(item)} = {show_expr(item.value)}",
+        ast.Param: _param,
+        ast.Extern: _extern,
         ast.Enum: _enum,
         ast.Region: lambda item: f"region {own_name(item.name)} = {show_expr(item.value)}",
         ast.Def: _def,
