@@ -50,9 +50,9 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
     words = _Words(spec)
     pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
     clashes = [part for node in pairs for part in _operands(node, words)]
-    kept = [part for part in clashes if implications or part.kind != "implication"]
-    words.parenthesised.update((part.span.start, part.span.end) for part in kept)
-    found = [*kept, *(part for node in pairs for part in _scope(node, words))]
+    unclear = [part for part in clashes if implications or part.kind != "implication"]
+    words.parenthesised.update((part.span.start, part.span.end) for part in unclear)
+    found = [*unclear, *(part for node in pairs for part in _scope(node, words))]
     unique = {(part.span.start, part.span.end): part for part in reversed(found)}
     yield from sorted(unique.values(), key=lambda part: (part.span.start, -part.span.end))
 

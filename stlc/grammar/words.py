@@ -1,4 +1,4 @@
-"""Vocabulary of the language: reserved words, aliases, and names of tokens in messages."""
+"""Vocabulary of the language: temporal operators, reserved words, names of units, patterns of the grammar."""
 
 from __future__ import annotations
 

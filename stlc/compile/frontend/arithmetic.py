@@ -55,15 +55,19 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
     function = FUNCTIONS[name]
     for arg in args:
         _refuse_enum(function, arg, span, scope)
-    typed_args, shell = _units(function, args, span, scope)
+    typed_args, template = _units(function, args, span, scope)
     if name in ("div", "mod"):
         _check_divisor(function, typed_args[1], span, scope)
     if function.fold is not None and all(arg.constant is not None for arg in typed_args):
-        return _fold(function, typed_args, shell, scope)
-    kind: Kind = "bool" if name == "bernoulli" else "int" if _whole(function, typed_args, shell) else "real"
+        return _fold(function, typed_args, template, scope)
+    kind: Kind = (
+        "bool" if name == "bernoulli" else "int" if _whole(function, typed_args, template) else "real"
+    )
     if name == "choice" and len({(arg.kind, arg.labels) for arg in typed_args}) == 1:
-        return replace(shell, num=_op(name, typed_args), kind=typed_args[0].kind, labels=typed_args[0].labels)
-    return replace(shell, num=_op(name, typed_args), kind=kind)
+        return replace(
+            template, num=_op(name, typed_args), kind=typed_args[0].kind, labels=typed_args[0].labels
+        )
+    return replace(template, num=_op(name, typed_args), kind=kind)
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
@@ -253,19 +257,19 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
     """True for a plain number times a point, as in a mean or in a conversion between scales."""
-    told = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
-    rest = [arg for arg in args if arg not in told]
+    points = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
+    rest = [arg for arg in args if arg not in points]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
-    first = function.rule == "mul" or (function.rule == "div" and told[:1] == [args[0]])
-    return first and len(told) == 1 and plain
+    first = function.rule == "mul" or (function.rule == "div" and points[:1] == [args[0]])
+    return first and len(points) == 1 and plain
 
 
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
     """Convert numbers, some of them points, to one offset: that of a varying point if there is one."""
     points = [arg for arg in args if arg.unit.offset]
-    told = [arg for arg in args if not arg.bare]
+    measured = [arg for arg in args if not arg.bare]
     bare = next((arg for arg in args if arg.bare), None)
-    difference = next((arg for arg in told if arg.sense == "difference"), None)
+    difference = next((arg for arg in measured if arg.sense == "difference"), None)
     undecided = all(arg.sense == "open" for arg in points)
     if difference is not None:
         if not undecided:
@@ -273,7 +277,7 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
             scope.fail(_compared_with_point(difference, fixed, what, span))
         unit = points[0].unit.interval
     else:
-        varying = [arg for arg in told if arg.constant is None]
+        varying = [arg for arg in measured if arg.constant is None]
         moved = next((arg for arg in varying if arg.unit.offset), None) or next(iter(varying), points[0])
         unit = moved.unit if moved.unit.offset else points[0].unit.interval
         if bare is not None and (undecided or not unit.offset):
@@ -325,8 +329,8 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
     point = next((place for place in places if place.unit.offset), None)
     if point is None:
         found, blank = agree(args, _verb(function), span, scope)
-        told = not deviation.bare and deviation.unit.dims == _TEMPERATURE
-        around = told and all(place.bare for place in places)
+        is_difference = not deviation.bare and deviation.unit.dims == _TEMPERATURE
+        around = is_difference and all(place.bare for place in places)
         return found, replace(blank, sense="difference" if around else blank.sense)
     if not deviation.flexible and not same_dims(point.unit, deviation.unit):
         scope.fail(_mismatch(middle, deviation, _verb(function), span))
@@ -483,7 +487,7 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
             return ir.Op(name, nums)
 
 
-def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scope) -> Number:
+def _fold(function: Function, args: Sequence[Number], template: Number, scope: Scope) -> Number:
     """Fold a function of constants; exact where all are exact and the function preserves it."""
     assert function.fold is not None
     exacts = [arg.exact for arg in args]
@@ -496,22 +500,22 @@ def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scop
     except (ValueError, TypeError, OverflowError, ZeroDivisionError):
         written = ", ".join(f"{arg.constant:g}" for arg in args)
         name = function.symbol or function.name
-        return scope.fail(Diagnostic("E205", f"`{name}` has no value for {written}", shell.span))
+        return scope.fail(Diagnostic("E205", f"`{name}` has no value for {written}", template.span))
     exact = Fraction(result) if isinstance(result, Fraction | int) else None
     if exact is not None and max(exact.numerator.bit_length(), exact.denominator.bit_length()) > _MAX_BITS:
         exact = None
     return replace(
-        shell, num=ir.Const(value), exact=exact, kind="int" if _whole(function, args, shell) else "real"
+        template, num=ir.Const(value), exact=exact, kind="int" if _whole(function, args, template) else "real"
     )
 
 
-def _whole(function: Function, args: Sequence[Number], shell: Number) -> bool:
+def _whole(function: Function, args: Sequence[Number], template: Number) -> bool:
     """True if the result is an integer for all values of the arguments.
 
     `floor` and other roundings act on SI values, which in kilometres need not be integers.
     """
     if function.integral:
-        return shell.unit.ratio == 1
+        return template.unit.ratio == 1
     if function.name == "pow":
         exponent = args[1].exact
         return args[0].kind == "int" and exponent is not None and exponent.denominator == 1 and exponent >= 0

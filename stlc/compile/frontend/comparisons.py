@@ -107,8 +107,8 @@ def _pred(
 
 def _compared(*sides: Number) -> Unit:
     """Unit of a comparison: that of the side that is not constant."""
-    told = [side for side in sides if side.unit.text] or list(sides)
-    return next((side.unit for side in told if side.constant is None), told[0].unit)
+    measured = [side for side in sides if side.unit.text] or list(sides)
+    return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 
 
 def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> None:

@@ -116,14 +116,14 @@ def _check_extern_type(written: ast.TypeRef, scope: Scope) -> None:
 
 def _absent_function(item: ast.Extern, interface: Interface) -> Diagnostic:
     near = closest(item.name, interface.externs)
-    asks = (f"did you mean `{near}`?",) if near is not None else ()
+    hint = (f"did you mean `{near}`?",) if near is not None else ()
     line = f'functions: {{{item.name}: {{kind: python, target: "package.module:{item.name}"}}}}'
     return Diagnostic(
         "E107",
         f"the system provides no function `{item.name}`",
         item.name_span,
         f"declared here, absent from {interface.where}",
-        help=(*asks, line),
+        help=(*hint, line),
     )
 
 

@@ -20,7 +20,7 @@ from stlc.compile.frontend import intervals as moments
 from stlc.compile.frontend.arithmetic import agree, broadcast, negate, refuse_point, too_large
 from stlc.compile.frontend.builtins import builtin, outside, unsupported
 from stlc.compile.frontend.coerce import Expectation, as_formula, as_number, as_state_formula, loose_number
-from stlc.compile.frontend.macros import arguments, cycle, finished, outgrown
+from stlc.compile.frontend.macros import arguments, cycle, finished, too_big
 from stlc.compile.frontend.scope import Cost, Definition, External, Failed, Scope, reserved
 from stlc.compile.frontend.values import (
     Number,
@@ -66,9 +66,9 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
             if name in outer.modules:
                 return outer.modules[name]
     near = closest(expr.span.text, scope.modules)
-    asks = f"did you mean `{near}`?" if near is not None else 'import "file.stl" as m, or import std'
+    hint = f"did you mean `{near}`?" if near is not None else 'import "file.stl" as m, or import std'
     return scope.fail(
-        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=(asks,))
+        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=(hint,))
     )
 
 
@@ -442,7 +442,7 @@ def _refuse_excess(place: Span, scope: Scope) -> None:
         return
     if not meter.reported:
         meter.reported = True
-        scope.report(outgrown(meter, place))
+        scope.report(too_big(meter, place))
     raise Failed
 
 
@@ -599,17 +599,17 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
     values = evaluate_all([value for _, value in expr.bindings], scope)
     for (name, written), value in zip(expr.bindings, values, strict=True):
         if isinstance(value, VectorValue):
-            items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
+            items = [_frozen(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
             bound[name] = (VectorValue(tuple(items), written.span), Cost(1, 1))
         else:
             number = loose_number(value, written, Expectation("`freeze` binds numbers and vectors"), scope)
-            bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))
+            bound[name] = (_frozen(number, name, expr, bindings), Cost(1, 1))
     inner = replace(scope, locals={**scope.locals, **bound})
     body = formula(expr.body, Expectation("`freeze`"), inner)
     return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
 
 
-def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
+def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
     """Return the bound number as a frozen value with a unique name."""
     if number.constant is not None:
         return number

@@ -167,7 +167,7 @@ def interval(
 
 
 def _sign(value: TimeExpr) -> int:
-    """-1 if the time is negative on every grid, else 0 or 1."""
+    """Return -1 if the time is negative on every grid, 0 if it is zero, else 1."""
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0

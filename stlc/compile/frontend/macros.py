@@ -91,7 +91,7 @@ def cycle(entry: Definition, scope: Scope) -> Diagnostic:
     return Diagnostic("E105", f"`{entry.name}` is defined in terms of itself", entry.span, note=note)
 
 
-def outgrown(meter: Meter, span: Span) -> Diagnostic:
+def too_big(meter: Meter, span: Span) -> Diagnostic:
     """Return E005 for an expression beyond the size limits when expanded."""
     if meter.nodes > MAX_NODES:
         message = f"this expands to more than {MAX_NODES:,} operations"

@@ -64,8 +64,8 @@ def _unreadable(name: str, text: str, error: SpecError) -> Diagnostic:
 def _unknown(name: str, names: set[str]) -> Diagnostic:
     near = closest(name, names)
     known = f"constants: {', '.join(sorted(names))}" if names else "the specification has no constant"
-    asks = f"did you mean `{near}`?  " if near is not None else ""
-    return Diagnostic("U101", f"`--set {name}=…`: there is no constant `{name}`", help=(f"{asks}{known}",))
+    hint = f"did you mean `{near}`?  " if near is not None else ""
+    return Diagnostic("U101", f"`--set {name}=…`: there is no constant `{name}`", help=(f"{hint}{known}",))
 
 
 def parameters(

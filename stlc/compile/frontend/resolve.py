@@ -154,8 +154,8 @@ def resolve(
     """
     values = read_overrides(overrides or {}, spec, interface)
     findings = Findings()
-    elsewhere = _elsewhere(interface)
-    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=elsewhere)
+    system_hints = _system_hints(interface)
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, system_hints=system_hints)
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
     signature, parameters = signature_of(file, interface)
@@ -204,7 +204,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 # ----------------------------------------------------------------- declarations
 
 
-def _elsewhere(interface: Interface | None) -> dict[str, str]:
+def _system_hints(interface: Interface | None) -> dict[str, str]:
     """Return advice for each name that only the system declares."""
     if interface is None:
         return {}

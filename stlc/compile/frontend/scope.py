@@ -69,7 +69,7 @@ class Meter:
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Context whose `Cost`, set after the block, is that of evaluations inside, which are not charged."""
+        """Measure the evaluations in a block without charging them; the `Cost` is set when the block ends."""
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
         cost = Cost()
@@ -81,7 +81,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Context with a separate budget, for one declaration."""
+        """Count the evaluations in a block with a budget of their own, for one declaration."""
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
@@ -181,7 +181,7 @@ class Scope:
         temporal: temporal operators are allowed.
         time_unit: unit of bare numbers in intervals; "" without a `time` pragma.
         facts: enforced ranges of columns, in stored units.
-        elsewhere: names that only the system declares, with advice.
+        system_hints: name that only the system declares -> advice.
         modules: scopes of imported files, by alias.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
         locals: arguments of the current macro and quantifier variables, with their costs.
@@ -194,7 +194,7 @@ class Scope:
     temporal: bool = False
     time_unit: str = ""
     facts: Mapping[str, Bounds] = field(default_factory=dict)
-    elsewhere: Mapping[str, str] = field(default_factory=dict)
+    system_hints: Mapping[str, str] = field(default_factory=dict)
     modules: Mapping[str, Scope] = field(default_factory=dict, compare=False)
     product: bool = False
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
@@ -245,8 +245,8 @@ class Scope:
         near = closest(name.name, candidates) if pairs <= _MAX_PAIRS else None
         what = "function" if called else "name"
         help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
-        if name.name in self.elsewhere:
-            help_ = (self.elsewhere[name.name],)
+        if name.name in self.system_hints:
+            help_ = (self.system_hints[name.name],)
         note = () if called or not self.in_spec else ("parameters never default to 0",)
         self.fail(Diagnostic("E101", f"unknown {what} `{name.name}`", name.span, help=help_, note=note))
 

@@ -142,8 +142,8 @@ def _with(found: Tags, tag: ast.Tag, scope: Scope) -> Tags:
 
 def _unknown(tag: ast.Tag) -> Diagnostic:
     near = closest(tag.name, _KNOWN)
-    asks = f"did you mean `@{near}`?  " if near is not None else ""
-    return Diagnostic("E501", f"unknown tag `@{tag.name}`", tag.span, help=(f"{asks}tags: {_SHOWN}",))
+    hint = f"did you mean `@{near}`?  " if near is not None else ""
+    return Diagnostic("E501", f"unknown tag `@{tag.name}`", tag.span, help=(f"{hint}tags: {_SHOWN}",))
 
 
 def _only(tag: ast.Tag) -> ast.Expr | None:

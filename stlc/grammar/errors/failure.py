@@ -72,14 +72,14 @@ class ParseFailure:
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """Text after the piece: the start of the next declaration."""
+        """First lexeme after the piece, which starts the next declaration."""
         if self.piece.rule != "start":
             return None
         return next(lexemes(self.piece.source.text, self.piece.end), None)
 
     @cached_property
     def accepts(self) -> frozenset[str]:
-        """Terminals accepted here."""
+        """Terminals of the grammar that are accepted at the failure."""
         return acceptable(self.piece.text, self.piece.rule, even_broken=True) or frozenset()
 
     @property
@@ -122,7 +122,7 @@ class ParseFailure:
         return line.strip()
 
     def operand_before(self, index: int) -> int:
-        """Index of the first lexeme of the operand that ends before lexeme `index`."""
+        """Return the index of the first lexeme of the operand that ends before lexeme `index`."""
         depth = 0
         for i in range(index - 1, -1, -1):
             text = self.lexemes[i].text
@@ -132,7 +132,7 @@ class ParseFailure:
         return 0
 
     def operand_after(self, index: int) -> int:
-        """Index after the last lexeme of the operand that begins with lexeme `index`."""
+        """Return the index after the last lexeme of the operand that begins with lexeme `index`."""
         depth = 0
         for i in range(index, len(self.lexemes)):
             text = self.lexemes[i].text

@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 - this module lists such characters
-"""Replacements for characters of papers and word processors."""
+"""Replacements for mathematical and typographic characters, such as `□`, `≤` and curved quotes."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
 
 
 def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
-    """Operands with a line break before each operator."""
+    """Return operands with a line break before each operator."""
     parts = [*expression(text, start, splits[0])]
     for at, following in zip(splits, [*splits[1:], end], strict=True):
         operand = at + 1
@@ -182,7 +182,7 @@ def _bracket(text: Text, opening: int) -> Group:
 
 
 def _comma(text: Text, start: int, end: int) -> int:
-    """Index of the next comma, or `end`."""
+    """Return the index of the next comma outside of brackets; `end` without one."""
     index = start
     while index < end and text.tokens[index].text != ",":
         index = behind(text, index)
@@ -203,7 +203,7 @@ _REQUIRED = frozenset({"require_decl", "assume_decl"})
 
 @dataclass(slots=True)
 class _Page:
-    """Collected lines, each with its alignable parts."""
+    """Lines of the text, each with the widths by which it is aligned."""
 
     columns: list[AlignedColumn] = field(default_factory=list)
 
@@ -231,7 +231,7 @@ def _comments(comments: Sequence[Comment], page: _Page) -> None:
 
 
 def _item(item: Item, page: _Page, width: int) -> None:
-    """The lines of an item: comments, tags, declaration."""
+    """Add the lines of an item to the page: comments, tags, declaration."""
     for tag in _tags(item.tokens):
         _comments(tag[0].before, page)
         _declaration(prepare(_bare(tag)), "tag", page, width)
@@ -289,7 +289,7 @@ def _document(text: Text, rule: str) -> tuple[Doc, ...]:
 
 
 def _body(text: Text, rule: str) -> int:
-    """Index of the first token after the `=` or `:` of a declaration."""
+    """Return the index of the first token after the `=` or `:` of a declaration."""
     sign = "=" if rule in _DEFINED else ":" if rule in _REQUIRED else ""
     index = 0
     while index < len(text.tokens) and sign:
@@ -300,7 +300,7 @@ def _body(text: Text, rule: str) -> int:
 
 
 def _head(text: Text, rule: str) -> int:
-    """Width of the first column of a line; 0 without one."""
+    """Return the width of the part of a declaration that is aligned with its neighbours; 0 without one."""
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
     elif rule in _OWN_COLUMN:

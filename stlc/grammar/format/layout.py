@@ -13,7 +13,7 @@ INDENT = 4
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """A text without line breaks, comments above it and one behind it."""
+    """Text without line breaks, with the comments on the lines before it and the one after it."""
 
     text: str
     before: tuple[Comment, ...] = ()
@@ -27,7 +27,7 @@ class Blank:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line break in a group that does not fit, `flat` in one that does."""
+    """Line break in a group that does not fit on one line; the text `flat` in one that does."""
 
     flat: str = " "
 
@@ -116,7 +116,7 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """Width of a document on one line, in columns."""
+    """Return the width of a layout element on one line, in columns."""
     match doc:
         case Word(text, before, _):
             return 0 if before else len(text)
@@ -169,7 +169,7 @@ class _Page:
         self.line, self.indent, self.blank, self.commented = "", level, False, False
 
     def finish(self) -> list[str]:
-        """All lines."""
+        """End the current line and return all lines."""
         self.end_line(0)
         return self.lines
 

@@ -79,7 +79,7 @@ def spelling(kind: str, text: str) -> str:
 
 
 def gap(text: Text, index: int) -> str:
-    """The separator before the token at `index`: a blank or nothing."""
+    """Return the separator before the token at `index`: a blank, or nothing."""
     left, right = text.tokens[index - 1], text.tokens[index]
     if _hugs_right(text, index - 1) or _hugs_left(text, index):
         return ""
@@ -107,7 +107,7 @@ def _hugs_left(text: Text, index: int) -> bool:
 
 
 def _typed(text: Text, index: int) -> bool:
-    """`signal x : Sort` has a blank before its colon."""
+    """True for the colon of a declared sort, `signal x : Sort`, which has a blank before it."""
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
     return declared and not any(token.text == "=" for token in text.tokens[:index])
 
@@ -145,7 +145,7 @@ def _paired(tokens: tuple[Token, ...]) -> Text:
 
 
 def _role(text: Text, index: int) -> Role:
-    """The kind of an opening bracket, from the tokens before it."""
+    """Return the role of an opening bracket, from the tokens before it."""
     token = text.tokens[index]
     before = text.tokens[index - 1] if index else None
     if before is not None and before.kind.endswith(("_AT", "_BRACKET")):
@@ -166,7 +166,7 @@ def _holds_interval(text: Text, opening: int) -> bool:
 
 
 def level(text: Text, opening: int) -> list[int]:
-    """Indices of the tokens directly within a bracket; see `behind`."""
+    """Return the indices of the tokens within a bracket, without those of inner brackets; see `behind`."""
     found: list[int] = []
     index = opening + 1
     while index < text.partner[opening]:
@@ -176,7 +176,7 @@ def level(text: Text, opening: int) -> list[int]:
 
 
 def behind(text: Text, index: int) -> int:
-    """Index of the next token, after the bracket that this one opens or the names that it binds."""
+    """Return the index of the next token; a bracket, and a binder with its names, count as one."""
     if index in text.roles:
         return text.partner[index] + 1
     last = {"QUANTIFIER": "COLON", "_FREEZE": "_IN"}.get(text.tokens[index].kind, "")
@@ -187,7 +187,7 @@ def behind(text: Text, index: int) -> int:
 
 
 def _doubled(text: Text) -> set[int]:
-    """Indices of the outer of two directly nested parentheses."""
+    """Return the indices of redundant parentheses: the outer of two directly nested pairs."""
     found: set[int] = set()
     for opening, role in text.roles.items():
         inner = opening + 1

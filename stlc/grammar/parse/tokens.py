@@ -119,7 +119,7 @@ def _at(token: LarkToken) -> int:
 
 
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
-    """Group tokens by item. Tokens between items (`;`) are dropped; their comments move to the next item."""
+    """Yield the items with their tokens; comments of tokens between items (`;`) move to the next item."""
     index = 0
     for rule, start, end in places:
         carried: tuple[Comment, ...] = ()

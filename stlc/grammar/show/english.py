@@ -81,7 +81,7 @@ def _is_formula(expr: ast.Expr) -> bool:
 
 def say(expr: ast.Expr) -> str:
     """Return an expression in words."""
-    return _SAID.get(type(expr), show_expr)(expr)
+    return _PHRASES.get(type(expr), show_expr)(expr)
 
 
 def _inner(expr: ast.Expr) -> str:
@@ -103,8 +103,8 @@ def _call(expr: ast.Call) -> str:
 def _temporal(expr: ast.Temporal | ast.Until) -> str:
     operator = OPERATORS[expr.op]
     operands = (expr.body,) if isinstance(expr, ast.Temporal) else (expr.left, expr.right)
-    said = dict(zip("pq", map(_inner, operands), strict=False))
-    return operator.english.format(when=_when(expr.interval, past=operator.past), **said)
+    phrases = dict(zip("pq", map(_inner, operands), strict=False))
+    return operator.english.format(when=_when(expr.interval, past=operator.past), **phrases)
 
 
 def _when(interval: ast.Interval | None, *, past: bool) -> str:
@@ -182,7 +182,7 @@ def _freeze(expr: ast.Freeze) -> str:
     return f"let {names}: {_inner(expr.body)}"
 
 
-_SAID: Mapping[type, Callable[[Any], str]] = MappingProxyType(
+_PHRASES: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
         **dict.fromkeys((ast.Temporal, ast.Until), _temporal),
         ast.Logic: _logic,
