@@ -35,20 +35,22 @@ _UNIT_PREFIX = re.compile(r"(?:[A-Za-zµ°Ω%][\w/^*·.°]*)?\Z")
 _SILENT = re.compile(r"""[^"\n]*(?:"[^"\n]*"[^"\n]*)*(?:(?:\#|//).*|"[^"\n]*)""")
 _PLAIN_WORDS = RESERVED | {*PRAGMAS, "as", "fn", "from"}
 _TERMINALS = {
-    **{
-        "AND": ("and",),
-        "OR": ("or", "xor"),
-        "IFF": ("iff",),
-        "IMPLIES": ("implies",),
-        "_NOT_IN": ("not in",),
-    },
-    **{"QUANTIFIER": ("forall", "exists"), "ROLE": tuple(ROLES)},
+    "AND": ("and",),
+    "OR": ("or", "xor"),
+    "IFF": ("iff",),
+    "IMPLIES": ("implies",),
+    "_NOT_IN": ("not in",),
+    "QUANTIFIER": ("forall", "exists"),
+    "ROLE": tuple(ROLES),
     "UNARY": tuple(dict.fromkeys(UNARY_TEMPORAL.values())),
     "BINARY": tuple(dict.fromkeys(BINARY_TEMPORAL.values())),
 }
 """Words of a terminal of the grammar, in the spelling that the language prefers."""
 _KINDS: dict[str, OfferKind] = {
-    **{"signal": "Variable", "param": "Variable", "const": "Constant", "member": "EnumMember"}
+    "signal": "Variable",
+    "param": "Variable",
+    "const": "Constant",
+    "member": "EnumMember",
 }
 _FIRST_UNITS = ("s", "steps", "ms", "min", "m", "m/s", "m/s^2", "rad", "deg", "1")
 

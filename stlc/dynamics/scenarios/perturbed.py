@@ -90,19 +90,17 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
     """The declaration with replaced equations of real states and replaced guards."""
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
-    rates = {assign.name: assign for assign in flow if assign.name in real}
+
+    def replaced(assigns: tuple[Assign, ...], others: tuple[Assign, ...]) -> tuple[Assign, ...]:
+        values = {assign.name: assign for assign in others if assign.name in real}
+        return tuple(values.get(assign.name, assign) for assign in assigns)
+
     again = {jump.name: jump for jump in jumps}
-    return replace(
-        decl,
-        flow=tuple(rates.get(assign.name, assign) for assign in decl.flow),
-        jumps=tuple(_jump(jump, again.get(jump.name, jump), real) for jump in decl.jumps),
+    pairs = ((jump, again.get(jump.name, jump)) for jump in decl.jumps)
+    changed = (
+        replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets)) for jump, other in pairs
     )
-
-
-def _jump(jump: JumpDecl, again: JumpDecl, real: set[str]) -> JumpDecl:
-    values = {assign.name: assign for assign in again.resets if assign.name in real}
-    resets = tuple(values.get(assign.name, assign) for assign in jump.resets)
-    return replace(jump, guard=again.guard, resets=resets)
+    return replace(decl, flow=replaced(decl.flow, flow), jumps=tuple(changed))
 
 
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:

@@ -19,15 +19,15 @@ from stlc.registry import closest
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
 """Standard scenarios that the documentation measures."""
 _STANDARD = re.compile(r"(mismatch|disturb|noise)(?:-(\d{1,3}(?:\.\d{1,3})?))?")
+_USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
+"""Percentages of standard scenarios whose name gives none."""
+_MISMATCH = "actuators and numbers of the dynamics are {:g} % more or less than the model says"
 _ERRORS = {
-    "mismatch": (
-        *(10.0, "actuators and numbers of the dynamics are {:g} % more or less than the model says"),
-        ("actuator_gain", "parameters"),
-    ),
-    "disturb": (10.0, "noise on what actuators give, {:g} % of half their range", ("actuator_noise",)),
-    "noise": (0.5, "noise on what agents see, {:g} % of the range of each state", ("sensor_noise",)),
+    "mismatch": (_MISMATCH, ("actuator_gain", "parameters")),
+    "disturb": ("noise on what actuators give, {:g} % of half their range", ("actuator_noise",)),
+    "noise": ("noise on what agents see, {:g} % of the range of each state", ("sensor_noise",)),
 }
-"""Standard scenario -> percentage unless given, description, and the errors that it sets."""
+"""Description of a standard scenario, and the errors that it sets."""
 
 
 def standard(name: str) -> ScenarioDecl | None:
@@ -35,8 +35,8 @@ def standard(name: str) -> ScenarioDecl | None:
     found = _STANDARD.fullmatch(name)
     if found is None:
         return None
-    usual, doc, errors = _ERRORS[found[1]]
-    percent = float(found[2] or usual)
+    doc, errors = _ERRORS[found[1]]
+    percent = float(found[2] or _USUAL[found[1]])
     if not 0.0 < percent <= 100.0:
         return None
     shares = ErrorsDecl(**dict.fromkeys(errors, percent / 100))

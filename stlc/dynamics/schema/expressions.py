@@ -228,20 +228,18 @@ class Expressions:
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
         """Compile-time constant, as stored in a column of `unit`."""
         value = self.stored(node, where, unit)
-        if value is None or node is None:
-            return None
-        if not isinstance(value, ir.Const):
-            self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
-            return None
-        return value.value
+        found = None if value is None or node is None else self._constants((value,), node, where)
+        return None if found is None else found[0]
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
         """Compile-time constants, as stored in columns of `unit`."""
         values = self.stored_each(node, where, unit, size)
-        if values is None:
-            return None
+        return None if values is None else self._constants(values, node, where)
+
+    def _constants(self, values: tuple[ir.Num, ...], node: Node, where: str) -> tuple[float, ...] | None:
+        """Values of numbers that are all known."""
         found = tuple(value.value for value in values if isinstance(value, ir.Const))
-        if len(found) < size:
+        if len(found) < len(values):
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
             return None
         return found
