@@ -7,12 +7,10 @@ components with feedback are stepped, after the loop invariants have been comput
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import TypeAlias
-
-import numpy as np
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import add, map_parts, multiply, names_in
@@ -134,21 +132,37 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
 
 
 def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
-    """Strongly connected components, dependencies first.
+    """Strongly connected components, dependencies first (Tarjan's algorithm, without recursion)."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+    path: list[tuple[str, Iterator[str]]] = []
 
-    Names of one component reach the same names, and a component reaches more names than those it depends on.
-    """
-    names = list(reads)
-    index = {name: i for i, name in enumerate(names)}
-    reach = np.eye(len(names), dtype=np.float32)
-    for name, others in reads.items():
-        reach[index[name], [index[other] for other in others]] = 1.0
-    for _ in range(len(names).bit_length()):
-        reach = np.minimum(reach @ reach, 1.0)
-    groups: dict[bytes, list[str]] = {}
-    for i in np.argsort(reach.sum(1), kind="stable"):
-        groups.setdefault(reach[i].tobytes(), []).append(names[i])
-    return list(groups.values())
+    def enter(name: str) -> None:
+        order[name] = low[name] = len(order)
+        stack.append(name)
+        path.append((name, iter(sorted(reads[name]))))
+
+    for root in reads:
+        if root not in order:
+            enter(root)
+        while path:
+            name, rest = path[-1]
+            other = next(rest, None)
+            if other is None:
+                path.pop()
+                if path:
+                    low[path[-1][0]] = min(low[path[-1][0]], low[name])
+                if low[name] == order[name]:
+                    at = stack.index(name)
+                    found.append(stack[at:])
+                    del stack[at:]
+            elif other not in order:
+                enter(other)
+            elif other in stack:
+                low[name] = min(low[name], order[other])
+    return found
 
 
 # ------------------------------------------------------------------------------ hoisting
