@@ -34,13 +34,13 @@ class Times:
     trace: str = ""
 
     def or_else(self, other: Times) -> Times:
-        """These times, with unknown ones taken from `other`."""
+        """Return these times, with unknown ones taken from `other`."""
         step = self if self.dt is not None else other
         return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
     @property
     def complete(self) -> bool:
-        """True if both are known."""
+        """True if time step and horizon are known."""
         return self.dt is not None and self.horizon is not None
 
     def grid(self) -> Grid:

@@ -25,12 +25,12 @@ KNOWN = "@known "
 
 
 def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
-    """Names of the columns that hold NaN."""
+    """Return the names of the columns that hold NaN."""
     return frozenset(name for name, values in env.items() if np.isnan(values).any())
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """The columns (samples, batch), unknown values replaced, and the columns that mark known values."""
+    """Return the columns (samples, batch), unknown values replaced, and columns that mark known values."""
     filled = dict(env)
     for name in holes:
         unknown = np.isnan(env[name])
@@ -42,12 +42,12 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """The formula whose value is the least, or the greatest, possible value of `formula`.
+    """Return the formula whose value is the least, or the greatest, possible value of `formula`.
 
     Args:
         formula: in negation normal form.
         holes: signals with unknown values; names that a `freeze` binds to them are added here.
-        least: which of the two.
+        least: the least value; else the greatest.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -63,7 +63,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
 
 
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
-    """A number that is 1 where all that `num` reads is known, else -1; None if that is everywhere."""
+    """A number that is 1 where all signals in `num` are known, else -1; None if they are known everywhere."""
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)

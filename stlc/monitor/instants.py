@@ -30,7 +30,7 @@ At: TypeAlias = int | Literal["all"] | None
 
 
 def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:
-    """The instants at which a requirement is evaluated on a trace of so many samples.
+    """Return the instants at which a requirement is evaluated on a trace of `samples` samples.
 
     Raises:
         UsageError: U101, `at` is not a sample of the trace.
@@ -76,7 +76,7 @@ def rule_known(
 
 
 def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: Boundary) -> Array:
-    """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
+    """Return values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
 
     They are also NaN where they depend on unknown values, unless `end` is "lower" or "upper".
     A requirement on the mission clock has one value at all samples.

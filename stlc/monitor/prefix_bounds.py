@@ -48,7 +48,7 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """The formula, with instants that an early end of the trace removes from its windows left out."""
+        """Return the formula whose windows leave out instants that an early end of the trace removes."""
         match formula:
             case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
@@ -78,14 +78,14 @@ class _PrefixBound:
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """The formula where a sample so many steps later exists; for the greatest value the dual."""
+        """The formula where a sample `later` steps later exists; for the greatest value the dual."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
-    """The columns (samples, traces), and the one that marks existing samples."""
+    """Return the columns (samples, traces), with the column that marks existing samples."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 

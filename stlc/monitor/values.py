@@ -110,8 +110,8 @@ def window_bounds(
 ) -> tuple[Array, Array]:
     """`bounds` where `end` is `window` samples after each instant: `(count, batch)`.
 
-    Every instant has its own record, from the lookback of the past operators to its own end. Many of them
-    are evaluated at once, as columns. Where a record ends before its window, the rest is unknown; where
+    Every instant has its own record, from the lookback of the past operators to its own end. Many records are
+    evaluated at once, as columns. Where a record ends before its window, the rest is unknown; where
     windows are cut, its last sample is the end.
     """
     back = history(formula)
@@ -129,7 +129,7 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Records whose columns are the surroundings of instants, in blocks of instants."""
+    """Yield records and their numbers of instants; each column holds the samples around one instant."""
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]

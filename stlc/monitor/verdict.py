@@ -324,7 +324,7 @@ def _judge(
 
 
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """The judgement with the robustness of the semantics of `ready`.
+    """The judgement with its robustness in the semantics of `ready`.
 
     Where something is unknown, a semantics whose extrema are means keeps only the sign of the exact bounds.
     """

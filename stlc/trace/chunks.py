@@ -22,7 +22,7 @@ LARGE = 1_500_000_000
 
 
 def size_of(path: Path) -> int:
-    """Approximate bytes of a file's numbers in memory; 0 for a format that is not read in chunks.
+    """Return the approximate bytes of a file's numbers in memory; 0 for a format that is not read in chunks.
 
     Raises:
         StlcError: the file cannot be opened, or is damaged.
@@ -33,7 +33,7 @@ def size_of(path: Path) -> int:
 
 
 def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
-    """Chunks of a file's trace, so many samples each, with continuing times.
+    """Yield the trace of a file in chunks of `samples` samples, with continuing times.
 
     Raises:
         TraceError: as `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its format

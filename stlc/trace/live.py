@@ -314,7 +314,7 @@ class _Track:
             self.values.append(value)
 
     def forget(self, before: float) -> None:
-        """Forget all samples before the last one up to an instant."""
+        """Drop the samples that precede the last sample before an instant."""
         there = int(np.searchsorted(self.times, before, side="right")) - 1
         if there > 0:
             del self.times[:there], self.values[:there]

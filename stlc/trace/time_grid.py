@@ -163,12 +163,12 @@ def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
 
 
 def snapped(step: float) -> float:
-    """A measured time step, as a simple fraction where one is near."""
+    """Return a measured time step, rounded to a simple fraction where one is near."""
     return _snap(step, None) if np.isfinite(step) and step > 0 else step
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """The recorded step if the times agree with it, else the mean, as a simple fraction where one is near."""
+    """The given step if it agrees with the mean; else the mean, or a simple fraction that is near."""
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt
     near = float(Fraction(mean).limit_denominator(100_000))

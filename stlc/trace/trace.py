@@ -79,7 +79,7 @@ class Trace:
         return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
 
     def renamed(self, names: Mapping[str, str]) -> Trace:
-        """The trace with signal `names[new]` renamed to `new`.
+        """Return the trace with signal `names[new]` renamed to `new`.
 
         Raises:
             TraceError: E601, a signal that is not in the trace.
@@ -257,6 +257,6 @@ def check_writable(path: Path | str) -> None:
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:
-    """A time step as the intended fraction: 0.1 is 1/10, 0.0333… is 1/30."""
+    """Return a time step in seconds as the intended fraction: 0.1 is 1/10, 0.0333… is 1/30."""
     near = Fraction(dt).limit_denominator(1_000_000)
     return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)

@@ -59,4 +59,4 @@ class Tracker(Protocol):
         """Final bounds: the trace has ended, and windows to its end are clipped at the last sample."""
 
     def drop(self, start: int) -> int:
-        """Forget instants before `start`; returns the number of the first sample that is still needed."""
+        """Drop instants before `start`; returns the number of the first sample that is still needed."""

@@ -12,9 +12,8 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as names_of_columns
-from stlc.compile.ir.support import history, reach
-from stlc.compile.ir.traverse import leaves as readings
-from stlc.compile.ir.traverse import map_children, nodes, numbers
+from stlc.compile.ir.support import farthest, history, reach
+from stlc.compile.ir.traverse import map_children, nodes, numbers, operands
 
 RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
@@ -88,12 +87,9 @@ def _lag(streams: Sequence[DerivedColumn]) -> int:
 
 
 def read_by(stream: DerivedColumn) -> frozenset[str]:
-    """Names of the columns that a stream reads."""
-    return (
-        frozenset()
-        if isinstance(stream, PredicateColumn)
-        else frozenset().union(*map(names_of_columns, stream.parts))
-    )
+    """Return the names of the columns that a column reads."""
+    parts = () if isinstance(stream, PredicateColumn) else stream.parts
+    return frozenset().union(*map(names_of_columns, parts))
 
 
 def endless(formula: ir.Formula) -> bool:
@@ -103,7 +99,7 @@ def endless(formula: ir.Formula) -> bool:
 
 
 def column(name: str) -> ir.Predicate:
-    """A column as a formula."""
+    """Return a column as a formula."""
     return ir.Predicate(ir.Signal(name))
 
 
@@ -135,32 +131,39 @@ class _Planner:
                 return self._frozen(formula)
             case ir.AtStart():
                 raise EndlessError
-            case ir.PastTemporal(op, window, body):
-                return self._past(op, window, self.over_columns(body))
-            case ir.Since(op, window, left, right):
-                return self._since(op, window, self.over_columns(left), self.over_columns(right))
+            case ir.PastTemporal() | ir.Since():
+                return self._past(map_children(formula, formulas=self.over_columns))
             case _:
                 return map_children(formula, formulas=self.over_columns)
 
     def _leaf(self, formula: ir.Formula) -> ir.Formula:
         if formula not in self.streams:
-            ahead = reach(formula).future
-            ahead = (
-                max(ahead, looks_on(formula))
-                if isinstance(formula, ir.Predicate)
-                else ahead + looks_on(formula)
-            )
+            ahead, reads = reach(formula).future, looks_on(formula)
+            ahead = max(ahead, reads) if isinstance(formula, ir.Predicate) else ahead + reads
             self.streams[formula] = PredicateColumn(f"#{len(self.streams)}", formula, history(formula), ahead)
         return column(self.streams[formula].name)
 
-    def _frozen(self, formula: ir.Formula) -> ir.Formula:
-        if endless(formula) or any(
-            unbounded_past(node) or isinstance(node, ir.AtStart) for node in nodes(formula)
-        ):
-            raise EndlessError
+    def _frozen(self, formula: ir.Freeze) -> ir.Formula:
+        for node in nodes(formula):
+            if isinstance(node, ir.AtStart) or (isinstance(node, ir.Windowed) and node.window.hi is None):
+                raise EndlessError
         return self._leaf(formula)
 
-    def _latched(self, op: RecursiveOp, *parts: ir.Formula) -> ir.Formula:
+    def _past(self, formula: ir.PastTemporal | ir.Since) -> ir.Formula:
+        """A past operator over columns; an unbounded one becomes a column, read where its window ends."""
+        if formula.window.hi is not None:
+            return formula
+        value, first = self._recursive(formula.op, operands(formula)), formula.window.lo
+        if not first:
+            return value
+        dual = formula.op in ("historically", "trigger")
+        earlier = ir.Shift(-first, value, outside=dual)
+        if isinstance(formula, ir.PastTemporal):
+            return earlier
+        recent = ir.PastTemporal("once" if dual else "historically", ir.Window(0, first - 1), formula.left)
+        return ir.BoolOp("or" if dual else "and", (recent, earlier))
+
+    def _recursive(self, op: RecursiveOp, parts: tuple[ir.Formula, ...]) -> ir.Formula:
         if any(map(endless, parts)):
             raise EndlessError
         key = (op, parts)
@@ -169,41 +172,7 @@ class _Planner:
             self.streams[key] = RecursiveColumn(f"#{len(self.streams)}", op, parts, back, ahead)
         return column(self.streams[key].name)
 
-    def _past(self, op: Literal["historically", "once"], window: ir.Window, body: ir.Formula) -> ir.Formula:
-        if window.hi is not None:
-            return ir.PastTemporal(op, window, body)
-        return _earlier(self._latched(op, body), window.lo, neutral=op == "historically")
-
-    def _since(
-        self, op: Literal["since", "trigger"], window: ir.Window, left: ir.Formula, right: ir.Formula
-    ) -> ir.Formula:
-        if window.hi is not None:
-            return ir.Since(op, window, left, right)
-        reached = _earlier(self._latched(op, left, right), window.lo, neutral=op == "trigger")
-        if not window.lo:
-            return reached
-        recent = ir.Window(0, window.lo - 1)
-        if op == "since":
-            return ir.BoolOp("and", (ir.PastTemporal("historically", recent, left), reached))
-        return ir.BoolOp("or", (ir.PastTemporal("once", recent, left), reached))
-
-
-def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
-    return ir.Shift(-steps, formula, outside=neutral) if steps else formula
-
-
-def unbounded_past(node: ir.Formula) -> bool:
-    """True if a node is a past operator with an unbounded window."""
-    return isinstance(node, ir.Windowed) and node.back and node.window.hi is None
-
 
 def looks_on(formula: ir.Formula) -> int:
-    """Lookahead of the predicates: samples that may be missing at the end of the trace."""
-    return max(0, *_offsets(formula))
-
-
-def _offsets(formula: ir.Formula) -> list[int]:
-    found = [
-        leaf.steps for num in numbers(formula) for leaf in readings(num) if isinstance(leaf, ir.ShiftedSignal)
-    ]
-    return [0, *found]
+    """Return the lookahead of the predicates: samples that may be missing at the end of the trace."""
+    return max((farthest(num).future for num in numbers(formula)), default=0)

@@ -87,7 +87,7 @@ class Tally:
 
     @property
     def status(self) -> Status:
-        """Violated if it is at one instant, satisfied if it is at all."""
+        """Violated if one instant is violated, satisfied if all instants are."""
         if self.fails:
             return "violated"
         return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"
@@ -101,7 +101,7 @@ class Tally:
 
     @property
     def worst(self) -> int:
-        """The instant of the least robustness; where violated, that of a violation."""
+        """The instant of the least robustness; for a violated requirement, of its worst violation."""
         return self.high_at if self.fails else self.low_at
 
     @property

@@ -108,7 +108,7 @@ class _CutTracker(ABC):
 
 @dataclass(slots=True)
 class _ColumnTracker(_CutTracker):
-    """Tracker of a formula over columns: two sides where windows are open, four where they are cut.
+    """Tracker of a formula over columns: two sides, or four where the end of the trace cuts windows.
 
     Attributes:
         plans: the columns.
@@ -431,7 +431,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """Tracker of a requirement that needs the whole trace: nothing is forgotten."""
+    """Tracker of a requirement that needs the whole trace: all samples are stored."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -503,7 +503,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002
-        """Nothing can be forgotten."""
+        """Drop nothing."""
         return 0
 
 

@@ -170,7 +170,7 @@ class UnboundedState:
         begin: the sample at which the formula is evaluated.
         at: number of the first sample that is not yet in the polynomial.
         coefficients: (subsets of the operators, traces): the value where those operators are +inf from
-            there on and the others -inf; None at first.
+            `at` on and the others -inf; None before the first `advance`.
     """
 
     bones: UnboundedOperators
@@ -226,7 +226,7 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """The formula, or once there is a polynomial the operators, at the frontier: one row each."""
+        """Values at the frontier, one row each: of the formula, or with a polynomial of the operators."""
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
 

@@ -220,7 +220,7 @@ def _by_arrow(lines: TableText) -> list[Array] | None:
 
 
 def _by_numpy(lines: TableText) -> list[Array] | None:
-    """The columns read in blocks with NumPy, to bound memory."""
+    """The columns, read with NumPy in blocks of lines to bound memory."""
     parts: list[list[Array]] = [[] for _ in range(lines.width)]
     for stretch in _stretches(lines):
         try:

@@ -60,7 +60,7 @@ class _Sheet:
 
 
 def read(path: Path) -> Recording:
-    """The trace of a file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
+    """Return the trace of a file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
     return of_table(path, read_csv(path))
 
 
@@ -70,7 +70,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """The trace of a file, so many lines at a time. Raises as `read`."""
+    """Yield the trace of a file in chunks of `samples` lines. Raises as `read`."""
     with path.open("rb") as file:
         header = next((line for line in file if line.strip()), b"")
         while lines := list(islice(file, samples)):
@@ -367,7 +367,7 @@ def _names_in(path: Path, header: str) -> list[str]:
 
 
 def _row(heads: Iterable[str]) -> str:
-    """A header."""
+    """The text of a header with these cells."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
     return text.getvalue()

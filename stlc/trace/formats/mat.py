@@ -28,7 +28,7 @@ _RATIO = 1100
 
 
 def read(path: Path) -> Recording:
-    """The numeric variables of a file.
+    """Return the numeric variables of a file.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -52,7 +52,7 @@ def read(path: Path) -> Recording:
 
 
 def _as_signal(values: Array) -> Array:
-    """The array, with MATLAB's columns and rows as plain signals."""
+    """The array; a matrix of one row or column becomes (samples,)."""
     if values.ndim == 2 and 1 in values.shape:
         return values.reshape(-1)
     return values

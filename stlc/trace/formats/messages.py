@@ -158,7 +158,7 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Times in ns and signals of one topic, none where it has no message."""
+        """Return times in ns and signals of one topic; empty where it has no message."""
         return self._topics.get(name, _Topic()).arrays()
 
     def _nothing(self) -> str:
@@ -174,7 +174,7 @@ def _called(topic: str, name: str) -> str:
 
 
 def numbers_of(content: object) -> Iterator[MessageNumber]:
-    """All numbers of a JSON message, by path.
+    """Yield all numbers of a JSON message, with their paths.
 
     Raises:
         OverflowError: a number is larger than a float.

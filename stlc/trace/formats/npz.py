@@ -67,7 +67,7 @@ _DAMAGE = (
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """The arrays of an `.npz` file: numbers of any shape, and texts.
+    """Return the arrays of an `.npz` file: numbers of any shape, and texts.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -104,7 +104,7 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
 
 
 class ArchiveMember:
-    """One array of an open archive: read as a whole, or from its start on, so many samples at a time.
+    """An array of an open archive, read as a whole or in consecutive chunks of samples.
 
     Attributes:
         length: number of samples: of the last axis of (samples,) and (1, samples), else of the first one; -1
@@ -228,7 +228,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """The trace of a file, so many samples at a time. Raises TraceError as `read`."""
+    """Yield the trace of a file in chunks of `samples` samples. Raises TraceError as `read`."""
     with ExitStack() as stack, damage(path):
         archive = stack.enter_context(zipfile.ZipFile(path))
         members = {name: ArchiveMember(path, archive, i, stack) for name, i in _infos(path, archive).items()}

@@ -41,7 +41,7 @@ def read(path: Path) -> Recording:
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
-    """The opened file; `whole` checks that its numbers fit into memory."""
+    """Open a file; with `whole`, check that its numbers fit into memory."""
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
@@ -62,7 +62,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """The trace of a file, so many rows at a time. Raises as `read`."""
+    """Yield the trace of a file in chunks of `samples` rows. Raises as `read`."""
     file = open_parquet(path, whole=False)
     with damage(path):
         batches = file.iter_batches(batch_size=samples, columns=_names(file))

@@ -47,7 +47,7 @@ class Table:
 
 
 def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recording:
-    """A recording with one clock.
+    """Return the recording of a table, with one clock.
 
     Raises:
         TraceError: E605, traces that differ in length or in their times, or an invalid unit.
@@ -83,7 +83,7 @@ def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
 
 
 def clock_scale(trace: str, name: str, unit: str) -> float:
-    """Seconds of one unit of a clock. Raises TraceError (E605) for a unit that is not a time."""
+    """Return the seconds of one unit of a clock. Raises TraceError (E605) for a unit that is not a time."""
     text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
     try:
         time = parse_unit(text)
