@@ -119,7 +119,7 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
             rank(judged.rho, task.cost(judged)).view(-1, count).argmax(1)
 
     def gradient() -> None:
-        value = loss(task, trainer.objective, x0, chosen).total.mean()
+        value = loss(task, trainer.objective, x0, chosen).mean()
         torch.autograd.grad(value, chosen)
 
     def both() -> None:

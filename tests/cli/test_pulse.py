@@ -27,7 +27,8 @@ def pulse(monkeypatch: pytest.MonkeyPatch) -> Pulse:
 
 def said(pulse: Pulse, stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, what: str) -> str:
     monkeypatch.setattr("sys.stderr", stream)
-    with pulse.beating(), pulse.doing(what):
+    with pulse.beating(), pulse.doing("at work"):
+        pulse.now(what)
         time.sleep(0.25)
         emit("a result")
     return stream.getvalue()

@@ -235,6 +235,11 @@ class Pulse:
         finally:
             self._doing.pop()
 
+    def now(self, what: str) -> None:
+        """Change the text of the current activity, whose time continues."""
+        if self._doing:
+            self._doing[-1] = what, self._doing[-1][1]
+
     def note(self) -> None:
         """Register output: the line on the terminal is removed."""
         with self._lock:

@@ -66,7 +66,7 @@ class Session:
     def watch(self) -> Watch:
         """The callbacks of the training."""
         stop = lambda: bool(self._signals)  # noqa: E731
-        return Watch(self._resolved, self._row, stop, self._steps, self._late)
+        return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
         """Expected delay in seconds at the end on a slow machine, estimated from the time of imports."""

@@ -21,6 +21,7 @@ from stlc.files import write_atomic
 from stlc.native import never
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from torch import Tensor
@@ -85,6 +86,10 @@ class Score:
         }
 
 
+def silent(_text: str) -> None:
+    """Ignore a report of progress."""
+
+
 def score(
     task: Task,
     policy: Policy,
@@ -92,6 +97,7 @@ def score(
     n: int = HELD_OUT,
     seed: int = HELD_OUT_SEED,
     enough: Stop = never,
+    report: Callable[[str], None] = silent,
 ) -> Score:
     """Judge a policy on `n` held-out states of seed `seed`; for missions, states along held-out missions.
 
@@ -99,13 +105,13 @@ def score(
     returns True. A search starts from the policy's plan; if that fails, it continues independently of the
     policy (in native code, which is fast enough), so that the feasible share hardly depends on how well the
     policy is trained. States whose search was cut off do not count as searched, unless they are the first. If
-    `enough` is True before that, fewer states are judged.
+    `enough` is True before that, fewer states are judged. `report` receives the progress as a short text.
     """
     if task.compiled.timers:
         states = visited(task, policy, n, seed, enough)
     else:
         states = task.sample(n, seed=seed, dtype=torch.float64)
-    states, plans, rho, each = _judged(policy, states, enough)
+    states, plans, rho, each = _judged(policy, states, enough, report)
     n, good = len(states), satisfied(rho)
     shares = satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
@@ -116,8 +122,9 @@ def score(
     for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
         if number and enough():
             break
-        begun = states[chunk], plans[chunk], plans[good]
-        found = solve(task, *begun, 1, tries=CEILING_TRIES, generator=generator, stop=enough).solved
+        report(f"evaluation, search of {number * size:,} of {len(failing[:MOST_SEARCHED]):,} failing starts")
+        given = states[chunk], plans[chunk], plans[good]
+        found = solve(task, *given, 1, tries=CEILING_TRIES, generator=generator, stop=enough).solved
         left = torch.nonzero(~found)[:, 0]
         if len(left) and task.native is not None and not enough():
             found[left] = solve(task, states[chunk[left]], stop=enough).rho >= -TOLERANCE
@@ -142,7 +149,9 @@ def score(
     )
 
 
-def _judged(policy: Policy, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _judged(
+    policy: Policy, states: Tensor, enough: Stop, report: Callable[[str], None]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Evaluated states (k, dim), the plans followed from there, their robustness, and that per requirement.
 
     All states, or the first ones, at least one batch, evaluated before `enough` returns True.
@@ -153,6 +162,7 @@ def _judged(policy: Policy, states: Tensor, enough: Stop) -> tuple[Tensor, Tenso
     for part in torch.split(states, JUDGED):
         if rho and enough():
             break
+        report(f"evaluation, {sum(map(len, rho)):,} of {len(states):,} held-out starts")
         followed, judged = policy.plan_judged(part)
         plans.append(followed)
         rho.append(judged.rho)

@@ -135,9 +135,8 @@ class RunVerdicts:
 
 def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
     """Runs that satisfy every rule, (rows,)."""
-    held = np.ones(rows, dtype=bool)
-    for statuses in rules.values():
-        held &= statuses == "satisfied"
+    satisfied = [statuses == "satisfied" for statuses in rules.values()]
+    held: NDArray[np.bool_] = np.all([np.ones(rows, dtype=bool), *satisfied], axis=0)
     return held
 
 
@@ -327,14 +326,6 @@ def _lost(
     return Lost("told" if event else "later", dt * since)
 
 
-def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
-    """Runs that violate any rule, (rows,)."""
-    found = np.zeros(rows, dtype=bool)
-    for statuses in rules.values():
-        found |= statuses == "violated"
-    return found
-
-
 def judge_runs_by_plans(
     held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
 ) -> RunVerdicts:
@@ -386,12 +377,11 @@ def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str,
     `rules`: the same per rule. `broken`: run, rules and times (seconds from the start, null where not
     located), and `cause`: since when no plan is known and why (`Lost`).
     """
-    obeyed, rows = runs.obeyed, len(runs.viable)
-    violated = _violating(runs.rules, rows)
+    obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {
         "count": rows,
-        "obeyed": int(obeyed.sum()),
-        "undecided": int((~obeyed & ~violated).sum()),
+        "obeyed": obeyed,
+        "undecided": rows - obeyed - len(runs.broken),
         "lost": int((~runs.viable).sum()),
         "told": sum(each.lost is not None and each.lost.why == "told" for each in runs.broken),
         "rules": {

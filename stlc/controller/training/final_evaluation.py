@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
-from stlc.controller.evaluation.held_out import Score, score
+from stlc.controller.evaluation.held_out import Score, score, silent
 from stlc.controller.training.budget import simulation_reserve, verdict_reserve
 from stlc.controller.training.diagnose import conflict, refuted
 from stlc.controller.training.run import Run
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.controller.training.budget import TimeBudget
@@ -61,6 +63,7 @@ class FinalEvaluation:
         task: problem of the training.
         config: resolved options of the run.
         time: budget of the training.
+        report: called with the progress as a short text.
         trained: clock reading at the start of the evaluation.
     """
 
@@ -68,6 +71,7 @@ class FinalEvaluation:
     task: Task
     config: ResolvedConfig
     time: TimeBudget
+    report: Callable[[str], None] = silent
     trained: float = 0.0
 
     @property
@@ -82,7 +86,9 @@ class FinalEvaluation:
     def of(self, policy: Policy, steps: int) -> TrainingOutcome:
         """Evaluate a policy after `steps` steps, store the result in the run, and close its record."""
         self.trained = self.time.now()
-        result = score(self.task, policy, n=self.config.held_out, enough=self._out_of_time)
+        result = score(
+            self.task, policy, n=self.config.held_out, enough=self._out_of_time, report=self.report
+        )
         self.writer.held_out(self.task, result)
         why = conflict(self.task, self._late) if result.feasible == 0.0 else None
         run = Run(self.writer.folder, self.task, policy)
@@ -99,6 +105,7 @@ class FinalEvaluation:
         """Closed-loop results of the policy, within the remaining time."""
         if not self.config.drives:
             return None
+        self.report("evaluation, closed-loop runs")
         time, started = self.time, self.time.now()
         if time.allowed:
             end = time.started + (1.0 + VERDICT_OVER) * time.seconds

@@ -254,13 +254,12 @@ class Trainer(Learner):
         winner, good = self._winner(x0, plans)
         rows = torch.arange(len(x0), device=self.device)
         chosen = plans[rows, winner]
-        value = loss(self.task, self.objective, x0, chosen).total.mean()
+        value = loss(self.task, self.objective, x0, chosen).mean()
         if config.share:
             some = rows[:: config.plans]
             other = torch.randint(config.plans, (len(some),), generator=self.generator).to(self.device)
             value = (
-                value
-                + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
+                value + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).mean()
             )
         if hard:
             value = value + self._imitation(plans[-hard:], targets, good[-hard:])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from stlc.controller.evaluation.held_out import silent
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
@@ -74,6 +75,7 @@ class Watch:
         deferring: context of the steps, in which an interrupt waits until the step is finished and saved.
             Outside of it an interrupt may be raised anywhere.
         late: wall-time budget -> seconds by which work before and after the training would exceed it.
+        evaluating: called with the progress of the final evaluation, as a short text.
     """
 
     started: Callable[[dict[str, Any]], None] = lambda _chosen: None
@@ -81,6 +83,7 @@ class Watch:
     stop: Callable[[], bool] = never
     deferring: Callable[[], AbstractContextManager[object]] = nullcontext
     late: Callable[[float], float] = lambda _budget: 0.0
+    evaluating: Callable[[str], None] = silent
 
 
 def train(
@@ -215,7 +218,7 @@ def _without_steps(
     watch.started({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
     with watch.deferring():
         policy = method.load(task, writer.folder, config, "cpu")
-        return FinalEvaluation(writer, task, config, time).of(policy, 0)
+        return FinalEvaluation(writer, task, config, time, watch.evaluating).of(policy, 0)
 
 
 def _require_as_many(before: int, now: int) -> None:
@@ -261,7 +264,7 @@ class _Session:
         self.time = time
         self.schedule = schedule
         self.now = time.now
-        self.evaluation = FinalEvaluation(writer, learner.task, learner.config, time)
+        self.evaluation = FinalEvaluation(writer, learner.task, learner.config, time, watch.evaluating)
         self.pace = Pace(
             every=learner.config.every, searching=learner.searches, now=self.now(), seconds=time.seconds
         )

@@ -39,23 +39,6 @@ class Objective:
     performance_weight: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Losses per plan, (batch,) each, differentiable.
-
-    Attributes:
-        total: the loss, to be averaged over the batch.
-        stl: the part of the specification, before lambda.
-        cost: the performance terms as if every plan were satisfying, without gradient.
-        satisfied: exact verdicts of the plans that were rolled out.
-    """
-
-    total: Tensor
-    stl: Tensor
-    cost: Tensor
-    satisfied: Tensor
-
-
 def paper_objective(task: Task) -> Objective:
     """The paper's objective: hinge at gamma on log-sum-exp robustness, tanh switching (Eq. 6 to 10)."""
     declared = task.system.decl.objective
@@ -79,7 +62,7 @@ def guided_objective(margin: float, *, slope: float, performance_weight: float) 
     )
 
 
-def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
+def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
     """Compute the loss of plans (Eq. 10: L_perf + lambda L_STL).
 
     Args:
@@ -89,7 +72,7 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
         u: plans in physical units, (B, T, m), differentiable.
 
     Returns:
-        Losses per plan.
+        Loss per plan, (B,), differentiable; the performance terms count where the plan satisfies exactly.
     """
     rho, columns = _rolled(task, objective, x0, u)
     exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
@@ -98,10 +81,8 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
     if objective.saturation is not None:
         hinge = objective.saturation * torch.log1p(hinge / objective.saturation)
     cost = task.performance(columns, rho, u)
-    total = objective.stl_weight * hinge + objective.performance_weight * torch.where(
-        good, cost, torch.zeros_like(cost)
-    )
-    return Loss(total=total, stl=hinge, cost=cost.detach(), satisfied=good)
+    gated = torch.where(good, cost, torch.zeros_like(cost))
+    return objective.stl_weight * hinge + objective.performance_weight * gated
 
 
 def native_rolled(

@@ -22,8 +22,13 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     with torch.random.fork_rng():
         torch.manual_seed(0)
         policy = BestOfKPolicy(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
-    found = score(car_task, policy, n=60)
+    reports: list[str] = []
+    found = score(car_task, policy, n=60, report=reports.append)
     good = satisfied(found.rho)
+    assert reports == [
+        "evaluation, 0 of 60 held-out starts",
+        f"evaluation, search of 0 of {60 - int(good.sum())} failing starts",
+    ]
     assert 0 < int(good.sum()) < 60
     assert bool(found.known[good].all())
     assert found.feasible == float(found.known.double().mean()) > found.accuracy
