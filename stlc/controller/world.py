@@ -1,4 +1,4 @@
-"""The world of a deployment: the true environment, which the policy's model may not know.
+"""The world of a deployment: the true environment, with effects that the policy's model lacks.
 
 A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it,
 imported only when that system is deployed. Without one, independent agents follow the model and meet the

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from stlc.compile.ir import nodes as ir
 from stlc.controller.problem.pending_goals import HELD
-from stlc.controller.problem.task import KEPT, PULL, SHORT
+from stlc.controller.problem.task import GOALS, GUIDANCE, SHORTFALL
 from stlc.dynamics.declaration.learning import START
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class CostTerm:
 def cost_terms(task: Task) -> Iterator[CostTerm]:
     """Yield the terms of `Task.cost`."""
     states, controlled = task.system.objective
-    compiled, samples, goals = task.compiled, task.horizon + 1, task.promises
+    compiled, samples, goals = task.compiled, task.horizon + 1, task.pending_goals
     gamma = ir.Const(task.system.decl.objective.gamma)
 
     def shortfall(margin: ir.Num, weight: float) -> ir.Num:
@@ -92,10 +92,10 @@ def cost_terms(task: Task) -> Iterator[CostTerm]:
             samples,
             greatest=True,
             goal=goal.body,
-            value=shortfall(REDUCED, KEPT),
+            value=shortfall(REDUCED, GOALS),
             condition=pending,
         )
     if compiled.guidance_cost is not None:
-        yield CostTerm(ir.Op("mul", (ir.Const(PULL), compiled.guidance_cost)), samples)
+        yield CostTerm(ir.Op("mul", (ir.Const(GUIDANCE), compiled.guidance_cost)), samples)
     if compiled.timers:
-        yield CostTerm(shortfall(ir.Signal("rho"), SHORT), 1)
+        yield CostTerm(shortfall(ir.Signal("rho"), SHORTFALL), 1)

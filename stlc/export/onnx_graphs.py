@@ -361,8 +361,13 @@ def deepened(task: Task, states: States) -> Value:
     """`PendingGoals.deepened` of a task with at least one goal, (1, batch) booleans."""
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
+<<<<<<< HEAD
     for margin in written([each.body for each in task.promises.items], soon, count=2):
         now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
+=======
+    for margin in written([each.body for each in task.pending_goals.items], soon, count=2):
+        now, next_ = margin.spread(2, margin.shape[1])[:1], margin.spread(2, margin.shape[1])[1:]
+>>>>>>> 9a854ef (controller: one base of sources of training states; pending goals by their name; plainer sentences)
         held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
         found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
     return reduce(ONNX_OPS.either, found)
@@ -433,7 +438,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     best = _best(table["rank"].T[:count].T)
     policy = _picked(table, best)
     better = ONNX_OPS.ge(_one(table["rank"], count), policy["rank"])
-    if task.promises.items:
+    if task.pending_goals.items:
         better = ONNX_OPS.either(better, _one(table["deepened"], count))
     kept = ONNX_OPS.both(better, ONNX_OPS.ge(_one(table["rho"], count), -TOLERANCE))
     index = kept.reshaped(BATCH, 1).apply("Where", sheet.constant([[count]], "int64"), best, kind="int64")
@@ -449,7 +454,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     starts = dict(zip(names, each.reshaped(len(names), BATCH).rows(), strict=True))
     found = judged(task, starts, plans.reshaped(BATCH, steps, controls))
     rows = {"rank": rank(found), "rho": found.rho, "safe": found.safe, "cost": found.cost}
-    if task.promises.items:
+    if task.pending_goals.items:
         rows["deepened"] = deepened(task, found.states)
     table = {name: row.reshaped(BATCH, count) for name, row in rows.items()}
     requirements = joined(found.each).T.reshaped(BATCH, count, len(found.each))

@@ -74,7 +74,7 @@ def test_every_benchmark_decides_as_the_guard(spec: str, system: str, tmp_path: 
 
 def test_promises_are_gone_on_with_as_the_guard_does() -> None:
     run, folder = mission()
-    assert run.task.promises.items
+    assert run.task.pending_goals.items
     assert "kept" in driven(run, folder, "none", agents=30, steps=15)
 
 

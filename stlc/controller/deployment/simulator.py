@@ -207,8 +207,8 @@ class _Pilot:
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
         """Remainders of the previous plans of rows `due`, from measured states `seen` (rows, n).
 
-        With `replan` > 1 the policy continues a plan from its end: the last action, held for that long, may
-        hit a wall, and the previous plan would then never be kept.
+        With `replan` > 1 the policy extends a plan at its end: with the last action held for so many steps
+        the previous plan may violate the specification, and would never be retained.
         """
         if self.decision is None:
             return None

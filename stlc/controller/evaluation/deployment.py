@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -209,11 +209,7 @@ def as_json(
                     {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.viable}
                     for each in found.unsafe
                 ],
-                "latency": {
-                    "median": found.latency.median,
-                    "p99": found.latency.p99,
-                    "samples": found.latency.samples,
-                },
+                "latency": asdict(found.latency),
             }
             for name, found in deployments.items()
         },

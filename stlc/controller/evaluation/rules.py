@@ -72,7 +72,7 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Loss: the instant after which a broken rule could no longer be kept, as far as known.
+    """Loss: the instant after which a broken rule could no longer be obeyed, as far as known.
 
     A plan is known where the followed plan satisfies the plans' specification (its requirements tagged
     `@safety`, where such a rule was broken), or a search finds a plan.

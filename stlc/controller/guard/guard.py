@@ -73,7 +73,7 @@ _FIELDS = tuple(each.name for each in fields(GuardDecision))
 
 
 class Guard:
-    """Runtime safety filter: judges every plan of a policy and replaces unsafe ones.
+    """Runtime safety filter: judges every plan of a policy and replaces violating ones.
 
     Args:
         task: specification and system.
@@ -107,9 +107,9 @@ class Guard:
     def decide(self, x: Tensor, previous: GuardDecision | None = None) -> GuardDecision:
         """Decide for (agents, n) states; verdicts are computed in float64.
 
-        A previous plan that still satisfies the specification is kept where the new one is no better;
-        otherwise an agent could postpone a goal at every step. So is one that is about to increase the margin
-        of a pending goal (`stlc.controller.problem.pending_goals`).
+        The previous plan is retained where it still satisfies the specification and the new plan ranks no
+        higher; otherwise an agent could postpone a goal at every step. It is also retained where its next
+        step increases the margin of a pending goal (`stlc.controller.problem.pending_goals`).
 
         Args:
             x: (agents, n) states.
@@ -205,7 +205,7 @@ class Guard:
     def _with_previous(
         self, x: Tensor, previous: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
-        """The policy's plans, or the previous ones where they are kept."""
+        """The policy's plans; previous plans in place of those that rank no higher."""
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
         if previous is None:
@@ -219,6 +219,6 @@ class Guard:
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
         """Agents whose remaining plan increases the margin of a reached goal, (agents,) booleans."""
-        if not self.task.promises.items:
+        if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
-        return self.task.promises.deepened(rest.columns)
+        return self.task.pending_goals.deepened(rest.columns)

@@ -30,8 +30,8 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 def anchored(formula: ir.Formula) -> ir.Formula:
     """The formula with predicates on the initial state as conditions that do not limit the margin.
 
-    All plans share the initial state. To compare plans that violate `a -> always b`, the violation of b
-    counts, not the robustness of a.
+    All plans share the initial state, so plans that violate `a -> always b` are compared by the violation of
+    b, not by the robustness of a.
     """
     match formula:
         case ir.Predicate():

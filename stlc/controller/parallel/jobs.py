@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from stlc.stopping import CHILD, PATIENCE, leaving
 
 TAIL = 12
-"""Lines of a process's error output that are kept."""
+"""Number of stored lines of a process's error output."""
 
 
 @dataclass(frozen=True, slots=True)

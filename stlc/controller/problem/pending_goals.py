@@ -1,8 +1,9 @@
 """Robustness margins of pending `eventually@` goals on the mission clock.
 
 A goal such as `eventually@[0 s, 18 s] [x, y] in b` is reached at the first sample that satisfies it, with
-almost no margin, and from then on the next goal attracts. So plans that reach a pending goal are compared by
-their margin, up to gamma, and a previous plan that reaches it is kept while its margin increases.
+almost no margin; from then on the guidance cost draws plans to the next goal. Therefore plans that reach a
+pending goal are compared by their margin, up to gamma, and a previous plan that reaches it is retained while
+its margin increases.
 """
 
 from __future__ import annotations
@@ -61,11 +62,11 @@ class PendingGoals:
         self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
         statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
         found = [
-            _promise(rule.name, rule.typed.formula, compiled.grid)
+            _goal(rule.name, rule.typed.formula, compiled.grid)
             for rule in compiled.requirements
             if rule.name in statuses
         ]
-        self.items = tuple(promise for promise in found if promise is not None)
+        self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
         """Shortfall of the margins of pending goals below gamma, summed over goals: (batch,).
@@ -75,10 +76,10 @@ class PendingGoals:
         """
         clock = columns[self.clock]
         lack = torch.zeros_like(clock[0])
-        for promise, margin in zip(self.items, self._margins(columns, len(clock)), strict=True):
-            counts = (clock >= promise.first) & (clock <= promise.last)
+        for goal, margin in zip(self.items, self._margins(columns, len(clock)), strict=True):
+            counts = (clock >= goal.first) & (clock <= goal.last)
             best = torch.where(counts, margin, torch.full_like(clock, -torch.inf)).amax(0)
-            is_open = columns[promise.status][0].abs() < HELD
+            is_open = columns[goal.status][0].abs() < HELD
             lack = lack + torch.where(is_open, (self._gamma - best).clamp(0.0, self._gamma), 0.0)
         return lack
 
@@ -97,11 +98,11 @@ class PendingGoals:
     def _margins(self, columns: Mapping[str, Tensor], count: int) -> list[Tensor]:
         """Margin of every goal at the first `count` samples, (count, batch) each."""
         env = {name: column[:count] for name, column in columns.items()}
-        found: list[Tensor] = evaluate([promise.body for promise in self.items], env, ops=TORCH, count=count)
+        found: list[Tensor] = evaluate([goal.body for goal in self.items], env, ops=TORCH, count=count)
         return found
 
 
-def _promise(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
+def _goal(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
     match formula:
         case typed.Temporal(
             op="eventually",

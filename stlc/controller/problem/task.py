@@ -37,11 +37,11 @@ FLOAT32_SLACK = 1e-5
 """Float32 rounding tolerated in a margin that is 0 by construction."""
 TIE = 1e-4
 """Weight of the cost between plans of equal robustness, which is flat where a deadline cannot be met."""
-PULL = 0.1
+GUIDANCE = 0.1
 """Weight of the guidance cost towards the next goal among the performance terms."""
-KEPT = 3.0
+GOALS = 3.0
 """Weight of the margin shortfall of pending goals below gamma among the performance terms."""
-SHORT = 10.0
+SHORTFALL = 10.0
 """Weight of a mission plan's margin shortfall below gamma in the cost that selects plans."""
 
 
@@ -276,7 +276,7 @@ class Task:
             if not self.compiled.timers:
                 return cost
             gamma = self.system.decl.objective.gamma
-            return cost + SHORT * (gamma - judged.rho).clamp(0.0, gamma)
+            return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
         """Performance terms as if every plan were satisfying, with a mission's goals and guidance: (batch,).
@@ -287,20 +287,20 @@ class Task:
             u: controls, (batch, T, m).
         """
         cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
-        if self.promises.items:
-            cost = cost + KEPT * self.promises.short(columns)
-        if self._pull is None:
+        if self.pending_goals.items:
+            cost = cost + GOALS * self.pending_goals.short(columns)
+        if self._guidance is None:
             return cost
-        gap: Tensor = self._pull(columns, TORCH, HARD)["gap"]
-        return cost + PULL * gap.mean(0)
+        gap: Tensor = self._guidance(columns, TORCH, HARD)["gap"]
+        return cost + GUIDANCE * gap.mean(0)
 
     @cached_property
-    def promises(self) -> PendingGoals:
+    def pending_goals(self) -> PendingGoals:
         """Pending goals of the mission with their required margin."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
-    def _pull(self) -> ArrayProgram | None:
+    def _guidance(self) -> ArrayProgram | None:
         """Guidance cost: distance to the next goal of the mission, per sample."""
         return (
             None

@@ -1,11 +1,12 @@
-"""Plans found by exploration: a tree of plan prefixes, extended from those that reached something new.
+"""Plans found by exploration: a tree of plan prefixes, extended from those that reached new cells.
 
 Local search changes whole plans; where many goals have to be reached in order, hardly any change reaches one
-more without losing others. So plans are built from prefixes here. For every prefix, bounds over all
-continuations tell which parts of the specification are violated for good, which are satisfied, and which are
-open. Prefixes with a violated part are dropped. The others are kept in layers (one per step of the plan), the
-best per cell: satisfied parts and region of the state space. Prefixes that are advanced, or in rarely visited
-cells, are extended first (Ecoffet et al. 2021, "First return, then explore").
+more without losing others. Therefore plans are built from prefixes here. For every prefix, bounds over all
+continuations show which parts of the specification every continuation violates, which every continuation
+satisfies, and which are open. Prefixes with a violated part are dropped. The others form layers, one per
+length; a layer holds the best prefix per cell, a combination of satisfied parts and region of the state
+space. Advanced prefixes and those in rarely visited cells are extended first (Ecoffet et al. 2021, "First
+return, then explore").
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Plan repair by batched local search on the exact robustness, starting from the policy's own plan.
 
-Gradients vanish outside a stop zone and do not lead across an obstacle; a search does. Each generation tries
-a batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a
+Gradients vanish outside a stop zone and do not lead across an obstacle; a search does. Each generation judges
+a batch of changed plans per state and retains the best. Changes are noise over a random stretch of time, a
 constant shift of a stretch, a stretch held at one random level, and plans that solved other states. The
 native kernel does it if there is one, otherwise torch.
 """
@@ -153,7 +153,7 @@ class Searcher:
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
     ) -> SearchResult:
-        """Improve plans until they reach the target robustness or the evaluations are used up.
+        """Improve plans up to the target robustness, with a maximum number of evaluations.
 
         Args:
             x0: states, (B, n).

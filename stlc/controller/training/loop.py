@@ -74,7 +74,7 @@ class Watch:
         stop: called after every step; True saves and ends the training.
         deferring: context of the steps, in which an interrupt waits until the step is finished and saved.
             Outside of it an interrupt may be raised anywhere.
-        late: wall-time budget -> seconds by which work before and after the training would exceed it.
+        late: wall-time budget -> seconds by which the work around the training would exceed it.
         evaluating: called with the progress of the final evaluation, as a short text.
     """
 

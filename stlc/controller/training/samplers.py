@@ -1,7 +1,7 @@
 """Sources of training states: independent draws, a fixed set, states along missions, solved hard states.
 
 Where a specification has memory (clock, statuses, timers), a state is useful for training only if a mission
-reaches it: the memory must fit the position. So many missions are simulated in parallel with the plans of the
+reaches it: the memory must fit the position. Therefore a pool of missions is simulated with the plans of the
 present policy, and the states on the way are returned. A mission ends when it is over or lost, and often
 where no plan satisfies the specification; a new one starts in its place. Early in training missions end
 early; later they get further, and plans that search found for failing states continue some of them.
@@ -9,9 +9,10 @@ early; later they get further, and plans that search found for failing states co
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import torch
 from torch import Tensor
@@ -31,53 +32,50 @@ if TYPE_CHECKING:
 BLOCK = 8192
 
 
-class Supply(Protocol):
-    """Interface of a source of training states."""
+class Supply(ABC):
+    """Source of training states.
+
+    Attributes:
+        block: states drawn and not yet returned, (k, n).
+        device: of the states.
+    """
+
+    state: ClassVar[tuple[str, ...]] = ("block",)
+    """Attributes that determine the next states."""
+
+    def __init__(self, task: Task, generator: torch.Generator, device: torch.device) -> None:
+        self.task, self.generator, self.device = task, generator, device
+        self.block = torch.empty(0, len(task.system.names), device=device)
+
+    @abstractmethod
+    def _more(self, n: int) -> Tensor:
+        """Draw states, preferably at least `n`: (k, dim)."""
 
     def take(self, n: int) -> Tensor:
         """Return the next `n` states, (n, dim), float32."""
-
-    def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Use plans that solve states on which the policy fails: (k, n), (k, T, m)."""
-
-    def tensors(self) -> dict[str, Tensor]:
-        """State of the source, by name."""
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state of `tensors`."""
-
-
-class Draws:
-    """Independent initial states.
-
-    Attributes:
-        block: drawn states not yet returned, (k, n).
-    """
-
-    def __init__(self, task: Task, generator: torch.Generator, device: torch.device) -> None:
-        self._task = task
-        self._generator = generator
-        self._device = device
-        self.block = torch.empty(0, len(task.system.names), device=device)
-
-    def take(self, n: int) -> Tensor:
-        """Return `n` fresh states, (n, dim), float32."""
         while self.block.shape[0] < n:
-            drawn = self._task.sample(max(n, BLOCK), generator=self._generator, device=self._device)
-            self.block = torch.cat((self.block, drawn))
+            self.block = torch.cat((self.block, self._more(n)))
         taken, self.block = self.block[:n], self.block[n:]
         return taken
 
-    def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Ignored: draws are independent."""
+    def follow(self, states: Tensor, plans: Tensor) -> None:  # noqa: B027
+        """Use plans that solve states on which the policy fails: (k, n), (k, T, m); ignored by default."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """States drawn and not yet returned."""
-        return {"block": self.block}
+        """State of the source, by name."""
+        return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore the state of `tensors`."""
-        self.block = tensors["block"].to(self._device)
+        for name in self.state:
+            setattr(self, name, tensors[name].to(self.device))
+
+
+class Draws(Supply):
+    """Independent initial states."""
+
+    def _more(self, n: int) -> Tensor:
+        return self.task.sample(max(n, BLOCK), generator=self.generator, device=self.device)
 
 
 class FixedSet:
@@ -102,9 +100,6 @@ class FixedSet:
         taken, self.queue = self.queue[:n], self.queue[n:]
         return self.states[taken]
 
-    def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Ignored: the set is fixed."""
-
     def tensors(self) -> dict[str, Tensor]:
         """The set, and the rest of the present pass."""
         return {"states": self.states, "queue": self.queue}
@@ -128,7 +123,7 @@ GIVE_UP = 0.3
 """Probability that a mission ends after a leg whose plan fails."""
 
 
-class Missions:
+class Missions(Supply):
     """States along missions simulated with a planner.
 
     Attributes:
@@ -137,54 +132,37 @@ class Missions:
         age: steps since the start of each mission, (POOL,).
     """
 
-    def __init__(self, task: Task, generator: torch.Generator, device: torch.device, plan: Planner) -> None:
-        self._task, self._plan = task, plan
-        self._generator, self._device = generator, device
-        self.block = torch.empty(0, len(task.system.names), device=device)
-        self.pool = self.block
-        self.age = torch.empty(0, device=device)
+    state = ("block", "pool", "age")
 
-    def take(self, n: int) -> Tensor:
-        """Return `n` states not returned before, (n, dim), float32."""
-        while self.block.shape[0] < n:
-            self.block = torch.cat((self.block, self._visited()))
-        taken, self.block = self.block[:n], self.block[n:]
-        return taken
+    def __init__(self, task: Task, generator: torch.Generator, device: torch.device, plan: Planner) -> None:
+        super().__init__(task, generator, device)
+        self._plan, self.pool = plan, self.block
+        self.age = torch.empty(0, device=device)
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
         """Continue some missions from states reached by plans that solve states on which the policy fails."""
         if len(states) and len(self.pool):
-            judged = self._task.judge(states, plans)
+            judged = self.task.judge(states, plans)
             reached = self._at(judged, self._legs(len(states)))
             place = self._order(len(self.pool))
             place = place[: len(states)]
             self.pool[place], self.age[place] = reached[: len(place)], 0.0
 
-    def tensors(self) -> dict[str, Tensor]:
-        """State of all missions."""
-        return {"block": self.block, "pool": self.pool, "age": self.age}
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state of `tensors`."""
-        self.block, self.pool, self.age = (
-            tensors[name].to(self._device) for name in ("block", "pool", "age")
-        )
-
     # ------------------------------------------------------------------ simulation
 
     @torch.no_grad()
-    def _visited(self) -> Tensor:
+    def _more(self, _n: int) -> Tensor:
         """Simulate every mission for one leg, and return states on the way in random order, (k, n)."""
         if not len(self.pool):
-            self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self._device)
+            self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
         judged = self._plan(self.pool)
         legs = self._legs(len(self.pool))
         shares = [self._rand(len(legs)) for _ in range(GLIMPSES - 1)]
         glimpses = [self._at(judged, (legs * share).long()) for share in shares]
         self.pool, self.age = self._at(judged, legs), self.age + legs
         seen = torch.cat((*glimpses, self.pool))
-        seen = seen[self._task.alive(seen)]
+        seen = seen[self.task.alive(seen)]
         self._begin_anew(satisfied(judged.rho))
         starts = self._starts(max(int(STARTS * len(seen)), 1))
         seen = torch.cat((seen, starts))
@@ -193,29 +171,29 @@ class Missions:
     def _begin_anew(self, good: Tensor) -> None:
         """Restart missions that are over or lost, and some whose plan failed."""
         given_up = ~good & (self._rand(len(good)) < GIVE_UP)
-        ended = (self.age > mission_steps(self._task)) | ~self._task.alive(self.pool) | given_up
+        ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
         """Random number of steps for which plans are followed, up to half of the horizon, (n,) int64."""
-        most = max(self._task.horizon // 2, 1)
-        return torch.randint(1, most + 1, (n,), generator=self._generator).to(self._device)
+        most = max(self.task.horizon // 2, 1)
+        return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
         """Predicted states after `steps`, one number per row: (n, dim)."""
         return torch.stack(
-            [judged.columns[name].gather(0, steps[None])[0] for name in self._task.system.names], 1
+            [judged.columns[name].gather(0, steps[None])[0] for name in self.task.system.names], 1
         )
 
     def _starts(self, n: int) -> Tensor:
-        return self._task.sample(n, generator=self._generator, device=self._device)
+        return self.task.sample(n, generator=self.generator, device=self.device)
 
     def _rand(self, n: int) -> Tensor:
-        return torch.rand(n, generator=self._generator).to(self._device)
+        return torch.rand(n, generator=self.generator).to(self.device)
 
     def _order(self, n: int) -> Tensor:
-        return torch.randperm(n, generator=self._generator).to(self._device)
+        return torch.randperm(n, generator=self.generator).to(self.device)
 
 
 def mission_steps(task: Task) -> int:

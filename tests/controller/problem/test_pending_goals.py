@@ -12,7 +12,7 @@ from torch import Tensor
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.pending_goals import PendingGoals
-from stlc.controller.problem.task import KEPT, Task
+from stlc.controller.problem.task import GOALS, Task
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
@@ -54,7 +54,7 @@ def columns(task: Task, x: list[float], clock: int = 0, there: float = 0.0) -> d
 
 
 def test_only_requirements_that_are_one_promise_are_told(task: Task) -> None:
-    (promise,) = task.promises.items
+    (promise,) = task.pending_goals.items
     assert (promise.status, promise.first, promise.last) == ("there", 2.0, 20.0)
 
 
@@ -70,19 +70,19 @@ def test_only_requirements_that_are_one_promise_are_told(task: Task) -> None:
 def test_an_open_promise_lacks_what_the_deepest_sample_lacks(
     task: Task, path: list[float], lack: float
 ) -> None:
-    short = task.promises.short(columns(task, path))
+    short = task.pending_goals.short(columns(task, path))
     assert short.item() == pytest.approx(lack, abs=1e-6)
 
 
 def test_what_is_kept_or_over_lacks_nothing_or_all(task: Task) -> None:
-    assert task.promises.short(columns(task, [0.0, 1.0, 2.1], there=1.0)).item() == 0.0
-    assert task.promises.short(columns(task, [2.1] * 3, clock=19)).item() == pytest.approx(0.2, abs=1e-6)
-    assert task.promises.short(columns(task, [2.1] * 3, clock=21)).item() == pytest.approx(0.3)
+    assert task.pending_goals.short(columns(task, [0.0, 1.0, 2.1], there=1.0)).item() == 0.0
+    assert task.pending_goals.short(columns(task, [2.1] * 3, clock=19)).item() == pytest.approx(0.2, abs=1e-6)
+    assert task.pending_goals.short(columns(task, [2.1] * 3, clock=21)).item() == pytest.approx(0.3)
 
 
 def test_the_gradient_goes_into_the_deepest_sample(task: Task) -> None:
     found = columns(task, [0.0, 1.0, 1.0, 2.1, 2.05])
-    task.promises.short(found).sum().backward()  # type: ignore[no-untyped-call]
+    task.pending_goals.short(found).sum().backward()  # type: ignore[no-untyped-call]
     gradient = found["x"].grad
     assert gradient is not None
     assert gradient[:, 0].tolist() == [0.0, 0.0, 0.0, -1.0, 0.0]
@@ -93,7 +93,7 @@ def test_it_is_a_performance_term_of_missions(task: Task) -> None:
     deep = {**found, "x": found["x"] + torch.tensor([0.0] * 8 + [0.1])[:, None]}
     rho, u = torch.zeros(1), torch.zeros(1, 8, 1)
     difference = task.performance(found, rho, u) - task.performance(deep, rho, u)
-    assert difference.item() == pytest.approx(KEPT * 0.1, abs=5e-3)
+    assert difference.item() == pytest.approx(GOALS * 0.1, abs=5e-3)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_it_is_a_performance_term_of_missions(task: Task) -> None:
     [([2.1, 2.2], True), ([2.2, 2.1], False), ([2.4, 2.5], False), ([1.9, 2.1], False)],
 )
 def test_a_plan_goes_on_while_it_gets_further_in(task: Task, path: list[float], goes_on: bool) -> None:
-    assert task.promises.deepened(columns(task, path)).tolist() == [goes_on]
+    assert task.pending_goals.deepened(columns(task, path)).tolist() == [goes_on]
 
 
 class Leaver(Policy):
@@ -132,5 +132,5 @@ def test_without_a_mission_there_are_no_promises(tmp_path: Path) -> None:
     path.write_text(LINE)
     spec = parse(Source("line.stl", "spec line\nstate signal x [m]\nrequire low: always[0, T] x < 3 m\n"))
     task = Task.of(spec, System.load(path))
-    assert isinstance(task.promises, PendingGoals)
-    assert task.promises.items == ()
+    assert isinstance(task.pending_goals, PendingGoals)
+    assert task.pending_goals.items == ()

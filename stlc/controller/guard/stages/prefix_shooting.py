@@ -25,7 +25,7 @@ HANDED_ON = 65_536
 
 
 class PrefixShooting(GuardStage):
-    """The shortest prefix with a satisfying plan, or else a safe one.
+    """Stage: the shortest prefix with a satisfying plan, else the shortest with a safe plan.
 
     Ties are broken by robustness, then by the performance terms of the objective, because robustness is flat
     where a deadline cannot be met, then by closeness to the policy.
