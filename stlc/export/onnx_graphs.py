@@ -361,13 +361,8 @@ def deepened(task: Task, states: States) -> Value:
     """`PendingGoals.deepened` of a task with at least one goal, (1, batch) booleans."""
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
-<<<<<<< HEAD
-    for margin in written([each.body for each in task.promises.items], soon, count=2):
-        now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
-=======
     for margin in written([each.body for each in task.pending_goals.items], soon, count=2):
-        now, next_ = margin.spread(2, margin.shape[1])[:1], margin.spread(2, margin.shape[1])[1:]
->>>>>>> 9a854ef (controller: one base of sources of training states; pending goals by their name; plainer sentences)
+        now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
         held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
         found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
     return reduce(ONNX_OPS.either, found)

@@ -30,13 +30,8 @@ def test_promises_deepen_as_the_task_says() -> None:
     x[:, 0] = torch.linspace(-1.0, 1.0, 80)
     x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
-<<<<<<< HEAD
-    wanted = run.task.promises.deepened(run.task.judge(x, plans).columns)
-    sheet = OnnxGraph()
-=======
     wanted = run.task.pending_goals.deepened(run.task.judge(x, plans).columns)
-    sheet = Sheet()
->>>>>>> 9a854ef (controller: one base of sources of training states; pending goals by their name; plainer sentences)
+    sheet = OnnxGraph()
     start = columns_of(sheet.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
     given = sheet.input("plan", (BATCH, run.task.horizon, 1))
     found = deepened(run.task, judged(run.task, start, given).states)
