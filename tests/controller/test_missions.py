@@ -128,9 +128,9 @@ def test_a_supply_goes_on_where_it_was(task: Task) -> None:
     one, other = missions(task), missions(task)
     one.take(1000)
     one.follow(one.take(10), steered(task, one.take(10)))
-    generator = one._generator.get_state()
+    generator = one.generator.get_state()
     other.restore({name: value.clone() for name, value in one.tensors().items()})
-    other._generator.set_state(generator)
+    other.generator.set_state(generator)
     for _ in range(5):
         assert torch.equal(one.take(GLIMPSES * POOL), other.take(GLIMPSES * POOL))
 
