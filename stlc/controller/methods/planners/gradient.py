@@ -67,7 +67,7 @@ class Gradient:
                 plans = squash(raw, controls)
                 search.offer(rows[going], plans.detach()[going])
                 if step < self.steps:
-                    value = loss(task, objective, x0, plans.flatten(0, 1)).total.sum()
+                    value = loss(task, objective, x0, plans.flatten(0, 1)).sum()
                     adam.zero_grad(set_to_none=True)
                     value.backward()  # type: ignore[no-untyped-call]
                     adam.step()
