@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.sheet import BATCH, GraphBody, Value
+from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, MissingError, UsageError
@@ -26,8 +26,7 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
-    from onnx import GraphProto, NodeProto, TensorProto, ValueInfoProto
+    from onnx import GraphProto, NodeProto, ValueInfoProto
 
     from stlc.compile.backends.onnx.sheet import GraphNode, OnnxGraph
     from stlc.controller.problem.task import Task
@@ -78,7 +77,7 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 
 def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
     """Graph of the nodes on which the outputs depend; outputs have their public names."""
-    from onnx import helper
+    from onnx import helper, numpy_helper
 
     shown = list(outputs)
     nodes = sheet.needed([value for _, value in shown])
@@ -89,7 +88,7 @@ def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) ->
         name,
         [_declared(each, each.name) for each in sheet.inputs],
         [_declared(value, outside) for outside, value in shown],
-        [_constant(key, sheet.constants[key]) for key in sheet.constants if key in read],
+        [numpy_helper.from_array(array, key) for key, array in sheet.constants.items() if key in read],
     )
 
 
@@ -107,23 +106,11 @@ def _node(node: GraphNode) -> NodeProto:
     return made
 
 
-def _constant(name: str, array: NDArray[Any]) -> TensorProto:
-    from onnx import numpy_helper
-
-    return numpy_helper.from_array(array, name)
-
-
 def _declared(value: Value, name: str) -> ValueInfoProto:
-    from onnx import TensorProto, helper
+    from onnx import helper
 
-    codes = {
-        "float64": TensorProto.DOUBLE,
-        "float32": TensorProto.FLOAT,
-        "int64": TensorProto.INT64,
-        "bool": TensorProto.BOOL,
-    }
     shape = ["batch" if length == BATCH else length for length in value.shape]
-    return helper.make_tensor_value_info(name, codes[value.kind], shape)
+    return helper.make_tensor_value_info(name, KINDS[value.kind], shape)
 
 
 # ---------------------------------------------------------------------------------------- a controller

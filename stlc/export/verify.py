@@ -49,6 +49,11 @@ class Agreement:
     rho: float
     ties: int
 
+    def worst(self, other: Agreement, *distances: float) -> Agreement:
+        """Return the worst of two agreements, and of further distances of a robustness."""
+        rho = max(self.rho, other.rho, *distances)
+        return Agreement(self.states, max(self.plan, other.plan), rho, self.ties + other.ties)
+
 
 def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
     """Compare an export with its policy in random states.

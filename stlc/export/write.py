@@ -108,8 +108,7 @@ def _torch(run: Run, folder: Path) -> Checked:
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
     fresh = agreement(run.policy, by_torch(path), states=STATES)
     guarded = backup_agreement(run.policy, backup, states=STATES // 16)
-    off = max(fresh.rho, guarded.rho)
-    return Agreement(STATES, max(fresh.plan, guarded.plan), off, fresh.ties + guarded.ties), None
+    return fresh.worst(guarded), None
 
 
 def _onnx(run: Run, folder: Path) -> Checked:
@@ -118,9 +117,8 @@ def _onnx(run: Run, folder: Path) -> Checked:
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
     kept = previous_plan_agreement(run.policy, graphs, states=STATES)
-    off = max(fresh.rho, kept.rho, same_verdicts(run.task, graphs, states=STATES // 4))
-    found = Agreement(STATES, max(fresh.plan, kept.plan), off, fresh.ties + kept.ties)
-    return found, timed(run.task, folder)
+    off = same_verdicts(run.task, graphs, states=STATES // 4)
+    return fresh.worst(kept, off), timed(run.task, folder)
 
 
 def _c(run: Run, folder: Path) -> Checked:

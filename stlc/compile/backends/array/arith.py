@@ -142,7 +142,8 @@ class _Bound:
         registers = self.registers.copy()
         for name, register in self.inputs:
             value = env[name]
-            registers[register] = _array(value, env, ops) if isinstance(value, (int, float)) else value
+            constant = isinstance(value, (int, float))
+            registers[register] = ops.full((), float(value), _first(env)) if constant else value
         for kernel, args, register in self.code:
             registers[register] = kernel(*[registers[arg] for arg in args])
         out = {name: registers[register] for name, register in self.arrays.items()}
@@ -154,10 +155,6 @@ class _Bound:
 
 def _first(env: Mapping[str, Array]) -> Array:
     return next(value for value in env.values() if not isinstance(value, (int, float)))
-
-
-def _array(value: float, env: Mapping[str, Array], ops: Ops) -> Array:
-    return ops.full((), float(value), _first(env))
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from stlc.compile.backends.c.emit import HEAD, Motion, passes, place_in_step, roots_in, state_index
+from stlc.compile.backends.c.emit import HEAD, Motion, along_roots, passes, place_in_step, state_index
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.backends.c.printer import StepPrinter
@@ -50,7 +50,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
     """
     plan = plan_of(formulas, motion.steps + 1)
     printer = StepPrinter(plan, state_index(motion))
-    blocks = [roots_in(plan)]
+    blocks = [along_roots(plan, "LANE g{value} += g[{i}][j];")]
     blocks += [printer.backward([step]) for step in reversed(plan.schedule.steps)]
     states, controls, steps = len(motion.states), len(motion.controls), motion.steps
     return "\n".join(
@@ -74,7 +74,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
 
 def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
     """Adjoint of a step for one lane: from the gradient at sample k + 1 to sample k and the controls."""
-    index = {name: i for i, name in enumerate(motion.states)}
+    index = state_index(motion)
     writer = SlopeWriter(place_in_step(motion), soft=True)
     for name, num in motion.lets:
         writer.bound[name] = writer.number(num)

@@ -119,17 +119,20 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
     """Return statements that fill the buffers of a plan and output the robustness of each formula."""
     printer = StepPrinter(plan, index)
-    return [*(printer.forward([step]) for step in plan.schedule.steps), _roots_out(plan)]
+    roots = along_roots(plan, "LANE out[{i}][j] = {value};")
+    return [*(printer.forward([step]) for step in plan.schedule.steps), roots]
 
 
-def _roots_out(plan: Plan) -> list[str]:
-    """Statements that copy the robustness of each requirement to the output, in order."""
-    return [_along(i, root, rows, "LANE out[{i}][j] = {value};") for i, root, rows in _side_by_side(plan)]
-
-
-def roots_in(plan: Plan) -> list[str]:
-    """Return statements that add the gradient of each requirement to its buffer, in order."""
-    return [_along(i, root, rows, "LANE g{value} += g[{i}][j];") for i, root, rows in _side_by_side(plan)]
+def along_roots(plan: Plan, form: str) -> list[str]:
+    """Return a statement per requirement, with its index `{i}` and the place `{value}` of its robustness."""
+    lines = []
+    for first, root, rows in _side_by_side(plan):
+        if rows == 1:
+            lines.append(form.format(i=first, value=root.buffer[str(root.row)]))
+        else:
+            text = form.format(i=f"{first} + i", value=root.buffer[f"{root.row} + i"])
+            lines.append(f"for (int i = 0; i < {rows}; ++i) {text}")
+    return lines
 
 
 def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
@@ -141,13 +144,6 @@ def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
         else:
             runs.append((i, root, 1))
     return runs
-
-
-def _along(first: int, root: Storage, rows: int, form: str) -> str:
-    if rows == 1:
-        return form.format(i=first, value=root.buffer[str(root.row)])
-    text = form.format(i=f"{first} + i", value=root.buffer[f"{root.row} + i"])
-    return f"for (int i = 0; i < {rows}; ++i) {text}"
 
 
 CHECK = Frame(

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
+KINDS: Mapping[Kind, int] = {"float32": 1, "int64": 7, "bool": 9, "float64": 11}
+"""Element type -> its number in `onnx.TensorProto.DataType`."""
 Attribute: TypeAlias = "int | tuple[int, ...] | GraphBody"
 
 BATCH = 1 << 40
@@ -230,8 +232,7 @@ class Value:
         """Convert to another element type."""
         if kind == self.kind:
             return self
-        code = {"float32": 1, "int64": 7, "bool": 9, "float64": 11}[kind]
-        (out,) = self.sheet.emit("Cast", (self,), [self.shape], kind, {"to": code})
+        (out,) = self.sheet.emit("Cast", (self,), [self.shape], kind, {"to": KINDS[kind]})
         return out
 
     # --------------------------------------------------------------------- shapes
