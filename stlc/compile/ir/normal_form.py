@@ -31,6 +31,8 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
     """
     op = getattr(formula, "op", "")
     match formula:
+        case typed.Predicate():
+            return formula if sign > 0 else typed.Not(formula.span, formula)
         case typed.Truth(_, value):
             return formula if sign > 0 else replace(formula, value=not value)
         case typed.Not(_, body):

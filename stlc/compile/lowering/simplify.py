@@ -15,7 +15,7 @@ from typing import Any
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
-from stlc.compile.ir.traverse import frozen_in, map_children, numbers, substitute_frozen
+from stlc.compile.ir.traverse import frozen_in, map_children, numbers, operands, substitute_frozen
 from stlc.compile.semantics.semantics import Exact, Semantics
 
 _EXACT = Exact()
@@ -35,18 +35,20 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
 
 
 def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
+    """Merge nested operators, and remove repetitions and constants."""
     flat: list[ir.Formula] = []
     for item in whole.items:
-        nested = semantics.associative and isinstance(item, ir.BoolOp) and item.op == whole.op
-        flat += item.items if nested and isinstance(item, ir.BoolOp) else (item,)
+        same = isinstance(item, ir.BoolOp) and item.op == whole.op and semantics.associative
+        flat += operands(item) if same else (item,)
     if semantics.idempotent:
         flat = list(dict.fromkeys(flat))
     return joined(whole.op, flat, ir.Truth(whole.op == "and", whole.span))
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
+    """Remove windows over constants and windows [0, 0]; merge nested windows of one operator."""
     body, window = node.body, node.window
-    every = node.op in ("always", "historically")
+    every = node.op == node.names[0]
     if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
         return replace(body, span=node.span)
     if window == _NOW:
@@ -96,12 +98,8 @@ def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
     strong = node.op in ("until", "since")
     if not (isinstance(node.left, ir.Truth) and node.left.value is strong):
         return node
-    if isinstance(node, ir.Until):
-        later = ir.Temporal("eventually" if strong else "always", node.window, node.right, node.span)
-        return simplify(later, semantics)
-    return simplify(
-        ir.PastTemporal("once" if strong else "historically", node.window, node.right, node.span), semantics
-    )
+    kind: Any = ir.PastTemporal if node.back else ir.Temporal
+    return simplify(kind(kind.names[strong], node.window, node.right, node.span), semantics)
 
 
 _LAWS: Mapping[type, Callable[[Any, Semantics], ir.Formula]] = MappingProxyType(
