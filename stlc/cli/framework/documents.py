@@ -448,8 +448,8 @@ class RemovedRuns(TypedDict):
 
 class MetricValues(TypedDict):
     mean: Num
-    low: Num
-    high: Num
+    low: Num | None
+    high: Num | None
     values: list[Num]
 
 
