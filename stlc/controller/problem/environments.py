@@ -1,23 +1,26 @@
 """Episodes of a task on its model, many side by side: the environment of learners of one action a step.
 
 An episode begins at a random initial state and has as many steps as a plan. Rewards are those that the paper
-compares (RL_S, RL_A): the robustness of an episode, or whether it satisfies the specification, at its end.
+compares: the declared one of every step (RL_R), the robustness of an episode (RL_S), or whether it satisfies
+the specification (RL_A), at its end.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import torch
 from torch import Tensor
 
 from stlc.controller.problem.task import satisfied
+from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
-Reward: TypeAlias = Literal["robustness", "accuracy"]
+Reward: TypeAlias = Literal["task", "robustness", "accuracy"]
+"""Reward of learners; `task` is the one that the system file declares (`train: {reward: …}`)."""
 
 SATISFIED = 100.0
 """Reward `accuracy` of an episode that satisfies the specification (the paper's RL_A)."""
@@ -52,6 +55,8 @@ class Transition:
 class Environments:
     """Episodes of one task, side by side in one batch; all begin and end together.
 
+    Raises UsageError (U101) for reward `task` where the system declares none, or for another name.
+
     Attributes:
         task: specification and system.
         count: number of episodes, N.
@@ -63,6 +68,10 @@ class Environments:
         self, task: Task, count: int, *, reward: Reward = "robustness", generator: torch.Generator
     ) -> None:
         self.task, self.count, self.steps = task, count, task.system.horizon
+        if reward not in get_args(Reward):
+            raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(get_args(Reward))}")
+        if reward == "task":
+            task.system.require_reward()
         self._reward, self._generator = reward, generator
         self.states = task.sample(count, generator=generator)
         self._start, self._step = self.states, 0
@@ -95,20 +104,26 @@ class Environments:
         system = self.task.system
         held = torch.clamp(actions.to(self.states), system.control_low, system.control_high)
         self._actions[:, self._step] = held
-        self.states = system.step(self.states, held)
+        before, self.states = self.states, system.step(self.states, held)
         self._step += 1
         over = self._step == self.steps
         final = self.observe(self.states, self._step)
         done = torch.full((self.count,), over)
-        reward, rho = self._rewarded(over)
+        reward, rho = self._rewarded(before, held, over)
         return Transition(self.reset() if over else final, reward, done, final, rho)
 
-    def _rewarded(self, over: bool) -> tuple[Tensor, Tensor]:
-        """Reward of a step, and the robustness of the episodes if it is `over`."""
-        nothing = self.states.new_zeros(self.count)
+    def _rewarded(self, before: Tensor, held: Tensor, over: bool) -> tuple[Tensor, Tensor]:
+        """Reward of the step from `before` with controls `held`; robustness of episodes that are `over`."""
+        system, earned = self.task.system, self.states.new_zeros(self.count)
+        if self._reward == "task":
+            earned = system.reward(self.states, system.commanded(before, held))
         if not over:
-            return nothing, torch.full_like(nothing, torch.nan)
+            return earned, torch.full_like(earned, torch.nan)
         rho = self.task.judge(self._start, self._actions, states=False).rho
-        if self._reward == "accuracy":
-            return SATISFIED * satisfied(rho).to(rho), rho
-        return torch.nan_to_num(rho).clamp(-MOST, MOST), rho
+        match self._reward:
+            case "task":
+                return earned, rho
+            case "accuracy":
+                return SATISFIED * satisfied(rho).to(rho), rho
+            case "robustness":
+                return torch.nan_to_num(rho).clamp(-MOST, MOST), rho

@@ -282,6 +282,9 @@ class TrainDecl:
     batch: int | None = key(integer(), "fresh initial states a step")
     samples: int | None = key(integer(), "size of the training set of `method: gradient`")
     method: str | None = key(word(METHODS), "training method")
+    reward: ir.Num | None = key(
+        _absolute, "reward of a step by states after it and controls in it, for `reward: task`"
+    )
 
 
 def _seconds(value: Fraction | None) -> float | None:

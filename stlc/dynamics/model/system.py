@@ -17,7 +17,7 @@ from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.load import load_system_decl
@@ -290,6 +290,26 @@ class System:
         observe = self.decl.policy.observe
         seen = (*observe, *(ir.Signal(column.name) for column in self.added))
         return ArrayProgram({str(i): num for i, num in enumerate(seen)}) if observe else None
+
+    def reward(self, after: Tensor, u: Tensor) -> Tensor:
+        """The declared reward of a step into states (B, n) under actuator commands (B, m): (B,).
+
+        Raises UsageError (U101) where the file declares none.
+        """
+        found: Tensor = self._reward({**self._named(after), **self._inputs(u)}, TORCH, HARD)["reward"]
+        return found.expand(len(after))
+
+    @cached_property
+    def _reward(self) -> ArrayProgram:
+        return ArrayProgram({"reward": self.require_reward()})
+
+    def require_reward(self) -> ir.Num:
+        """The declared reward of a step. Raises UsageError (U101) where the file declares none."""
+        if self.decl.train.reward is not None:
+            return self.decl.train.reward
+        message = f"the system `{self.decl.name}` declares no reward of a step"
+        declare = f"declare one in {self.decl.path.name}: train: {{reward: EXPRESSION}}"
+        raise usage(message, declare, "or choose the reward `robustness` or `accuracy`")
 
     @cached_property
     def mirror(self) -> Mirror | None:

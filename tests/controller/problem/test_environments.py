@@ -1,9 +1,18 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 import torch
 
 from stlc.controller.problem.environments import SATISFIED, Environments
 from stlc.controller.problem.task import Task
+from stlc.diagnostics import UsageError
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
+
+ROOT = Path(__file__).parents[3]
 
 
 def episode(task: Task, reward: str) -> tuple[Environments, torch.Tensor, list]:
@@ -41,3 +50,64 @@ def test_episodes_move_as_the_model_says(car_task: Task) -> None:
     before = made.states
     made.step(torch.full((4, 1), 99.0))
     assert torch.equal(made.states, car_task.system.step(before, torch.full((4, 1), 10.0)))
+
+
+RULE = "state signal x [m]\nrequire r: always[0, T] x < 9 m\n"
+DRIFT = (
+    "stlc: 1\nname: drift\ntime: {dt: 0.1 s, horizon: 3 steps}\nstate: {x: {unit: m, range: [-9, 9]}}\n"
+    "control: {u: {unit: m/s, range: [-6, 6]}}\nflow: {x: 'u'}\ninit: {mixture: [{draw: {x: 0.5}}]}\n"
+)
+
+
+def drift(folder: Path, more: str) -> Task:
+    (folder / "drift.yaml").write_text(DRIFT + more)
+    return Task.of(parse(Source("r.stl", RULE)), System.load(folder / "drift.yaml"))
+
+
+def test_the_declared_reward_is_that_of_the_state_after_each_step(tmp_path: Path) -> None:
+    task = drift(tmp_path, "train: {reward: '10 * ind(x > 0.7 m) + x / (1 m) - abs(u) / (1 m/s)'}\n")
+    made = Environments(task, 2, reward="task", generator=torch.Generator())
+    made.reset()
+    steps = [made.step(torch.tensor([[u], [-9.0]])) for u in (1.0, 9.0, 0.0)]
+    assert torch.stack([step.reward for step in steps], 1).tolist() == [
+        pytest.approx([0.6 - 1.0, 11.2 - 6.0, 11.2]),
+        pytest.approx([-0.1 - 6.0, -0.7 - 6.0, -1.3 - 6.0]),
+    ]
+    assert steps[-1].satisfied.tolist() == [True, True]
+
+
+def test_a_reward_of_controls_reads_what_actuators_get(tmp_path: Path) -> None:
+    task = drift(tmp_path, "policy: {feedback: {gain: {u: {x: 2}}}}\ntrain: {reward: u / (1 m/s)}\n")
+    made = Environments(task, 1, reward="task", generator=torch.Generator())
+    made.reset()
+    assert made.step(torch.zeros(1, 1)).reward.item() == pytest.approx(-1.0)
+
+
+def test_a_reward_that_is_not_declared_is_an_error(tmp_path: Path) -> None:
+    task = drift(tmp_path, "")
+    with pytest.raises(UsageError, match="`drift` declares no reward"):
+        Environments(task, 2, reward="task", generator=torch.Generator())
+    with pytest.raises(UsageError, match="no reward `rho`"):
+        Environments(task, 2, reward="rho", generator=torch.Generator())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "reward"),
+    [
+        ("car", {"sign": 0, "x": 0.5, "tau": 0.5, "v": 4, "dx": -1}, -1000 + 2),
+        ("car", {"sign": 0, "x": -0.4, "yielding": 1, "tau": 1, "v": 4, "dx": 5}, -100 + 2 + 2),
+        ("car", {"sign": 1, "x": -0.4, "tau": 3, "v": 4, "dx": 0.5}, -100 - 50),
+        ("car", {"sign": 1, "x": -4, "tau": 5, "v": 4, "dx": -1}, 2),
+        ("maze", {"dy": -0.25, "x": 2, "x0": 1, "l0": 2, "g0": 2.1, "x1": 1, "l1": 3, "g1": -1}, 0),
+        ("maze", {"dy": 2.25, "x": 2, "x0": 1, "l0": 2, "g0": 2, "x1": 3, "l1": 1, "g1": 2}, 100),
+        ("ship_safe", {"y": 2.1, "x1": 0.5, "y1": 2, "r1": 1, "x2": 9, "r2": 1}, 10 - 200),
+        ("ship_track", {"y": 0.4, "tau": -1, "x1": -5, "r1": 1}, 10 - 100),
+        ("rover", {"x": 4, "y": 4, "xc": 4, "yc": 4.5, "tau_b": 3, "tau_s": -1}, 20),
+        ("rover", {"x": 1, "y": -0.1, "xd": 1, "xc": 9, "yc": 9, "tau_b": -1, "tau_s": 0}, -200 + 10),
+        ("panda", {"q[3]": -1, "q[5]": -1}, -100),
+    ],
+)
+def test_rewards_of_the_paper(name: str, state: dict[str, float], reward: float) -> None:
+    system = System.load(ROOT / "examples" / f"{name}.yaml")
+    x = torch.tensor([[state.get(column, 0.0) for column in system.names]])
+    assert system.reward(x, system.control_low[None]).item() == pytest.approx(reward)
