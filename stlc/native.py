@@ -219,6 +219,58 @@ class Adjoint:
         return out
 
 
+class Advance:
+    """The compiled functions `advance` and `look`; see `stlc.compile.backends.c.advance`.
+
+    Args:
+        library: with the two functions.
+        seen: number of values that the policy reads, k.
+        rewarded: whether a reward is compiled in.
+    """
+
+    def __init__(self, library: ctypes.CDLL, *, seen: int, rewarded: bool) -> None:
+        self._advance, self._look = library.advance, library.look
+        pointer = ctypes.c_void_p
+        self._advance.argtypes = [
+            ctypes.c_int64,
+            pointer,
+            pointer,
+            ctypes.c_double,
+            pointer,
+            pointer,
+            pointer,
+        ]
+        self._look.argtypes = [ctypes.c_int64, pointer, ctypes.c_double, pointer]
+        self._advance.restype = self._look.restype = None
+        self._seen, self._rewarded = seen, rewarded
+
+    def advance(
+        self, x: NDArray[np.float64], u: NDArray[np.float64], share: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64] | None]:
+        """One exact step.
+
+        Args:
+            x: states, (B, n), contiguous.
+            u: controls, (B, m), contiguous.
+            share: last value of every observation.
+
+        Returns:
+            The states after the step (B, n), their observations (B, k + 1), and the rewards (B,) or None.
+        """
+        after = np.empty_like(x)
+        seen = np.empty((len(x), self._seen + 1), dtype=np.float32)
+        reward = np.empty(len(x)) if self._rewarded else None
+        where = None if reward is None else reward.ctypes.data
+        self._advance(len(x), x.ctypes.data, u.ctypes.data, share, after.ctypes.data, seen.ctypes.data, where)
+        return after, seen, reward
+
+    def look(self, x: NDArray[np.float64], share: float) -> NDArray[np.float32]:
+        """Observations of states, (B, n) contiguous -> (B, k + 1), with `share` as the last value."""
+        seen = np.empty((len(x), self._seen + 1), dtype=np.float32)
+        self._look(len(x), x.ctypes.data, share, seen.ctypes.data)
+        return seen
+
+
 def _share(
     rows: Callable[[int, int], int], batch: int, threads: int, *, grain: int = GRAIN, stop: Stop = never
 ) -> None:

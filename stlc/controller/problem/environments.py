@@ -13,19 +13,40 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import torch
 from torch import Tensor
 
+from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import satisfied
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
+    from stlc.controller.problem.task import PlanVerdicts, Task
 
 Reward: TypeAlias = Literal["task", "robustness", "accuracy"]
 """Reward of learners; `task` is the one that the system file declares (`train: {reward: …}`)."""
+REWARDS: tuple[Reward, ...] = get_args(Reward)
 
 SATISFIED = 100.0
 """Reward `accuracy` of an episode that satisfies the specification (the paper's RL_A)."""
 MOST = 10.0
 """Bound on both sides of the reward `robustness`, which may be infinite."""
+
+
+def require_reward(task: Task, reward: str) -> None:
+    """Raise UsageError (U101) where there is no such reward, or the system declares none for `task`."""
+    if reward not in REWARDS:
+        raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(REWARDS)}")
+    if reward == "task":
+        task.system.require_reward()
+
+
+def reward_at_end(reward: Reward, rho: Tensor) -> Tensor:
+    """Reward of episodes at their end, by their robustness: (N,) -> (N,); 0 for `task`."""
+    match reward:
+        case "task":
+            return torch.zeros_like(rho)
+        case "accuracy":
+            return SATISFIED * satisfied(rho).to(rho)
+        case "robustness":
+            return torch.nan_to_num(rho).clamp(-MOST, MOST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +59,8 @@ class Transition:
         done: where an episode ended, (N,) bool.
         final: observation after the step, before any reset, (N, k).
         rho: robustness of the episodes that ended, (N,); NaN elsewhere.
+        verdicts: exact verdicts on the episodes; None before their end.
+        states: after the step, before any reset, (N, n).
     """
 
     observation: Tensor
@@ -45,6 +68,8 @@ class Transition:
     done: Tensor
     final: Tensor
     rho: Tensor
+    verdicts: PlanVerdicts | None
+    states: Tensor
 
     @property
     def satisfied(self) -> Tensor:
@@ -54,6 +79,15 @@ class Transition:
 
 class Environments:
     """Episodes of one task, side by side in one batch; all begin and end together.
+
+    Steps are compiled to C where possible. States are float64, what a learner reads is float32.
+
+    Args:
+        task: specification and system.
+        count: number of episodes, N.
+        reward: of learners.
+        generator: of initial states.
+        ahead: number of initial states to draw at a time, which makes short batches faster; 0: `count`.
 
     Raises UsageError (U101) for reward `task` where the system declares none, or for another name.
 
@@ -65,17 +99,21 @@ class Environments:
     """
 
     def __init__(
-        self, task: Task, count: int, *, reward: Reward = "robustness", generator: torch.Generator
+        self,
+        task: Task,
+        count: int,
+        *,
+        reward: Reward = "robustness",
+        generator: torch.Generator,
+        ahead: int = 0,
     ) -> None:
+        require_reward(task, reward)
         self.task, self.count, self.steps = task, count, task.system.horizon
-        if reward not in get_args(Reward):
-            raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(get_args(Reward))}")
-        if reward == "task":
-            task.system.require_reward()
-        self._reward, self._generator = reward, generator
-        self.states = task.sample(count, generator=generator)
-        self._start, self._step = self.states, 0
-        self._actions = self.states.new_zeros(count, self.steps, len(task.system.control_names))
+        self._reward, self._generator, self._ahead = reward, generator, ahead
+        self._native = NativeStep.of(task.system, rewarded=reward == "task")
+        self._low, self._high = task.system.control_low.double(), task.system.control_high.double()
+        self._drawn = torch.empty(0, len(task.system.names), dtype=torch.float64)
+        self._begin(self._starts())
 
     @property
     def width(self) -> int:
@@ -88,11 +126,17 @@ class Environments:
         return torch.cat((seen, seen.new_full((*seen.shape[:-1], 1), step / self.steps)), -1)
 
     @torch.no_grad()
-    def reset(self) -> Tensor:
-        """Draw new initial states; return their observations, (N, k)."""
-        self.states = self.task.sample(self.count, generator=self._generator)
-        self._start, self._step = self.states, 0
-        return self.observe(self.states, 0)
+    def reset(self, states: Tensor | None = None) -> Tensor:
+        """Begin all episodes anew, at new initial states or at `states` (N, n); return observations (N, k)."""
+        self._begin(self._starts() if states is None else states.double())
+        if self._native is not None:
+            return self._native.look(self.states, 0.0)
+        return self.observe(self.states, 0).float()
+
+    def seed(self, seed: int) -> None:
+        """Seed the initial states from the next reset on, and forget those drawn ahead."""
+        self._generator.manual_seed(seed)
+        self._drawn = self._drawn[:0]
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> Transition:
@@ -101,29 +145,40 @@ class Environments:
         Args:
             actions: in physical units, clipped to their ranges, (N, m).
         """
-        system = self.task.system
-        held = torch.clamp(actions.to(self.states), system.control_low, system.control_high)
+        held = torch.clamp(actions.double(), self._low, self._high)
         self._actions[:, self._step] = held
-        before, self.states = self.states, system.step(self.states, held)
         self._step += 1
-        over = self._step == self.steps
-        final = self.observe(self.states, self._step)
+        self.states, final, earned = self._moved(held)
+        over, states = self._step == self.steps, self.states
         done = torch.full((self.count,), over)
-        reward, rho = self._rewarded(before, held, over)
-        return Transition(self.reset() if over else final, reward, done, final, rho)
-
-    def _rewarded(self, before: Tensor, held: Tensor, over: bool) -> tuple[Tensor, Tensor]:
-        """Reward of the step from `before` with controls `held`; robustness of episodes that are `over`."""
-        system, earned = self.task.system, self.states.new_zeros(self.count)
-        if self._reward == "task":
-            earned = system.reward(self.states, system.commanded(before, held))
         if not over:
-            return earned, torch.full_like(earned, torch.nan)
-        rho = self.task.judge(self._start, self._actions, states=False).rho
-        match self._reward:
-            case "task":
-                return earned, rho
-            case "accuracy":
-                return SATISFIED * satisfied(rho).to(rho), rho
-            case "robustness":
-                return torch.nan_to_num(rho).clamp(-MOST, MOST), rho
+            return Transition(final, earned, done, final, torch.full((self.count,), torch.nan), None, states)
+        verdicts = self.task.judge(self._start, self._actions, states=False)
+        reward = earned + reward_at_end(self._reward, verdicts.rho).float()
+        return Transition(self.reset(), reward, done, final, verdicts.rho.float(), verdicts, states)
+
+    def _moved(self, held: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States after a step, their observations, and the declared rewards, 0 unless asked for."""
+        share = self._step / self.steps
+        if self._native is not None:
+            after, seen, reward = self._native.advance(self.states, held, share)
+        else:
+            system = self.task.system
+            after, reward = system.step(self.states, held), None
+            seen = self.observe(after, self._step).float()
+            if self._reward == "task":
+                reward = system.reward(after, system.commanded(self.states, held))
+        return after, seen, torch.zeros(self.count) if reward is None else reward.float()
+
+    def _begin(self, states: Tensor) -> None:
+        self.states = self._start = states
+        self._step = 0
+        self._actions = torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
+
+    def _starts(self) -> Tensor:
+        """Initial states, (N, n) float64."""
+        if len(self._drawn) < self.count:
+            drawn = max(self.count, self._ahead)
+            self._drawn = self.task.sample(drawn, generator=self._generator, dtype=torch.float64)
+        starts, self._drawn = self._drawn[: self.count], self._drawn[self.count :]
+        return starts.contiguous()

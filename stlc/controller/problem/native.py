@@ -1,4 +1,4 @@
-"""Native code of a task, built from its dynamics and requirements: verdicts, local search and gradients.
+"""Native code of a task, built from dynamics and requirements: verdicts, local search, gradients, single steps.
 
 Verdicts equal those of the torch graph and are tens of times faster: a training step in torch is about a
 thousand small array operations, here two calls. Without a compiler, on another device, or for formulas
@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.advance import emit_advance
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.native import Adjoint, Kernel, ObjectiveSlopes, SearchOptions, Stop, load, never, why_none
+from stlc.dynamics.model.step import commands
+from stlc.native import Adjoint, Advance, Kernel, ObjectiveSlopes, SearchOptions, Stop, load, never, why_none
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
@@ -200,6 +202,50 @@ class _Judged(torch.autograd.Function):
             threads=torch.get_num_threads(),
         )
         return None, None, torch.from_numpy(gradient).to(u.dtype), None
+
+
+class NativeStep:
+    """One exact step of a system with its observation and declared reward, on the CPU.
+
+    Attributes:
+        compiled: the two functions.
+    """
+
+    def __init__(self, compiled: Advance) -> None:
+        self.compiled = compiled
+
+    @classmethod
+    def of(cls, system: System, *, rewarded: bool) -> NativeStep | None:
+        """Build for a system; None where torch has to be used.
+
+        Raises UsageError (U101) where a reward is wanted (`rewarded`) and the file declares none.
+        """
+        reward = system.require_reward() if rewarded else None
+        given = commands(system.decl)
+        try:
+            text = emit_advance(motion_of(system), observed=system.observed, reward=reward, commands=given)
+        except Untranslatable:
+            return None
+        library = load(text)
+        return (
+            None if library is None else cls(Advance(library, seen=system.observed_count, rewarded=rewarded))
+        )
+
+    def advance(self, x: Tensor, u: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor | None]:
+        """States (B, n), observations (B, k + 1) float32 with `share` last, and rewards (B,) after a step.
+
+        Args:
+            x: states, (B, n) float64.
+            u: plans, (B, m) float64.
+            share: elapsed share of the episode after the step.
+        """
+        after, seen, reward = self.compiled.advance(x.contiguous().numpy(), u.contiguous().numpy(), share)
+        earned = None if reward is None else torch.from_numpy(reward)
+        return torch.from_numpy(after), torch.from_numpy(seen), earned
+
+    def look(self, x: Tensor, share: float) -> Tensor:
+        """Observations of states (B, n) float64 with `share` last, (B, k + 1) float32."""
+        return torch.from_numpy(self.compiled.look(x.contiguous().numpy(), share))
 
 
 def reason(text: Callable[[], str]) -> str:

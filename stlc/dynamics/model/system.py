@@ -134,8 +134,7 @@ class System:
     @property
     def observed_count(self) -> int:
         """Number of inputs of the policy."""
-        observe = self.decl.policy.observe
-        return len(observe) + len(self.added) if observe else len(self.names)
+        return len(self.observed)
 
     # -------------------------------------------------------------------- motion
 
@@ -286,10 +285,17 @@ class System:
         return torch.stack([seen[str(i)].expand(x.shape[:-1]) for i in range(self.observed_count)], -1)
 
     @cached_property
+    def observed(self) -> tuple[ir.Num, ...]:
+        """Inputs of the policy as numbers over the states, parameters and timers last."""
+        states = (ir.Signal(name) for name in self.decl.signature.names)
+        added = (ir.Signal(column.name) for column in self.added)
+        return (*(self.decl.policy.observe or states), *added)
+
+    @cached_property
     def _observation(self) -> ArrayProgram | None:
-        observe = self.decl.policy.observe
-        seen = (*observe, *(ir.Signal(column.name) for column in self.added))
-        return ArrayProgram({str(i): num for i, num in enumerate(seen)}) if observe else None
+        """The inputs of the policy as a program; None where they are the states."""
+        seen = {str(i): num for i, num in enumerate(self.observed)}
+        return ArrayProgram(seen) if self.decl.policy.observe else None
 
     def reward(self, after: Tensor, u: Tensor) -> Tensor:
         """The declared reward of a step into states (B, n) under actuator commands (B, m): (B,).

@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from stlc.controller.problem.environments import SATISFIED, Environments
+from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
+from stlc.files import find_system, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
@@ -30,7 +32,7 @@ def test_the_reward_is_the_robustness_of_the_episode(car_task: Task) -> None:
     plans = torch.full((64, made.steps, 1), -10.0)
     rho = car_task.judge(first, plans, states=False).rho
     assert all(float(step.reward.abs().sum()) == 0.0 and not bool(step.done.any()) for step in steps[:-1])
-    assert torch.equal(steps[-1].reward, rho.clamp(-10.0, 10.0))
+    assert torch.equal(steps[-1].reward, rho.clamp(-10.0, 10.0).float())
     assert bool(steps[-1].done.all())
     assert steps[-1].final.shape == steps[-1].observation.shape == (64, made.width)
     assert steps[-1].final[:, -1].tolist() == [1.0] * 64
@@ -49,7 +51,7 @@ def test_episodes_move_as_the_model_says(car_task: Task) -> None:
     made.reset()
     before = made.states
     made.step(torch.full((4, 1), 99.0))
-    assert torch.equal(made.states, car_task.system.step(before, torch.full((4, 1), 10.0)))
+    torch.testing.assert_close(made.states, car_task.system.step(before, torch.full((4, 1), 10.0)))
 
 
 RULE = "state signal x [m]\nrequire r: always[0, T] x < 9 m\n"
@@ -111,3 +113,63 @@ def test_rewards_of_the_paper(name: str, state: dict[str, float], reward: float)
     system = System.load(ROOT / "examples" / f"{name}.yaml")
     x = torch.tensor([[state.get(column, 0.0) for column in system.names]])
     assert system.reward(x, system.control_low[None]).item() == pytest.approx(reward)
+
+
+def of_benchmark(name: str) -> Task:
+    path = ROOT / "specs" / f"{name}.stl"
+    spec = parse(read_source(path))
+    assert spec.system is not None
+    return Task.of(spec, System.load(find_system(spec.system, path)))
+
+
+BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_steps_in_c_are_those_of_torch(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    task, made = of_benchmark(name), []
+    for native in (True, False):
+        if not native:
+            monkeypatch.setattr(NativeStep, "of", lambda *_, **__: None)
+        generator = torch.Generator().manual_seed(5)
+        made.append(Environments(task, 37, reward="task", generator=generator))
+    assert made[0]._native is not None
+    torch.testing.assert_close(made[0].reset(), made[1].reset())
+    generator = torch.Generator().manual_seed(6)
+    for _ in range(made[0].steps + 3):
+        shape = (37, len(task.system.control_names))
+        low, high = task.system.control_low, task.system.control_high
+        action = low + (high - low) * torch.rand(shape, generator=generator)
+        ours, theirs = (each.step(action) for each in made)
+        for field in ("states", "final", "observation", "reward", "rho", "done"):
+            torch.testing.assert_close(getattr(ours, field), getattr(theirs, field), equal_nan=True)
+
+
+def test_a_mission_observes_its_timers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "drift.yaml").write_text(DRIFT + "policy: {observe: [2 * x]}\n")
+    rule = "state signal x [m]\nrequire r: eventually@[0 s, 1 s] x > 0.7 m\n"
+    task = Task.of(parse(Source("r.stl", rule)), System.load(tmp_path / "drift.yaml"))
+    made = [Environments(task, 3, generator=torch.Generator())]
+    assert made[0]._native is not None
+    monkeypatch.setattr(NativeStep, "of", lambda *_, **__: None)
+    made.append(Environments(task, 3, generator=torch.Generator()))
+    for each in made:
+        each.reset()
+    for _ in range(3):
+        ours, theirs = (each.step(torch.tensor([[1.0], [2.0], [3.0]])) for each in made)
+        torch.testing.assert_close(ours.final, theirs.final)
+        assert ours.final.shape[1] == 2 + len(task.system.timers) > 2
+
+
+def test_episodes_begin_where_they_are_told_and_repeat_with_their_seed(car_task: Task) -> None:
+    made = Environments(car_task, 4, generator=torch.Generator(), ahead=64)
+    given = car_task.sample(4, seed=9, dtype=torch.float64)
+    made.reset(given)
+    assert torch.equal(made.states, given)
+    starts = []
+    for _ in range(2):
+        made.seed(7)
+        starts.append((made.reset(), made.reset()))
+    assert torch.equal(starts[0][0], starts[1][0])
+    assert torch.equal(starts[0][1], starts[1][1])
+    assert not torch.equal(*starts[0])

@@ -1,0 +1,131 @@
+"""C translation unit of one step of a system, with its observation and reward, for many states at once.
+
+Exact switching and double precision, `LANES` states at a time; observations are float32, as learners read them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from stlc.compile.backends.c.emit import HEAD, Motion, state_index
+from stlc.compile.backends.c.numbers import NumberWriter
+from stlc.compile.backends.numbers import Leaf
+from stlc.compile.ir import nodes as ir
+
+
+def emit_advance(
+    motion: Motion, *, observed: Sequence[ir.Num], reward: ir.Num | None, commands: Mapping[str, ir.Num]
+) -> str:
+    """Return the C source of `advance` and `look`; see `stlc.native.Advance` for their signatures.
+
+    Args:
+        motion: one step of the system.
+        observed: numbers that the policy reads, over the states.
+        reward: of a step, over the states after it and the commands in it; None for none.
+        commands: control -> what its actuator gets, over states before the step and controls; those that are
+            absent get the control itself.
+
+    Raises:
+        Untranslatable: the IR has a node without a C form.
+    """
+    states, controls = len(motion.states), len(motion.controls)
+    return "\n".join(
+        [
+            HEAD,
+            "typedef double lane[LANES];",
+            *_function(
+                "step", "const lane *restrict u, lane *restrict y, lane *restrict c", _step(motion, commands)
+            ),
+            *_function("see", "lane *restrict y", _numbers(motion, observed)),
+            *_function(
+                "earn",
+                "const lane *restrict u, lane *restrict y",
+                _numbers(motion, [ir.Const(0.0) if reward is None else reward]),
+            ),
+            _DRIVER.format(states=states, controls=max(controls, 1), inputs=controls, seen=len(observed)),
+        ]
+    )
+
+
+def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
+    head = f"static void {name}(const lane *restrict x, {more}) {{"
+    return [head, "  LANE {", *(f"    {line}" for line in body), "  }", "}"]
+
+
+def _writer(motion: Motion) -> NumberWriter:
+    """Writer of numbers over the states `x` and the controls `u`, of lane `j`."""
+    index = state_index(motion)
+
+    def place(leaf: Leaf) -> str | None:
+        if not isinstance(leaf, ir.Signal):
+            return None
+        if leaf.name in index:
+            return f"x[{index[leaf.name]}][j]"
+        return f"u[{motion.controls.index(leaf.name)}][j]"
+
+    return NumberWriter(place)
+
+
+def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
+    """Body of a step: next states `y` and commands `c` from states `x` and controls `u`."""
+    index, writer = state_index(motion), _writer(motion)
+    given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
+    for name, num in motion.lets:
+        writer.bound[name] = writer.number(num)
+    after = {name: writer.number(num) for name, num in motion.next.items()}
+    moved = [f"y[{i}][j] = {after.get(name, f'x[{i}][j]')};" for name, i in index.items()]
+    return [*writer.lines, *moved, *(f"c[{i}][j] = {value};" for i, value in enumerate(given))]
+
+
+def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
+    """Body that writes numbers over states `x` and commands `u` to `y`."""
+    writer = _writer(motion)
+    values = [writer.number(num) for num in numbers]
+    return [*writer.lines, *(f"y[{i}][j] = {value};" for i, value in enumerate(values))]
+
+
+_DRIVER = """
+enum {{ N = {states}, M = {controls}, INPUTS = {inputs}, K = {seen} }};
+
+static void shown(int64_t at, int here, const lane *restrict y, double share, float *restrict seen) {{
+  lane s[K + 1];
+  see(y, s);
+  for (int j = 0; j < here; ++j) {{
+    for (int i = 0; i < K; ++i) seen[(at + j) * (K + 1) + i] = (float)s[i][j];
+    seen[(at + j) * (K + 1) + K] = (float)share;
+  }}
+}}
+
+/* x (batch, {states}), u (batch, {inputs}) -> after (batch, {states}), seen (batch, {seen} + 1) with `share` last,
+   reward (batch) where asked for. */
+void advance(int64_t batch, const double *restrict from, const double *restrict given, double share,
+             double *restrict after, float *restrict seen, double *restrict reward) {{
+  lane x[N], y[N], u[M], c[M], r[1];
+  for (int64_t at = 0; at < batch; at += LANES) {{
+    const int here = batch - at < LANES ? (int)(batch - at) : LANES;
+    for (int j = 0; j < LANES; ++j) {{
+      const int64_t row = at + (j < here ? j : 0);
+      for (int i = 0; i < N; ++i) x[i][j] = from[row * N + i];
+      for (int i = 0; i < INPUTS; ++i) u[i][j] = given[row * INPUTS + i];
+    }}
+    step((const lane *)x, (const lane *)u, y, c);
+    for (int j = 0; j < here; ++j) for (int i = 0; i < N; ++i) after[(at + j) * N + i] = y[i][j];
+    shown(at, here, (const lane *)y, share, seen);
+    if (reward) {{
+      earn((const lane *)y, (const lane *)c, r);
+      for (int j = 0; j < here; ++j) reward[at + j] = r[0][j];
+    }}
+  }}
+}}
+
+/* x (batch, {states}) -> seen (batch, {seen} + 1) with `share` last. */
+void look(int64_t batch, const double *restrict from, double share, float *restrict seen) {{
+  lane x[N];
+  for (int64_t at = 0; at < batch; at += LANES) {{
+    const int here = batch - at < LANES ? (int)(batch - at) : LANES;
+    for (int j = 0; j < LANES; ++j)
+      for (int i = 0; i < N; ++i) x[i][j] = from[(at + (j < here ? j : 0)) * N + i];
+    shown(at, here, (const lane *)x, share, seen);
+  }}
+}}
+"""
