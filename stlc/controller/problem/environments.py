@@ -113,7 +113,9 @@ class Environments:
         self._native = NativeStep.of(task.system, rewarded=reward == "task")
         self._low, self._high = task.system.control_low.double(), task.system.control_high.double()
         self._drawn = torch.empty(0, len(task.system.names), dtype=torch.float64)
-        self._begin(self._starts())
+        self._step = 0
+        self._actions = self._blank()
+        self.states = self._start = self._starts()
 
     @property
     def width(self) -> int:
@@ -127,7 +129,7 @@ class Environments:
 
     @torch.no_grad()
     def reset(self, states: Tensor | None = None) -> Tensor:
-        """Begin all episodes anew, at new initial states or at `states` (N, n); return observations (N, k)."""
+        """Begin all episodes, at new initial states or at `states` (N, n); return observations (N, k)."""
         self._begin(self._starts() if states is None else states.double())
         if self._native is not None:
             return self._native.look(self.states, 0.0)
@@ -173,7 +175,11 @@ class Environments:
     def _begin(self, states: Tensor) -> None:
         self.states = self._start = states
         self._step = 0
-        self._actions = torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
+        self._actions = self._blank()
+
+    def _blank(self) -> Tensor:
+        """Actions of an episode, (N, T, m)."""
+        return torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
 
     def _starts(self) -> Tensor:
         """Initial states, (N, n) float64."""

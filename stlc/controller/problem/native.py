@@ -1,4 +1,4 @@
-"""Native code of a task, built from dynamics and requirements: verdicts, local search, gradients, single steps.
+"""Native code of a task, from its dynamics and requirements: verdicts, local search, gradients, steps.
 
 Verdicts equal those of the torch graph and are tens of times faster: a training step in torch is about a
 thousand small array operations, here two calls. Without a compiler, on another device, or for formulas

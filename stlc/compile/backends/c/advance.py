@@ -1,6 +1,6 @@
 """C translation unit of one step of a system, with its observation and reward, for many states at once.
 
-Exact switching and double precision, `LANES` states at a time; observations are float32, as learners read them.
+Exact switching and double precision, `LANES` states at a time; observations are float32, which learners read.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ static void shown(int64_t at, int here, const lane *restrict y, double share, fl
   }}
 }}
 
-/* x (batch, {states}), u (batch, {inputs}) -> after (batch, {states}), seen (batch, {seen} + 1) with `share` last,
-   reward (batch) where asked for. */
+/* x (batch, {states}), u (batch, {inputs}) -> after (batch, {states}), seen (batch, {seen} + 1) with
+   `share` last, reward (batch) where asked for. */
 void advance(int64_t batch, const double *restrict from, const double *restrict given, double share,
              double *restrict after, float *restrict seen, double *restrict reward) {{
   lane x[N], y[N], u[M], c[M], r[1];
