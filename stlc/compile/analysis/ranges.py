@@ -14,9 +14,10 @@ _DEVIATIONS = 3.0
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
-    """Return the range that holds nearly all draws of a sampler, or None where it is unknown.
+    """Return the range that contains nearly all draws of a sampler such as `uniform`; None if unknown.
 
-    The arguments must be constant; a constant may be added or multiplied, as by unit conversions.
+    The sampler's arguments must be constant; a constant may be added to it or multiplied by it, as unit
+    conversions do.
     """
     match num:
         case ir.Const(value):
@@ -46,11 +47,11 @@ KnownRanges: TypeAlias = Mapping[str, Bounds]
 
 
 def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
-    """Return an interval that encloses `num`, by interval arithmetic, or None where `facts` do not bound it.
+    """Return an interval that contains all values of `num`; None if the known ranges do not bound it.
 
     Args:
         num: a number in SI units.
-        facts: enforced ranges of columns, in stored units.
+        facts: ranges that columns never leave, in stored units.
     """
     match num:
         case ir.Const(value):

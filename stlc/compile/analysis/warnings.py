@@ -20,7 +20,7 @@ _TOLERANCE = 1e-6
 
 
 def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
-    """Yield W505 for each conjunction in a formula that is unsatisfiable for all signal values."""
+    """Yield W505 for each conjunction in a formula that no values of its signals satisfy."""
     reported: set[Span] = set()
     for node in nodes(formula):
         if isinstance(node, typed.Logic) and node.op == "and" and node.span not in reported:
@@ -32,7 +32,7 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """Bounds of a quantity that predicates impose, with the predicates that attain them."""
+    """Bounds that predicates impose on a quantity, and the predicates that impose the tightest."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -42,7 +42,7 @@ class _Room:
 
 @dataclass(frozen=True, slots=True)
 class _Linear:
-    """Linear form of a number: terms with coefficients, and a constant."""
+    """Linear form of a number: a coefficient for each of its terms, and a constant."""
 
     parts: dict[ir.Num, float] = field(default_factory=dict)
     constant: float = 0.0
@@ -84,7 +84,7 @@ def _contradiction(node: typed.Logic) -> Diagnostic | None:
 
 
 def _conjuncts(formula: typed.Formula) -> Iterator[typed.Predicate]:
-    """Yield the predicates that must all hold at one instant."""
+    """Yield the predicates of a conjunction, all of which must hold at the same instant."""
     match formula:
         case typed.Predicate():
             yield formula
@@ -114,7 +114,7 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield a warning for each predicate with a modulo that is discontinuous within its signals' ranges.
+    """Yield W403 for each predicate with a modulo that is discontinuous within its signals' ranges.
 
     Args:
         formula: resolved formula.
@@ -148,9 +148,9 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W503 for implications whose left side is never true, and for a formula that is never false.
+    """Yield W503 for implications whose left side is never true, or else for a formula never false.
 
-    Only enforced ranges are used: a nominal range does not constrain the signal.
+    Only ranges that signals never leave (`facts`) are used: a nominal range does not constrain a signal.
     """
     found = False
     for left in _antecedents(formula):
@@ -167,7 +167,10 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) ->
 
 
 def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
-    """Return the truth value at all instants of all traces within the enforced ranges; None if it varies."""
+    """Return the truth of a formula within the enforced ranges, or None if it varies.
+
+    The result holds at all instants of all traces whose signals stay in these ranges.
+    """
     return _truth(normal(formula), facts)
 
 
@@ -193,7 +196,7 @@ def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """Yield the left sides of implications that must hold, under no negation."""
+    """Yield the left sides of the implications that must always hold, those under a negation left out."""
     match formula:
         case typed.Logic(_, "->", (left, right)):
             yield left
@@ -208,7 +211,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
-    """Return the text `: x is in [0, 5]` for the columns whose enforced ranges decide the formula."""
+    """Return `: x is in [0, 5]`, the enforced ranges of the signals in a formula; "" without any."""
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
     for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):
@@ -223,7 +226,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
 
 
 def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
-    """Return W502 for a `@safety` requirement that no finite prefix can violate."""
+    """Return W502 for a `@safety` requirement that no finite prefix of a trace violates, else None."""
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):
         return None
@@ -242,7 +245,10 @@ def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -
 
 
 def _constrains(formula: typed.Formula) -> bool:
-    """True if some finite prefix, shorter than the horizon, can violate a formula in negation normal form."""
+    """True if some prefix of a trace, shorter than the horizon, violates the formula.
+
+    The formula is in negation normal form.
+    """
     if isinstance(formula, typed.Truth):
         return False
     match formula:
@@ -266,7 +272,7 @@ def _open(window: typed.Interval) -> bool:
 
 
 def _promise(formula: typed.Formula) -> Span:
-    """Return the place of the part that no finite prefix can violate."""
+    """Return the source location of the part of a formula that no finite prefix of a trace violates."""
     if isinstance(formula, typed.Freeze):
         return _promise(formula.body)
     if isinstance(formula, typed.Logic):

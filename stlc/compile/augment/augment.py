@@ -35,9 +35,11 @@ class Augmented:
     """Requirement rewritten for training.
 
     Attributes:
-        formula: formula that every plan has to satisfy.
-        alive: test of the state: the requirement can still be satisfied after the mission so far.
-        goal: absolute formulas of the requirement; None without any.
+        formula: formula that every plan must satisfy.
+        alive: state formula that holds while the requirement can still be satisfied, given the mission
+            before.
+        goal: absolute formulas of the requirement (`always@[a, b]` and its like, whose intervals count from
+            the start of the mission), joined by `and` and `or`; None without any.
     """
 
     formula: typed.Formula
@@ -48,11 +50,12 @@ class Augmented:
 def augment(
     requirement: typed.Requirement, grid: Grid, table: TimerTable, sink: list[Diagnostic]
 ) -> Augmented:
-    """Rewrite the formula of a requirement; append the states that it needs to `table`.
+    """Rewrite the formula of a requirement for training; add the states that it needs to `table`.
 
-    Findings are appended to `sink`: E307 for an absolute interval that cannot be hoisted out of the enclosing
-    operators, E309 for a past operator that no timer represents, E310 for an absolute operator whose body has
-    future operators, E312 for one without a deadline, E311 for a missing horizon.
+    Absolute operators (`always@[a, b]` and its like) have an interval that counts from the start of the
+    mission. Findings are appended to `sink`: E307 for an absolute operator that cannot be moved out of the
+    operators around it, E309 for a past operator that no timer represents, E310 for an absolute operator over
+    too much of the future, E312 for one without a deadline, E311 for a missing horizon.
     """
     formula = requirement.formula
     always = typed.Truth(formula.span, True)
@@ -77,7 +80,7 @@ def augment(
 @final
 @dataclass(frozen=True, slots=True)
 class _Goals:
-    """Builder of the goals of one requirement."""
+    """Builder of the goals of one requirement: its absolute formulas, each with its added states."""
 
     grid: Grid
     table: TimerTable
@@ -85,9 +88,10 @@ class _Goals:
     name: str
 
     def of(self, node: typed.Formula) -> Goal:
-        """Return the goals of a formula without past operators, evaluated at the start of the mission.
+        """Return the goals of a formula that is evaluated at the start of the mission.
 
-        Relative operators become absolute ones: at that sample relative and mission time agree.
+        The formula has no past operators. Relative operators become absolute ones: at the first sample,
+        relative time and mission time are equal.
         """
         if is_state(node, augmented=True):
             return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
@@ -134,7 +138,10 @@ _LATCHED: Mapping[AbsoluteOp, str] = {
 
 
 def _about(formula: Absolute) -> str:
-    """Return the description of a status: `open | true | false`, and the condition that latches it."""
+    """Return the description of a status, an added state that is open, true or false.
+
+    The description says which condition decides the status for the rest of the mission.
+    """
     left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
     window = formula.window
     if formula.right.span == formula.left.span:  # rewritten, with no text of its own

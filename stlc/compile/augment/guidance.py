@@ -1,8 +1,8 @@
 """Guidance cost: a performance term that drives plans towards deadlines beyond their horizon.
 
-Robustness sees only the horizon. The open goal with the earliest deadline therefore adds the violation of its
-formula, `max(-margin, 0)`, at every sample, so plans that approach it sooner cost less. Once it is met, the
-goal with the next deadline takes over.
+Robustness covers only the horizon. Therefore the open goal with the earliest deadline adds the violation of
+its formula, `max(-margin, 0)`, to the cost at every sample, so that plans that approach the goal sooner cost
+less. Once it is met, the goal with the next deadline takes over.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class _Guidance:
     """Guidance towards a goal.
 
     Attributes:
-        gap: violation of the goal.
-        left: steps until its deadline; `_DONE` or `_LOST`.
+        gap: violation of the goal, `max(-margin, 0)`.
+        left: steps until its deadline; `_DONE` if it is already met, `_LOST` if it can no longer be met.
     """
 
     gap: ir.Num
@@ -35,7 +35,10 @@ class _Guidance:
 
 
 def guidance_cost(goals: Sequence[Goal]) -> ir.Num | None:
-    """Return the violation of the goal with the earliest deadline, at one sample; None without such goals."""
+    """Return the guidance cost at one sample: the violation of the goal with the earliest deadline.
+
+    The result is None if no goal has a deadline.
+    """
     costs = [cost for goal in goals if (cost := _guidance(goal)) is not None]
     if not costs:
         return None
@@ -60,7 +63,10 @@ def _guidance(goal: Goal) -> _Guidance | None:
 
 
 def _leaf(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the guidance of a pending `eventually` or `until`, or of `always` before its window begins."""
+    """Return the guidance of an absolute formula, or None if it needs none.
+
+    Guided are `eventually` and `until` while open, `always` before its window begins, and recurring goals.
+    """
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
         return recurring
@@ -81,7 +87,10 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring(leaf: GoalLeaf) -> _Guidance | None:
-    """Guidance of a recurring goal, `always@[a, end] once[0, c] p`: p is due c after it last held."""
+    """Return the guidance of a recurring goal, `always@[a, end] once[0, c] p`, or None for another.
+
+    Its deadline is c after the last sample at which p held.
+    """
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
     costs = [cost for part in parts if (cost := _recurring_part(part, leaf)) is not None]
@@ -89,7 +98,11 @@ def _recurring(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
-    """Guidance of one recurring part, `p or c - since >= 0`."""
+    """Return the guidance of one part of a recurring goal, or None if the part has another form.
+
+    `once[0, c] p` has become `p or c - since >= 0`, where the timer `since` counts the steps since p last
+    held.
+    """
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
     tests = [
@@ -106,7 +119,7 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
-    """Guidance of a conjunction: the summed violations of the goals with the earliest deadline."""
+    """Return the guidance of a conjunction: the sum of the violations that have the earliest deadline."""
     if len(costs) == 1:
         return costs[0]
     first = reduce(lambda a, b: ir.Op("min", (a, b)), [cost.left for cost in costs])
@@ -115,7 +128,11 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
-    """Guidance of a disjunction: the goal that is met, else the less violated one that can still be met."""
+    """Return the guidance of a disjunction of two goals.
+
+    It is that of the less violated goal among those that can still be met; a goal already met has no
+    violation.
+    """
     first = ir.BoolOp(
         "or",
         (
@@ -135,7 +152,7 @@ def _not_lost(left: ir.Num) -> ir.Formula:
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:
-    """Robustness of a state formula as a number; None where it consists of time tests alone."""
+    """Return the robustness of a state formula as a number; None if it consists of tests of time alone."""
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():
             return None

@@ -39,7 +39,10 @@ class _Definedness(Analysis[Defined]):
         return np.ones(self.samples, dtype=bool)
 
     def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
-        """Return where all read operands are defined; for an empty window none is read."""
+        """Return where all operands that an operator reads are defined.
+
+        Where the window of the operator is empty, it reads no operand.
+        """
         if all(each == ir.NOW for each in offsets):
             return reduce(np.logical_and, parts)
         if len(parts) == 1:
@@ -64,7 +67,7 @@ class _Definedness(Analysis[Defined]):
         return np.full(self.samples, body[0])
 
     def _instants(self, first: int | None, last: int | None) -> _Ranges:
-        """First and last instant of a window at each sample; past windows are cut at the start."""
+        """Return the first and last instant of a window at each sample; past windows are cut at the start."""
         now = np.arange(self.samples)
         start = np.zeros_like(now) if first is None else np.maximum(now + first, 0)
         end = np.where(start < self.samples, self.samples - 1, self.samples) if last is None else now + last
@@ -77,7 +80,10 @@ class _Ranges(NamedTuple):
 
 
 def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """True if all instants first..last are within the trace and defined; true for an empty range."""
+    """Return, per sample, whether all instants first..last are in the trace and defined.
+
+    An empty range of instants gives True.
+    """
     samples = len(inside)
     known = int(np.argmin(inside)) if not inside.all() else samples
     if not inside[known:].any():  # a formula without past operators is defined up to some sample

@@ -2,7 +2,7 @@
 
 An interval covers the samples inside it. A bound between two samples is rounded conservatively, so that
 satisfaction on the samples implies the formula as written: outwards for `always` and `release`, inwards for
-`eventually` and `until`, as they stand in negation normal form. Each such bound is W304.
+`eventually` and `until`, in negation normal form. W304 reports each rounded bound.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def lacks(grid: Grid, formula: typed.Formula) -> bool:
 
 
 def _times(formula: typed.Formula) -> Iterator[typed.Time]:
-    """Yield the bounds and delays in a formula."""
+    """Yield the bounds of intervals and the delays of `shift` in a formula."""
     for node in nodes(formula):
         if isinstance(node, (typed.Temporal, typed.Until)):
             yield from (end for end in (node.interval.lo, node.interval.hi) if end is not None)
@@ -63,10 +63,11 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
     """Return the window of an interval, in steps.
 
     Args:
-        interval: in seconds, steps and horizons.
+        interval: interval whose bounds are sums of seconds, steps and horizons.
         grid: time step and horizon.
-        sink: receives E005, E301, E302, E305, E311 and W304; after an error the window is a placeholder.
-        outward: round bounds between two samples outwards.
+        sink: list to which E005, E301, E302, E305, E311 and W304 are appended; after an error the returned
+            window is only a placeholder.
+        outward: whether bounds between two samples are rounded outwards; else inwards.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
     if lo is None:
@@ -91,7 +92,7 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
 
 
 def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
-    """Return a bound in steps, or None (and E311) where the grid lacks the step or horizon."""
+    """Return a bound in steps; None, with E311 in `sink`, if the grid lacks the step or horizon it needs."""
     if time.horizons and grid.horizon is None:
         tell(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
         return None
@@ -103,14 +104,17 @@ def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | 
 
 
 def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
-    """Return the first sample of an interval that starts at `lo`."""
+    """Return the first sample of an interval that starts at `lo` (in steps), an excluded end left out."""
     if lo.denominator != 1:
         return math.floor(lo) if outward else math.ceil(lo)
     return int(lo) + 1 if excluded else int(lo)
 
 
 def _invalid(interval: typed.Interval, lo: Fraction, hi: Fraction | None) -> Diagnostic | None:
-    """Return E302, E301 or E005 for an interval before now, reversed, or too long."""
+    """Return the error of an invalid interval, or None.
+
+    E302: it starts before the present sample; E301: it ends before it starts; E005: it is too long.
+    """
     if lo < 0:
         text, span = "an interval starts before now", interval.lo.span or interval.span
         return Diagnostic("E302", text, span, label=f"{nearest(lo):g} steps")
@@ -144,7 +148,7 @@ def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, si
 
 
 def in_words(steps: Fraction, grid: Grid) -> str:
-    """Return a time for messages: in seconds where the step is known."""
+    """Return the text of a time for messages: in seconds if the time step is known, else in steps."""
     if grid.dt is None:
         return f"{nearest(steps):g} steps"
     return f"{nearest(steps * grid.dt):g} s"
@@ -177,7 +181,10 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
 
 
 def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
-    """Convert delays to samples. E205 and E311 go to `sink`, with 1 as placeholder."""
+    """Return a formula with the delays of `shift` converted from seconds to samples.
+
+    E205 and E311 are appended to `sink`; a delay with an error is replaced by one sample.
+    """
 
     def leaf(num: ir.Num) -> ir.Num:
         if not isinstance(num, typed.DelayedSignal):
@@ -206,7 +213,7 @@ def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
 
 
 def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
-    """Return E205 for a delay off the grid, or above `MAX_DELAY`."""
+    """Return E205 for a delay that is no whole number of steps or exceeds `MAX_DELAY`, else None."""
     if steps.denominator != 1 and grid.dt is not None:
         low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
         message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"
@@ -220,6 +227,6 @@ def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | 
 
 
 def no_delay(message: str, span: Span | None) -> Diagnostic:
-    """Return E205 for an invalid number of samples."""
+    """Return E205, with `message`, for a `shift` by an invalid number of samples."""
     help_ = ("shift(x, 2) is x two samples later, shift(x, -0.1 s) what it was a tenth of a second before",)
     return Diagnostic("E205", message, span, help=help_)

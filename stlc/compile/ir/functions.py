@@ -39,25 +39,29 @@ class Function:
         most: largest number of arguments; None for any.
         rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
             `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions.
-        kind: operators are written with a sign; samplers are only for initial sets and events.
+        kind: `operator`: written with a sign; `sampler`: draws random values, only in initial sets and
+            events; `function`: any other.
         doc: one sentence for editors; "" for operators.
-        fold: value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
-        array: tape and operands -> operand of the result; None calls the kernel of the same name of the array
-            library.
+        fold: Python function that computes the value for constant arguments (exactly for `Fraction`s if
+            `exact`); None for samplers.
+        array: function that builds the result from the operands by operations of a tape
+            (`stlc.compile.backends.array.tape`); None: the kernel of the same name of the array library is
+            called.
         numpy: name of that kernel in NumPy; "" where `NumpyOps` defines it itself.
         torch: name of that kernel in torch; "" where `TorchOps` defines it itself.
-        c: C expressions of the arguments -> C expression of the result; extrema take two arguments.
-        slopes: C expression of the result, then those of the arguments -> C expressions of the derivative by
-            each argument. `SHARED` for extrema.
-        of_each: two functions, the first applied to every argument, the second reducing the results; such an
-            entry has no `c` and no `slopes`.
-        bounds: constant range of the result, or its rule from the arguments' ranges; ValueError,
-            OverflowError or ZeroDivisionError where undefined.
+        c: function from the C expressions of the arguments to the C expression of the result; that of an
+            extremum takes two arguments.
+        slopes: function from the C expressions of the result and of the arguments to the C expressions of the
+            derivatives, one per argument. `SHARED` for extrema: equal operands share the derivative.
+        of_each: for a function without `c` and `slopes`: name of the function applied to every argument, and
+            name of the one that reduces the results (`norm1` is `abs`, then `add`).
+        bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
+            ValueError, OverflowError or ZeroDivisionError where it is undefined.
         exact: rational arguments give a rational result.
         whole: integer arguments give an integer result.
         integral: the result is always an integer.
-        linear: scaling all arguments by a positive factor scales the result.
-        symbol: sign of an operator.
+        linear: scaling all arguments by a positive factor scales the result by that factor.
+        symbol: sign with which an operator is written; "" for others.
     """
 
     name: str
@@ -105,7 +109,10 @@ def _pow(base: Any, exponent: Any) -> Any:
 
 
 def _corners(fold: Callable[..., Any]) -> RangeRule:
-    """Return the range rule of a function monotone in each argument: extremes are at the corners."""
+    """Return the range rule of a function that is monotone in each argument.
+
+    Its extremes are among the values at the corners: every argument at its least or greatest value.
+    """
 
     def rule(args: Sequence[Bounds]) -> Bounds:
         values = [float(fold(*corner)) for corner in product(*args)]
@@ -148,7 +155,11 @@ def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
 
 
 def _powers(args: Sequence[Bounds]) -> Bounds:
-    """Range of a power of positive numbers, monotone in both arguments."""
+    """Return the range of a power with a positive base, which is monotone in both arguments.
+
+    Raises:
+        ValueError: the base may be 0 or negative.
+    """
     if args[0][0] <= 0:
         raise ValueError("not monotone")
     return _corners(math.pow)(args)
@@ -174,10 +185,11 @@ def _function(
         doc: as for `Function`.
         rule: as for `Function`.
         fold: as for `Function`.
-        c: C expression of the arguments `{0}`, `{1}`, ….
-        slopes: C expression of the derivative by each argument, of the arguments and the result `{r}`.
-        bounds: range; None: monotone in each argument.
-        **rest: other attributes of the entry.
+        c: C expression of the result, in the arguments `{0}`, `{1}`, ….
+        slopes: one C expression per argument: the derivative by it, in the arguments `{0}`, `{1}`, … and the
+            result `{r}`.
+        bounds: as for `Function`; None: the function is monotone in each argument.
+        **rest: other attributes of `Function`.
     """
     return Function(
         name,
@@ -194,7 +206,10 @@ def _function(
 
 
 def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
-    """Return the entry of an operator; one without kernels is a method of the tape."""
+    """Return the entry of an operator.
+
+    Without a kernel (`numpy`), the array back ends call the method of the tape with the operator's name.
+    """
     flags = {"kind": "operator", "exact": True, "whole": True, **flags}
     if "numpy" not in flags:
         flags["array"] = lambda tape, *xs: getattr(tape, name)(*xs)
@@ -202,19 +217,22 @@ def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) 
 
 
 def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """Return the entry of an integer-valued step function; its slope is 0 where it exists."""
+    """Return the entry of a step function with whole values, such as `floor`; its slope is 0."""
     flags: dict[str, Any] = {"numpy": kernel, "torch": name, "exact": True, "whole": True, "integral": True}
     return _function(name, doc, rule, fold, c, ("0.0",), **flags)
 
 
 def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
-    """Return the entry of a smooth scalar function; `slope`: derivative in C, of `{0}` and result `{r}`."""
+    """Return the entry of a smooth function of one argument.
+
+    `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`.
+    """
     fold, c = getattr(math, name), f"{name}({{0}})"
     return _function(name, doc, "plain", fold, c, (slope,), bounds, numpy=kernel or name, torch=name)
 
 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
-    """Return the entry of a linear function of one or more arguments."""
+    """Return the entry of a function of one or more arguments that scales with them (`Function.linear`)."""
     return Function(name, 1, None, "same", doc=doc, fold=fold, bounds=bounds, linear=True, **rest)
 
 
@@ -446,11 +464,11 @@ STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
 
 
 def callable_names() -> tuple[str, ...]:
-    """Return all callable built-in names except samplers."""
+    """Return all callable built-in names except samplers, the functions that draw random values."""
     table = (name for name, function in FUNCTIONS.items() if function.kind == "function")
     return (*table, *REWRITTEN, *REGIONS, *STEPPING)
 
 
 def sampler_names() -> tuple[str, ...]:
-    """Return the names of the samplers."""
+    """Return the names of the samplers, the functions that draw random values."""
     return tuple(name for name, function in FUNCTIONS.items() if function.kind == "sampler")

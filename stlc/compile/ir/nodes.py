@@ -25,17 +25,17 @@ class Const:
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """Column of the environment: a state, a control, `t`, or a sampled value."""
+    """Value of a signal at the current sample: a state, a control, the time `t`, or a recorded signal."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class ShiftedSignal:
-    """A column `steps` samples later (negative: earlier).
+    """Value of a signal `steps` samples later (negative: earlier).
 
-    Undefined outside the trace, as is a predicate that reads it; a `clamped` one repeats the first or last
-    sample.
+    Outside the trace the value, and every predicate that reads it, is undefined; a `clamped` signal repeats
+    its first or last sample there.
     """
 
     name: str
@@ -45,7 +45,7 @@ class ShiftedSignal:
 
 @dataclass(frozen=True, slots=True)
 class FrozenVar:
-    """Value bound by an enclosing `Freeze`, under a unique name."""
+    """Value bound by an enclosing `Freeze`; the name is unique in the specification."""
 
     name: str
 
@@ -62,7 +62,8 @@ class Op:
 class Indicator:
     """1 where a state formula holds, else 0; smoothed in training by `stlc.compile.semantics.switch`.
 
-    `sharpness` is the paper's w (Eq. 6) for this indicator; None takes the default of the switch.
+    `sharpness` is the factor w in the smoothed indicator `(1 + tanh(w rho)) / 2` (Eq. 6 of the paper); None:
+    the default sharpness of the switch that evaluates the condition.
     """
 
     cond: Formula
@@ -80,9 +81,10 @@ class Where:
 
 @dataclass(frozen=True, slots=True)
 class Extern:
-    """Component `output` of a function that the system provides.
+    """Component number `output` of the result of a function that the system provides.
 
-    `function` maps arrays to all components, or is their body in the IR; None if not loaded.
+    `function` is a callable that maps arrays to all components, or the body of the function in the IR; None
+    if the function is not loaded.
     """
 
     name: str
@@ -96,8 +98,9 @@ class Body:
     """Body of a function as straight-line code.
 
     Attributes:
-        formals: columns of the arguments, component by component.
-        lets: (name, number), in order; each may read arguments and earlier ones.
+        formals: names of the arguments, one per component.
+        lets: (name, number) of each local value, in order; a number may read the arguments and earlier local
+            values.
         outputs: components of the result.
     """
 
@@ -115,7 +118,7 @@ _LONG = 1 << 30
 
 
 def at_first(column: Signal) -> ShiftedSignal:
-    """Return the value of a signal at the first sample, at any instant."""
+    """Return the number that equals, at every instant, the value of `column` at the first sample."""
     return ShiftedSignal(column.name, -_LONG, clamped=True)
 
 
@@ -123,7 +126,7 @@ def at_first(column: Signal) -> ShiftedSignal:
 
 
 class Offsets(NamedTuple):
-    """Instants relative to now, both ends included, at which an operator reads an operand.
+    """Instants at which an operator reads an operand, in samples relative to now; both ends are included.
 
     Attributes:
         first: least offset, negative in the past; None: from the start of the trace.
@@ -141,7 +144,8 @@ class Operator:
     """Base of formulas whose value follows from their operands at instants relative to now.
 
     Attributes:
-        names: the operator that is a minimum (over its window), and its dual, a maximum.
+        names: names of two dual operators: the one that takes the minimum (over its window), then the one
+            that takes the maximum.
     """
 
     __slots__ = ()
@@ -149,15 +153,18 @@ class Operator:
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of each operand, in field order; where the last operand has no instant, none is read."""
+        """Offsets at which each operand is read, in field order.
+
+        Where the last operand, which is read over the window, has no instant, no operand is read.
+        """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Window of steps lo..hi, both included, relative to now; `hi` None: to the end of the trace.
+    """Window of a temporal operator in steps lo..hi, both included; `hi` None: to the end of the trace.
 
-    For past operators the steps count backwards.
+    The steps are counted from now; for past operators they are counted backwards.
     """
 
     lo: int
@@ -168,7 +175,7 @@ class Windowed(Operator):
     """Base of operators with a window, over which the last operand is read.
 
     Attributes:
-        back: the window lies in the past, cut at the start of the trace.
+        back: whether the window lies in the past; such a window is cut at the start of the trace.
     """
 
     __slots__ = ()
@@ -178,7 +185,7 @@ class Windowed(Operator):
 
     @property
     def window_offsets(self) -> Offsets:
-        """The window as offsets."""
+        """The window as offsets from now; those of a past window are negative."""
         lo, hi = self.window.lo, self.window.hi
         return Offsets(None if hi is None else -hi, -lo) if self.back else Offsets(lo, hi)
 
@@ -190,7 +197,10 @@ class Windowed(Operator):
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Truth constant, with robustness +inf or -inf; `simplify` removes those in operators."""
+    """Formula `true` or `false`, with robustness +inf or -inf.
+
+    `simplify` removes the constants that are operands of other operators.
+    """
 
     value: bool
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -200,8 +210,8 @@ class Truth:
 class Predicate:
     """Predicate with robustness `sign * num`; true iff that is > 0 (`strict`) or >= 0.
 
-    Negation flips `sign` and `strict`, so `num` is evaluated as written. A `guard` is a time test: it decides
-    truth and never limits the margin (robustness +-inf).
+    Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a test of time:
+    its robustness is +inf or -inf, so it decides truth but is never the margin of an enclosing formula.
     """
 
     num: Num
@@ -213,7 +223,7 @@ class Predicate:
 
 @dataclass(frozen=True, slots=True)
 class BoolOp(Operator):
-    """min (`and`) or max (`or`) of at least two formulas."""
+    """Conjunction (`and`, minimum) or disjunction (`or`, maximum) of at least two formulas."""
 
     names: ClassVar = ("and", "or")
     op: Literal["and", "or"]
@@ -222,13 +232,13 @@ class BoolOp(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of each item: now."""
+        """Offsets of the operands: each is read at the present sample."""
         return (NOW,) * len(self.items)
 
 
 @dataclass(frozen=True, slots=True)
 class Temporal(Windowed):
-    """min (`always`) or max (`eventually`) over a window of the future."""
+    """`always` (minimum) or `eventually` (maximum) over a window of the future."""
 
     names: ClassVar = ("always", "eventually")
     op: Literal["always", "eventually"]
@@ -239,7 +249,7 @@ class Temporal(Windowed):
 
 @dataclass(frozen=True, slots=True)
 class PastTemporal(Windowed):
-    """min (`historically`) or max (`once`) over a window of the past, cut at the start of the trace."""
+    """`historically` (minimum) or `once` (maximum) over a past window, cut at the start of the trace."""
 
     names: ClassVar = ("historically", "once")
     back: ClassVar = True
@@ -288,9 +298,10 @@ class Since(Windowed):
 class Shift(Operator):
     """Value of `body` `steps` samples later (negative: earlier).
 
-    `outside` is the value beyond the ends of the trace: None is undefined, as for windows; False is used by
-    `rise` and `fall` at the first sample. Where windows are cut, an undefined value is false, or true for a
-    `weak` node, the negation of a strong one.
+    `outside` is the value where that sample lies outside the trace. None: undefined, like a window that
+    leaves the trace. False: used by `rise` and `fall` at the first sample. If the caller asks that windows be
+    cut at the end of the trace, an undefined value counts as false; as true in a `weak` node, which results
+    from a negation.
     """
 
     steps: int
@@ -301,15 +312,16 @@ class Shift(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operand: one instant."""
+        """Offsets of the operand: the single instant `steps` samples later."""
         return (Offsets(self.steps, self.steps),)
 
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """`body` with each bound `FrozenVar` equal to the value of its number now, at any instant of `body`.
+    """Formula `body` in which each bound `FrozenVar` has the value that its number has now.
 
-    Where a bound number is undefined, so are the predicates that read it.
+    The bound values are the same at all instants at which `body` is read. Where a bound number is undefined,
+    so are the predicates that read it.
     """
 
     bindings: tuple[tuple[str, Num], ...]
@@ -319,7 +331,10 @@ class Freeze:
 
 @dataclass(frozen=True, slots=True)
 class AtStart:
-    """Value of `body` at the first sample, for operators on the mission clock."""
+    """Value of `body` at the first sample.
+
+    It expresses operators such as `always@[a, b]`, whose interval counts from the start of the mission.
+    """
 
     body: Formula
     span: Span | None = field(default=None, compare=False, repr=False)

@@ -25,9 +25,10 @@ def flip(sign: Sign) -> Sign:
 
 
 def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
-    """Return `formula` for `sign` 1, its negation for -1, in terms of `and`, `or` and temporal operators.
+    """Return `formula` if `sign` is 1, or its negation if -1, in terms of `and`, `or` and temporal operators.
 
-    `not` remains before predicates, `since`, `rise`, `fall`, `prev`, `next` and `Recalled` nodes.
+    `not` remains before predicates, `since`, `rise`, `fall`, `prev`, `next`, and `Recalled` nodes (past
+    operators rewritten with timers).
     """
     op = getattr(formula, "op", "")
     match formula:
@@ -52,7 +53,10 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
 
 
 def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
-    """Rewrite `a -> b`, `a <-> b` (both implications) or `a xor b` (the negation of that)."""
+    """Rewrite `a -> b`, `a <-> b` (both implications) or `a xor b` (the negation of `a <-> b`).
+
+    For `sign` -1 the result is the negation.
+    """
     left, right = node.items
     if node.op == "xor":
         sign = flip(sign)
@@ -75,12 +79,12 @@ def _unless(node: typed.Until) -> typed.Formula:
 
 
 def condition(formula: typed.Formula, *, negated: bool = False, flat: bool = False) -> ir.Formula:
-    """Return a state formula as a condition of the IR, constants folded.
+    """Return a state formula as a condition of the IR, with operands that are constant removed.
 
     Args:
-        formula: a state formula (`is_state`).
-        negated: return the negation.
-        flat: merge nested `and`s and nested `or`s, without repetitions.
+        formula: a state formula (`stlc.compile.ir.traverse.is_state`): its truth depends on one instant.
+        negated: whether to return the negation.
+        flat: whether to merge nested `and`s and nested `or`s, and to remove repeated items.
     """
     return _folded(normal(formula, -1 if negated else 1), flat)
 
@@ -105,7 +109,7 @@ def flattened(op: Literal["and", "or"], items: Iterable[ir.Formula]) -> list[ir.
 
 
 def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
-    """Return a predicate or its negation in the IR."""
+    """Return a predicate, or the negation of one, as a predicate of the IR."""
     if isinstance(formula, typed.Predicate):
         return ir.Predicate(formula.num, 1, formula.strict, formula.guard, formula.span)
     assert isinstance(formula.body, typed.Predicate)
@@ -114,7 +118,10 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
 
 
 def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
-    """Return the `and` or `or` of formulas without constants; `neutral` is that of no formulas."""
+    """Return the `and` or `or` of formulas, with constants removed or, if one decides the result, returned.
+
+    `neutral` is the value of the operator without operands: true for `and`, false for `or`.
+    """
     kept: list[ir.Formula] = []
     for item in items:
         if not isinstance(item, ir.Truth):

@@ -19,7 +19,10 @@ V = TypeVar("V")
 
 
 class Analysis(ABC, Generic[V]):
-    """Bottom-up analysis: the value of each kind of node, from the values of its operands."""
+    """Bottom-up analysis of a formula: one method per kind of node.
+
+    Each computes the value of a node from the values of its operands; `fold` applies them.
+    """
 
     @abstractmethod
     def predicate(self, num: ir.Num) -> V:
@@ -31,24 +34,24 @@ class Analysis(ABC, Generic[V]):
 
     @abstractmethod
     def over(self, parts: Sequence[V], offsets: Sequence[ir.Offsets]) -> V:
-        """Value of an operator that reads each operand at its offsets; the last ones are its window."""
+        """Value of an operator that reads operand i at `offsets[i]`; the last offsets are its window."""
 
     @abstractmethod
     def at_start(self, body: V) -> V:
         """Value of a formula at the first sample."""
 
     def shift(self, body: V, node: ir.Shift) -> V:
-        """Value of a shifted formula."""
+        """Value of a formula read at another sample (`ir.Shift`)."""
         return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
-        """Value of a `freeze` with its bound numbers."""
+        """Value of a `freeze`, from those of its bound numbers and of its body."""
         parts = (body, *bound)
         return self.over(parts, (ir.NOW,) * len(parts))
 
 
 def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
-    """Return the value of a formula under an analysis."""
+    """Return the value that an analysis assigns to a formula."""
     match formula:
         case ir.Truth():
             return analysis.constant()
@@ -68,34 +71,40 @@ def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
 
 
 class Reach(NamedTuple):
-    """Lookback and lookahead in samples."""
+    """Lookback (`past`) and lookahead (`future`) in samples, both at least 0."""
 
     past: int
     future: int
 
 
 def reach(formula: ir.Formula) -> Reach:
-    """Return lookback and lookahead of a formula: how many samples it requires around its instant.
+    """Return how many samples before and after its instant a formula requires (lookback and lookahead).
 
-    A window to the end of the trace counts with its start alone. Operators on the mission clock count from
-    the first sample, regardless of enclosing operators.
+    Of a window to the end of the trace only the start is required. The interval of an operator such as
+    `always@[a, b]` counts from the first sample, wherever the operator stands, so its end is a lookahead.
     """
     past, future, clocked = fold(formula, _REQUIRED)
     return Reach(past, max(future, clocked))
 
 
 def reach_of(num: ir.Num) -> Reach:
-    """Return lookback and lookahead of a number: how many samples it needs to be defined."""
+    """Return how many samples before and after now a number needs in order to be defined."""
     return _offsets([leaf.steps for leaf in _shifts(num) if not leaf.clamped])
 
 
 def farthest(num: ir.Num) -> Reach:
-    """Return how many samples before and after now a number reads where they exist."""
+    """Return how many samples before and after now a number reads.
+
+    Unlike `reach_of` it counts clamped reads, which repeat the first or last sample outside the trace.
+    """
     return _offsets([leaf.steps for leaf in _shifts(num)])
 
 
 def history(formula: ir.Formula) -> int:
-    """Return how many samples before its instant a formula reads where they exist; 2^40 means all."""
+    """Return how many samples before its instant a formula reads; 2^40 stands for all.
+
+    Unlike `reach` it counts past windows in full, which are cut at the start of the trace.
+    """
     return fold(formula, _HISTORY)
 
 
@@ -113,7 +122,10 @@ _Needs: TypeAlias = tuple[int, int, int]
 
 @final
 class _Required(Analysis[_Needs]):
-    """Required samples; windows of the past are cut at the start of the trace and require none."""
+    """Analysis of the required samples.
+
+    Windows of the past are cut at the start of the trace, so they require no sample.
+    """
 
     def predicate(self, num: ir.Num) -> _Needs:
         return (*reach_of(num), 0)
@@ -122,7 +134,10 @@ class _Required(Analysis[_Needs]):
         return 0, 0, 0
 
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
-        """Furthest samples; of a window without bound only its near end is required."""
+        """Return the farthest samples that the operands require, the offsets at which they are read included.
+
+        Of an unbounded window only the near end is required.
+        """
         past = future = clocked = 0
         for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):
             low, high = (last or 0) if first is None else first, (first or 0) if last is None else last
@@ -135,7 +150,7 @@ class _Required(Analysis[_Needs]):
 
 @final
 class _History(Analysis[int]):
-    """Samples before the instant that are read where they exist."""
+    """Analysis of the samples before the instant that are read where the trace has them."""
 
     def predicate(self, num: ir.Num) -> int:
         return farthest(num).past
@@ -176,7 +191,10 @@ def depends_on_ends(num: ir.Num) -> bool:
 
 
 def uses_end(formula: ir.Formula) -> bool:
-    """True if a future window extends to the end of the trace, or a `sweep` is clamped there."""
+    """True if a future window extends to the end of the trace, or a number repeats the last sample beyond it.
+
+    `sweep`, the motion between samples, reads such numbers.
+    """
     windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
     endless = any(node.window.hi is None and not node.back for node in windowed)
     return endless or any(
@@ -188,15 +206,16 @@ def uses_end(formula: ir.Formula) -> bool:
 
 
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
-    """Return an instant from which a formula is constant on an open trace, +inf or -inf; None: not known.
+    """Return an instant from which a formula is constantly +inf or -inf on an open trace, or None.
 
-    Beyond the last sample the value of every predicate is the same bound, so formulas are constant from some
-    instant on, and a window far beyond a short trace needs one such instant instead of all.
+    An open trace continues beyond its last sample, where every unknown predicate has the same bound, +inf or
+    -inf. From some instant on most formulas are then constant, so that a window far beyond a short trace
+    needs only one such instant.
 
     Args:
-        formula: in negation normal form.
+        formula: formula in negation normal form.
         samples: number of known samples.
-        length: end of windows to the end of the trace.
+        length: length of the trace at which windows to its end are cut.
     """
     return fold(formula, _Tail(samples, length))
 
@@ -214,9 +233,10 @@ class _Tail(Analysis[int | None]):
         return 0
 
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
-        """Instant from which the operands are constant wherever they are read, or the window stays empty.
+        """Return an instant from which an operator is constant, or None.
 
-        A window from the start of the trace covers all known samples then.
+        From it on all operands are constant wherever they are read, or the window is empty; a window from the
+        start of the trace contains all known samples.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

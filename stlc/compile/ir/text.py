@@ -40,7 +40,7 @@ def show_formula(formula: ir.Formula) -> str:
 
 
 def _operator(formula: Any) -> str:
-    """Return an operator with its window in samples: before its operand, or between several."""
+    """Return the text of an operator with its window in samples, as `always[0..3] p` or `p until[0..3] q`."""
     parts = [_operand(part) for part in _parts(formula)]
     if not isinstance(formula, ir.Windowed):
         return f" {formula.op} ".join(parts)
@@ -50,15 +50,16 @@ def _operator(formula: Any) -> str:
 
 
 def _operand(formula: ir.Formula) -> str:
-    """Return an operand, in parentheses if it has several operands itself."""
+    """Return the text of an operand, in parentheses if it is an operator between several operands."""
     text = show_formula(formula)
     return f"({text})" if len(_parts(formula)) > 1 else text
 
 
 def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
-    """Return the operands; of `and` and `or` without those that quantify by how much a time test fails.
+    """Return the operands of a formula that its text shows.
 
-    `timers.timer_test` makes these.
+    Left out are operands of `and` and `or` that `timers.timer_test` adds to measure by how much a test of
+    time fails.
     """
     items = operands(formula)
     if not isinstance(formula, ir.BoolOp):
@@ -77,7 +78,10 @@ def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
 
 
 def _atom(atom: ir.Predicate) -> str:
-    """Return a comparison, with the varying side first: `0.5 >= abs(s - 1)` is reversed."""
+    """Return the text of a predicate as a comparison, a constant on the right.
+
+    `0.5 >= abs(s - 1)` becomes `abs(s - 1) <= 0.5`.
+    """
     sign = {(1, True): ">", (1, False): ">=", (-1, True): "<", (-1, False): "<="}[atom.sign, atom.strict]
     left, right = _sides(atom.num)
     if isinstance(left, ir.Const) and not isinstance(right, ir.Const):
@@ -94,14 +98,14 @@ def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
 
 
 def shown(name: str) -> str:
-    """Return a name as written, without the unique suffix of a frozen value."""
+    """Return a name as written in the source, without the suffix that makes a frozen value unique."""
     name = _FROZEN.sub("", name)
     part = _COMPONENT.search(name)
     return show_name(name) if part is None else show_name(name[: part.start()]) + part[0]
 
 
 def show_number(num: ir.Num, level: int = 0) -> str:
-    """Return a number in infix notation; `level` is the precedence of its context."""
+    """Return a number in infix notation, in parentheses if it binds more loosely than `level`."""
     text, own = _number(num)
     return f"({text})" if own < level else text
 

@@ -35,7 +35,7 @@ _SORTS: Mapping[str, _Sort] = {
 
 @cache
 def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
-    """Fields of a node class that hold children, in order."""
+    """Return the fields of a node class that hold children, in order, each with the sort of its value."""
     declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
     return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
@@ -68,8 +68,8 @@ def map_children(
 
     Args:
         node: a formula or a number.
-        formulas: child formula -> its replacement; None keeps them.
-        numbers: child number -> its replacement; None keeps them.
+        formulas: function from a child formula to its replacement; None keeps all formulas.
+        numbers: function from a child number to its replacement; None keeps all numbers.
     """
     changed: dict[str, Any] = {}
     kind: Any = type(node)
@@ -94,7 +94,10 @@ def map_children(
 
 @cache
 def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
-    """Fields of a formula class that hold a formula, or several; of `Recalled` only `now`."""
+    """Return (name, whether it holds several) for each field of a class that holds formulas.
+
+    For `Recalled`, a past operator rewritten with timers, this is only `now`.
+    """
     found = ((name, sort == "formulas") for name, sort in _shape(kind) if sort.startswith("formula"))
     return (("now", False),) if kind is typed.Recalled else tuple(found)
 
@@ -104,7 +107,10 @@ def operands(formula: ir.Formula) -> tuple[ir.Formula, ...]: ...
 @overload
 def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]: ...
 def operands(formula: Any) -> tuple[Any, ...]:
-    """Return the formulas directly below a formula; of `Recalled` only `now`."""
+    """Return the formulas directly below a formula.
+
+    For `Recalled`, a past operator rewritten with timers, this is only its field `now`.
+    """
     found: tuple[Any, ...] = ()
     kind: Any = type(formula)
     for name, several in _formulas_of(kind):
@@ -121,7 +127,7 @@ def nodes(formula: ir.Formula) -> Iterator[ir.Formula]: ...
 @overload
 def nodes(formula: typed.Formula) -> Iterator[typed.Formula]: ...
 def nodes(formula: Any) -> Iterator[Any]:
-    """Yield all sub-formulas, itself first, except conditions inside numbers."""
+    """Yield a formula and all its sub-formulas, except the conditions of numbers (`if`, `ind`)."""
     yield formula
     for part in operands(formula):
         yield from nodes(part)
@@ -134,7 +140,7 @@ def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
 
 
 def subexpressions(num: Node) -> Iterator[ir.Num]:
-    """Yield a number and all numbers in it, including those of its conditions."""
+    """Yield a number and all numbers in it, including those in its conditions (`if`, `ind`)."""
     stack: list[Any] = [num]
     while stack:
         part = stack.pop()
@@ -145,7 +151,7 @@ def subexpressions(num: Node) -> Iterator[ir.Num]:
 
 
 def leaves(num: Node) -> Iterator[NumberLeaf]:
-    """Yield the leaves of a number, including those of its conditions."""
+    """Yield the constants, signals and frozen values of a number, including those in its conditions."""
     stack: list[Any] = [num]
     while stack:
         part = stack.pop()
@@ -156,7 +162,7 @@ def leaves(num: Node) -> Iterator[NumberLeaf]:
 
 
 def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
-    """Return a number or a formula with each leaf of its numbers replaced by `change(leaf)`."""
+    """Return a number or a formula with each constant, signal and frozen value replaced by `change(leaf)`."""
     if isinstance(node, LEAVES):
         return change(node)  # type: ignore[return-value]
 
@@ -170,7 +176,7 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """Return the key of a leaf in the inputs of a program."""
+    """Return the key under which a program reads a leaf from its inputs."""
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name
@@ -182,7 +188,7 @@ def frozen_in(num: ir.Num) -> frozenset[str]:
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """Return the number with the values of `steps` samples and `delay` later.
+    """Return a number as it is `steps` samples, and in addition the time `delay`, later.
 
     Outside the trace a `clamped` number repeats the first or last sample.
     """
@@ -203,7 +209,10 @@ def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time
 
 
 def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
-    """Replace free frozen values in a number or a formula; names bound by an inner `freeze` are kept."""
+    """Replace the free frozen values in a number or a formula by `values`.
+
+    Names that an inner `freeze` binds again are not replaced.
+    """
     if isinstance(node, ir.FrozenVar):
         return values.get(node.name, node)  # type: ignore[return-value]
 
@@ -229,17 +238,20 @@ def margin_unit(formula: typed.Formula) -> str:
 
 
 def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
-    """True for a temporal operator with an interval on the mission clock."""
+    """True for a temporal operator whose interval counts from the start of the mission (`always@[a, b]`)."""
     return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"
 
 
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
-    """Return the operator with its interval relative to now; at the first sample both are equal."""
+    """Return an operator such as `always@[a, b]` with its interval relative to now (`always[a, b]`).
+
+    At the first sample both are equal.
+    """
     return replace(node, interval=replace(node.interval, clock="now"))
 
 
 def absolute(formula: typed.Formula) -> bool:
-    """True if a formula has an interval on the mission clock."""
+    """True if a formula has an operator such as `always@[a, b]`, timed from the start of the mission."""
     return any(map(on_clock, nodes(formula)))
 
 
@@ -253,9 +265,9 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
     """True for a state formula, whose truth depends on one instant (and on enclosing frozen values).
 
     Args:
-        formula: as typed.
-        augmented: whether it is for training, where `Recalled` nodes are state formulas (held by timers),
-            and frozen values count as other instants.
+        formula: typed formula.
+        augmented: whether the formula is for training. `Recalled` nodes, past operators rewritten with
+            timers, then are state formulas, and frozen values count as values of other instants.
     """
     state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
     elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)
@@ -273,7 +285,10 @@ def mentions_horizon(formula: typed.Formula) -> bool:
 
 
 def timer_form(formula: typed.Formula) -> typed.Formula:
-    """Return a state formula with each `Recalled` node replaced by the test of its timers."""
+    """Return a state formula in which the test of its timers replaces each `Recalled` node.
+
+    A `Recalled` node is a past operator rewritten with timers.
+    """
     if isinstance(formula, typed.Recalled):
         return timer_form(formula.now)
     return map_children(formula, formulas=timer_form)

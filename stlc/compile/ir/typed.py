@@ -1,6 +1,7 @@
-"""Typed specifications: names bound, sorts and units checked, macros expanded, time in seconds.
+"""Typed specifications: names resolved, types and units checked, macros expanded, time in seconds.
 
-Numbers are those of `stlc.compile.ir.nodes`; formulas keep their negations, implications and spans.
+Numbers are those of `stlc.compile.ir.nodes`; formulas keep their negations, implications and source locations
+(spans).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from stlc.units import DIMENSIONLESS, Unit
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """Bound of an interval: `seconds + steps * dt + horizons * T`."""
+    """Time of an interval bound or a delay: `seconds + steps * dt + horizons * T`."""
 
     seconds: Fraction = Fraction(0)
     steps: Fraction = Fraction(0)
@@ -27,7 +28,7 @@ class Time:
     span: Span | None = field(default=None, compare=False, repr=False)
 
     def plus(self, other: Time | None) -> Time:
-        """The sum of two times."""
+        """Return the sum of two times; None counts as zero."""
         if other is None:
             return self
         return Time(
@@ -40,7 +41,7 @@ class Time:
 
 @dataclass(frozen=True, slots=True)
 class DelayedSignal(ir.ShiftedSignal):
-    """Signal shifted by a time, `shift(x, 0.1 s)`, in addition to `steps` samples.
+    """Signal shifted by a time, as in `shift(x, 0.1 s)`, in addition to `steps` samples.
 
     `stlc.compile.ir.discretize.in_samples` converts the time to samples on the grid.
     """
@@ -50,7 +51,11 @@ class DelayedSignal(ir.ShiftedSignal):
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Bounds of a temporal operator; `hi` None: to the end of the trace (`end`, `inf` or omitted)."""
+    """Interval of a temporal operator; `hi` None: to the end of the trace (`end`, `inf` or omitted).
+
+    `clock` is "now" if the bounds are relative to the present sample, or "start" for an operator such as
+    `always@[a, b]`, whose interval counts from the start of the mission.
+    """
 
     lo: Time
     hi: Time | None
@@ -76,10 +81,11 @@ class Truth(Node):
 
 @dataclass(frozen=True, slots=True)
 class Predicate(Node):
-    """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
+    """Predicate `num > 0` (`strict`) or `num >= 0`.
 
-    `num` and the margin's `unit` are in SI; `written` is the unit of the comparison in the source. For
-    recorded traces `num` and `unit` are converted to it (`stlc.compile.lowering.lower`).
+    A `guard` is a test of time: it decides truth and is never the margin of an enclosing formula. `num` and
+    the unit of its margin, `unit`, are in SI; `written` is the unit of the comparison in the source. For
+    recorded traces `num` and `unit` are converted to `written` (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num
@@ -98,7 +104,7 @@ class Not(Node):
 
 @dataclass(frozen=True, slots=True)
 class Logic(Node):
-    """`and` and `or` hold two or more items, `->`, `<->` and `xor` exactly two."""
+    """Propositional operator: `and`, `or` of two or more items; `->`, `<->`, `xor` of exactly two."""
 
     op: Literal["and", "or", "xor", "->", "<->"]
     items: tuple[Formula, ...]
@@ -110,7 +116,7 @@ BinaryTemporal: TypeAlias = Literal["until", "release", "unless", "since"]
 
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
-    """Temporal operator with one operand."""
+    """Temporal operator with one operand, of the future or the past."""
 
     op: UnaryTemporal
     interval: Interval
@@ -119,7 +125,7 @@ class Temporal(Node):
 
 @dataclass(frozen=True, slots=True)
 class Until(Node):
-    """Temporal operator with two operands."""
+    """Temporal operator with two operands, of the future or the past."""
 
     op: BinaryTemporal
     interval: Interval
@@ -129,7 +135,11 @@ class Until(Node):
 
 @dataclass(frozen=True, slots=True)
 class Shift(Node):
-    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`; `delay` is a time in place of steps."""
+    """Formula at another sample: `next(p)` (`steps` is 1) or `prev(p)` (-1).
+
+    `outside` is its value outside the trace, as for `ir.Shift`; `delay`, if given, is a time that replaces
+    `steps`.
+    """
 
     steps: int
     body: Formula
@@ -139,7 +149,7 @@ class Shift(Node):
 
 @dataclass(frozen=True, slots=True)
 class Edge(Node):
-    """`rise(p)` or `fall(p)`; false at the first sample."""
+    """`rise(p)` or `fall(p)`: p has just become true or false; always false at the first sample."""
 
     op: Literal["rise", "fall"]
     body: Formula
@@ -147,7 +157,7 @@ class Edge(Node):
 
 @dataclass(frozen=True, slots=True)
 class Freeze(Node):
-    """`freeze p0 = p in body`: each bound `ir.FrozenVar` has the value of its number now."""
+    """`freeze p0 = p in body`: each bound `ir.FrozenVar` keeps the value that its number has now."""
 
     bindings: tuple[tuple[str, ir.Num], ...]
     body: Formula
@@ -155,11 +165,14 @@ class Freeze(Node):
 
 @dataclass(frozen=True, slots=True)
 class Recalled(Node):
-    """Past operator rewritten with timers, under no negation.
+    """Past operator rewritten with timers (added states that hold the time since an event).
+
+    It stands under no negation.
 
     Attributes:
-        now: state formula in which timers decide truth, without a margin.
-        along: formula with a robustness, along any part of a trace with known timers at its first sample.
+        now: state formula equivalent at one instant: timers decide its truth, without a margin.
+        along: equivalent formula with a robustness, for any part of a trace at whose first sample the timers
+            are known.
     """
 
     now: Formula
@@ -175,14 +188,14 @@ class Requirement:
 
     Attributes:
         name: name of the requirement.
-        doc: its `##` comment.
-        tags: bare tag names (`safety`, `liveness`).
+        doc: text of the `##` comment before it.
+        tags: names of its tags without arguments (`safety`, `liveness`).
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
-        id: of `@id("…")`, or "".
-        group: of `@group(name)`, or "".
+        id: text of `@id("…")`; "" without this tag.
+        group: name in `@group(name)`; "" without this tag.
         formula: typed formula.
-        written: formula as written, for messages.
+        written: syntax tree of the formula, for messages.
         span: place of the declaration.
     """
 
@@ -200,14 +213,14 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Component of a `param`: constant along a trajectory.
+    """Component of a `param`: a value drawn once for every trajectory and constant along it.
 
     Attributes:
         span: place of its name.
-        column: column of the value, with its range.
-        draw: distribution as a number with samplers, in the unit of the column.
-        text: distribution as written.
-        carried: the system has it as a state, and draws it.
+        column: name, unit and range of the value.
+        draw: distribution, a number that contains samplers such as `uniform`, in the unit of the column.
+        text: text of the distribution in the source.
+        carried: whether the system has a state of this name; the system then draws the value.
     """
 
     span: Span = field(compare=False, repr=False)
@@ -222,14 +235,14 @@ class Spec:
     """Resolved specification.
 
     Attributes:
-        name: that in the `spec` pragma, else the stem of the file.
+        name: name given by `spec NAME`, else the stem of the file name.
         signature: declared signals, with their declared units.
-        constants: every `const`, in SI units.
+        constants: (name, value in SI units) of every `const`.
         requirements: every `require`, in order.
         assumptions: every `assume`, in order.
-        source_ast: syntax tree.
+        source_ast: syntax tree of the specification.
         parameters: components of every `param`.
-        taken: names that states added by the compiler must not use.
+        taken: names in use, which states added by the compiler must avoid.
         warnings: findings that are not errors.
     """
 

@@ -2,8 +2,8 @@
 
 In training all margins are in SI, so that requirements are comparable. For recorded traces each predicate is
 divided by the scale of its unit, so that the margin of `speed < 120 km/h` is in km/h; signs do not change.
-Negation normal form comes first, so that bounds are rounded for the final operator: `not always[0, b] p` is
-`eventually[0, b] not p`, whose bound is rounded inwards.
+The formula is first brought into negation normal form, so that bounds between two samples are rounded for the
+operator that remains: `not always[0, b] p` is `eventually[0, b] not p`, whose bound is rounded inwards.
 """
 
 from __future__ import annotations
@@ -24,14 +24,17 @@ from stlc.units import Unit, same_dims
 
 
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
-    """Return the requirement with margins in the units of the source, `@scale` too if there is one unit."""
+    """Return a requirement with margins in the units of the source.
+
+    If all its predicates have the same unit, `@scale` is converted to that unit too.
+    """
     unit = _one_unit(requirement.formula)
     scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
     return replace(requirement, formula=_in_written_units(requirement.formula), scale=scale)
 
 
 def _one_unit(formula: typed.Formula) -> Unit | None:
-    """Return the unit of all predicates; None if they differ."""
+    """Return the unit in which all predicates are written; None if they differ or there are none."""
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
     alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
@@ -45,7 +48,7 @@ def _in_written_units(formula: typed.Formula) -> typed.Formula:
 
 
 def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
-    """Convert a number from SI to `unit`; columns stored in that unit are read without conversion."""
+    """Convert a number from SI to `unit`; a signal that is stored in `unit` is read without conversion."""
     if unit.ratio == 1:
         return num
     match num:
@@ -62,24 +65,27 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
 
 
 def _divided(value: float, unit: Unit) -> float:
-    """Return a constant in a unit, rounded to the intended value: 120, not 120.00000000000001."""
+    """Return an SI constant in a unit, without rounding errors: 120, not 120.00000000000001."""
     found = value / unit.scale
     short = float(f"{found:.14g}")
     return short if math.isclose(short, found, rel_tol=1e-15) else found
 
 
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
-    """Lower `formula` to negation normal form and steps.
+    """Lower a typed formula to an IR formula in negation normal form, with time in steps.
 
-    Absolute intervals are relative to the first sample; formulas for training have none
-    (`stlc.compile.augment`). Findings (E301, E302, E305, E311, W304) go to `sink`; if it then holds an error,
-    the formula must not be used.
+    The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
+    has no such operator (`stlc.compile.augment`). Findings (E301, E302, E305, E311, W304) are appended to
+    `sink`; if it then holds an error, the formula must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 
 
 def _meaning(node: typed.Edge | typed.Recalled) -> typed.Formula:
-    """Return the definition of an edge or a timer: `rise(p)` is `p and prev(not p)`, false at first."""
+    """Return the definition of `rise`, `fall` or a past operator that was rewritten with timers.
+
+    `rise(p)` is `p and prev(not p)`, with `prev(not p)` false at the first sample.
+    """
     if isinstance(node, typed.Recalled):
         return node.along
     span, inverse = node.span, typed.Not(node.span, node.body)
@@ -116,7 +122,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _negated(self, node: typed.Formula) -> ir.Formula:
-        """Lower the negation of an operator before which `normal` keeps `not`."""
+        """Lower the negation of a node before which `stlc.compile.ir.normal_form.normal` keeps `not`."""
         match node:
             case typed.Until(_, op, _, left, right):
                 return self._timed(replace(node, left=normal(left, -1), right=normal(right, -1)), DUAL[op])
@@ -129,7 +135,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
-        """Lower a temporal operator as `op`."""
+        """Lower a temporal operator as the operator named `op`: its own, or the dual if it is negated."""
         if on_clock(node):
             return ir.AtStart(self._timed(from_now(node), op), node.span)
         parts = [self.formula(part) for part in operands(node)]

@@ -1,9 +1,9 @@
 """Local simplification laws on the IR; each preserves robustness wherever both sides are defined.
 
-Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` is `G[a+c, a+d] p`, `true until q` is
-`eventually q`, and constants are folded, so that gradients stay finite. Nested `and`s merge where the
-semantics is associative, without repetitions where it is idempotent; where it is both,
-`G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and likewise for `F`, `H` and `O`.
+Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true until q`
+becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
+associative, nested `and`s and nested `or`s are merged; if it is idempotent, repeated items are removed; if it
+is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`, and likewise for `F`, `H` and `O`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _NOW = ir.Window(0, 0)
 
 
 def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
-    """Return an equivalent formula with fewer nodes; the result is a fixed point.
+    """Return an equivalent formula with fewer nodes; simplifying it again changes nothing.
 
     Args:
         formula: in negation normal form.
-        semantics: whose robustness is preserved; the exact one allows all laws.
+        semantics: semantics under which robustness is preserved; the exact one allows all laws.
     """
     whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
     law = _LAWS.get(type(whole))
@@ -35,7 +35,7 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
 
 
 def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
-    """Merge nested operators, and remove repetitions and constants."""
+    """Merge nested `and`s or `or`s, and remove repeated items and constants, as the semantics allows."""
     flat: list[ir.Formula] = []
     for item in whole.items:
         same = isinstance(item, ir.BoolOp) and item.op == whole.op and semantics.associative
@@ -46,7 +46,7 @@ def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
-    """Remove windows over constants and windows [0, 0]; merge nested windows of one operator."""
+    """Remove windows [0, 0] and windows over constants; merge nested windows of the same operator."""
     body, window = node.body, node.window
     every = node.op == node.names[0]
     if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
@@ -69,7 +69,7 @@ def _at_start(node: ir.AtStart, _semantics: Semantics) -> ir.Formula:
 
 
 def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
-    """Drop unused bindings; substitute the number in predicates at the instant of the `freeze`."""
+    """Drop unused bindings of a `freeze`; if its body is a predicate, substitute the bound numbers in it."""
     read = frozenset().union(*map(frozen_in, numbers(node.body)))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
@@ -80,9 +80,10 @@ def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:
-    """Return the sum of two nested windows, if it requires the same samples; else None.
+    """Return the window that replaces two nested ones, or None if no single window requires the same samples.
 
-    Two wide windows count samples repeatedly, so they need an idempotent and associative semantics.
+    Two windows of several samples each read samples repeatedly, so merging them needs a semantics that is
+    idempotent and associative.
     """
     lattice = semantics.associative and semantics.idempotent
     if outer.hi is not None and inner.hi is not None:
@@ -94,7 +95,7 @@ def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window 
 
 
 def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
-    """Simplify `true until q` to `eventually q`, and likewise `release`, `since` and `trigger`."""
+    """Simplify `true until q` to `eventually q`, and `release`, `since` and `trigger` accordingly."""
     strong = node.op in ("until", "since")
     if not (isinstance(node.left, ir.Truth) and node.left.value is strong):
         return node

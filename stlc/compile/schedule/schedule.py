@@ -1,8 +1,8 @@
-"""Schedule of the values that formulas need, by instant: from formulas and a trace length to ordered steps.
+"""Schedule: ordered steps that compute the values that formulas need, each at its instants.
 
-Only needed values are computed: a state predicate at the root at one instant, the body of `always[0, T]` at
-T + 1. Equal sub-formulas at equal instants are one step. All back ends read the same steps and match on their
-nodes. Instants are integers, or expressions in a loop index of the back end (`LoopIndex`).
+Only needed values are computed: a state predicate at the root at one instant, the body of `always[0, T]` at T
++ 1. Equal sub-formulas at equal instants share one step. All back ends read the same steps and handle each by
+the class of its node. Instants are integers, or expressions in a loop index of the back end (`LoopIndex`).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _FAR = 256
 
 
 def dual(pick: Pick) -> Pick:
-    """Return the dual extremum."""
+    """Return the dual extremum: "max" for "min", "min" for "max"."""
     return "max" if pick == "min" else "min"
 
 
 def neutral(pick: Pick) -> float:
-    """Return the extremum of no operands."""
+    """Return the extremum of no operands: +inf for "min", -inf for "max"."""
     return math.inf if pick == "min" else -math.inf
 
 
@@ -52,12 +52,12 @@ def neutral(pick: Pick) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LoopIndex:
-    """Instant as a function of enclosing loop indices.
+    """Instant that depends on the indices of the enclosing loops of generated code.
 
     Attributes:
         text: expression in the language of the back end.
-        low: least value.
-        high: greatest value.
+        low: least value over all iterations.
+        high: greatest value over all iterations.
     """
 
     text: str
@@ -85,17 +85,17 @@ Instant: TypeAlias = Any
 
 
 def earliest(instant: Instant) -> int:
-    """Return the least value of an instant."""
+    """Return the least value of an instant over all iterations of the enclosing loops."""
     return instant.low if isinstance(instant, LoopIndex) else int(instant)
 
 
 def latest(instant: Instant) -> int:
-    """Return the greatest value of an instant."""
+    """Return the greatest value of an instant over all iterations of the enclosing loops."""
     return instant.high if isinstance(instant, LoopIndex) else int(instant)
 
 
 def at_least(instant: Instant, least: int) -> Instant:
-    """Return the later of an instant and `least`."""
+    """Return the later of an instant and the sample `least`."""
     if isinstance(instant, int):
         return max(instant, least)
     if instant.low >= least:
@@ -105,7 +105,7 @@ def at_least(instant: Instant, least: int) -> Instant:
 
 
 def at_most(instant: Instant, most: int) -> Instant:
-    """Return an instant, or `most` where the instant may be later."""
+    """Return an instant, or the sample `most` if the instant may be later."""
     if isinstance(instant, int):
         return min(instant, most)
     return most if instant.high > most else instant
@@ -120,7 +120,7 @@ class IndexRange:
 
     @property
     def count(self) -> int:
-        """Number of instants from the earliest start to the latest end; empty if <= 0."""
+        """Number of instants from the earliest start to the latest end; a range with 0 or less is empty."""
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
         return latest(self.last) - earliest(self.start) + 1
@@ -132,7 +132,7 @@ class IndexRange:
 
     @property
     def settled(self) -> IndexRange:
-        """Range of all instants over all iterations of enclosing loops."""
+        """Range of all instants over all iterations of the enclosing loops."""
         return IndexRange(earliest(self.start), latest(self.last))
 
 
@@ -143,14 +143,15 @@ def spanning(start: int, count: int) -> IndexRange:
 
 @dataclass(frozen=True, slots=True)
 class TraceDomain:
-    """Length of a trace, and its continuation.
+    """Length of a trace, and how it continues beyond its last sample.
 
     Attributes:
         samples: number of known samples.
-        end: treatment of instants beyond them.
-        stop: final length of an open trace, at which windows to the end are clipped; None: at the last known
-            sample.
-        counted: every instant counts, unknown ones too, as the semantics is a mean.
+        end: treatment of the instants beyond the last sample (`Boundary`).
+        stop: final length of an open trace (one that continues, with unknown predicates), at which windows to
+            the end are cut; None: they are cut at the last known sample.
+        counted: whether every instant contributes to the value, even one with unknown predicates, since the
+            semantics is a mean.
     """
 
     samples: int
@@ -165,7 +166,7 @@ class TraceDomain:
 
     @property
     def length(self) -> int:
-        """Final length; unbounded windows are clipped here."""
+        """Final number of samples, at which windows to the end of the trace are cut."""
         return self.samples if self.stop is None else self.stop
 
 
@@ -175,7 +176,10 @@ class TraceDomain:
 def operands(
     node: ir.Formula, run: IndexRange, domain: TraceDomain
 ) -> tuple[tuple[ir.Formula, IndexRange], ...]:
-    """Return the operands of a formula needed at `run`, each with its instants, possibly none."""
+    """Return the operands that a formula needed at `run` reads, each with its instants.
+
+    The range of instants may be empty; `truth`, predicates and `freeze` have no operands.
+    """
     match node:
         case ir.Truth() | ir.Predicate() | ir.Freeze():
             return ()
@@ -203,7 +207,11 @@ def _first(read: ir.Offsets, run: IndexRange) -> Instant:
 def _last(
     read: ir.Offsets, run: IndexRange, window: ir.Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
 ) -> Instant:
-    """Return the last such instant, at most one beyond the trace at which all operands are constant."""
+    """Return the last instant at which a formula needed at `run` reads an operand.
+
+    On an open trace this may be cut to the first known instant beyond the trace from which all operands are
+    constant.
+    """
     if read.last is None:
         return domain.length - 1
     last = run.last + read.last
@@ -220,16 +228,17 @@ def _last(
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
-    """Return the samples required for a number to be defined.
+    """Return how many samples before and after now a number requires in order to be defined.
 
-    On an open trace a clamped read requires its actual sample.
+    A clamped read, which repeats the last sample, requires its actual sample on a trace whose final length
+    (`domain.stop`) is known.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
-    """Return the instants of `run` at which all samples within a lookback and lookahead exist."""
+    """Return the instants of `run` at which all samples that a number reaches (`reach`) exist."""
     first = max(earliest(run.start), reach.past)
     return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
 
@@ -239,13 +248,13 @@ def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Value to compute.
+    """Computation of one formula at a range of instants.
 
     Attributes:
-        node: formula, or a computation specific to a back end.
+        node: formula, or an operation specific to a back end.
         run: instants at which it is computed.
         args: step numbers of the operands; None for an operand that is not needed at any instant.
-        number: step number.
+        number: number of this step.
     """
 
     node: Any
@@ -255,17 +264,17 @@ class Step:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Step numbers of the needed operands."""
+        """Step numbers of the operands that are needed."""
         return tuple(number for number in self.args if number is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Ordered steps.
+    """Steps in the order of computation.
 
     Attributes:
         domain: trace that the steps read.
-        steps: steps in order, operands first.
+        steps: steps, each after those of its operands.
         roots: step numbers of the requested formulas.
     """
 
@@ -276,7 +285,7 @@ class Schedule:
 
 @dataclass(slots=True)
 class StepScope:
-    """Steps of one loop level, with an index of the values that they compute."""
+    """Steps of one loop level; `known` maps a formula and its instants to the number of their step."""
 
     steps: list[Step] = field(default_factory=list)
     known: dict[tuple[ir.Formula, IndexRange], int] = field(default_factory=dict)
@@ -291,7 +300,10 @@ class Scheduler:
         self._count = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the step number of a formula; None if it is needed at no instant."""
+        """Return the number of the step that computes a formula at `run`, adding it if there is none yet.
+
+        The result is None if `run` is empty.
+        """
         if run.count <= 0:
             return None
         key, known = (node, run), self.scope.known
@@ -301,12 +313,12 @@ class Scheduler:
         return found
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add a step after those of its operands."""
+        """Add the step of a formula after those of its operands; return its number."""
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
         return self.add(Step(node, run, args, number=self.number(run)))
 
     def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends allocate memory for it
-        """Return the next step number, for values at these instants."""
+        """Return the next free step number, for the values at the instants `run`."""
         self._count += 1
         return self._count - 1
 
@@ -317,7 +329,10 @@ class Scheduler:
 
 
 def schedule(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> Schedule:
-    """Return the schedule of `formulas` at the instants `run`; a `freeze` is one step."""
+    """Return the schedule that computes `formulas` at the instants `run`.
+
+    A `freeze` is a single step, whose body is scheduled by the back end.
+    """
     scheduler = Scheduler(domain)
     placed = (scheduler.place(formula, run) for formula in formulas)
     roots = tuple(number for number in placed if number is not None)

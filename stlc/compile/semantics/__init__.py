@@ -1,1 +1,1 @@
-"""Semantics of robustness: extrema that are exact, smooth, or means."""
+"""Semantics of robustness: minima and maxima that are exact, smooth, or means."""

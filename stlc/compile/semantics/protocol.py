@@ -1,4 +1,4 @@
-"""Protocol of a semantics: extrema of values, at once and by merging partial results."""
+"""Protocol of a robustness semantics: minima and maxima, computed at once or from partial results."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ Parts: TypeAlias = tuple[Array, ...]
 
 
 class Semantics(Protocol):
-    """Definition of extrema. Values are `(time, batch)`; infinite ones are neutral and have no gradient.
+    """Definition of minima and maxima over arrays `(time, batch)`.
 
-    Windows are computed by merging: operands are lifted to `Parts`, parts of disjoint sets are merged, and
-    `finish` converts parts to a value.
+    Infinite operands that do not decide the result have no influence, and no gradient. Windows are computed
+    from partial results: `lift` turns operands into `Parts`, `merge` joins the parts of disjoint sets of
+    operands, and `finish` converts parts to a value.
 
     Attributes:
-        exact: the value is that of an operand, so that native extrema of the array library apply.
-        idempotent: repeated operands do not matter, so that overlapping blocks may cover a window.
-        associative: the extremum of extrema is that of all their operands.
-        sound: no value is positive where the exact one is negative, nor negative where it is positive.
-        bounded: replacing unknown operands by their bounds, even infinite ones, bounds the value. Means
-            omit infinite operands, so that a finite one may exceed such a bound.
+        exact: whether the value is that of an operand, so that the array library's own minimum and maximum
+            apply.
+        idempotent: whether repeated operands make no difference, so that overlapping blocks may cover a
+            window.
+        associative: whether the extremum of extrema is that of all their operands.
+        sound: whether no value has the opposite sign of the exact one.
+        bounded: whether the value is bounded when unknown operands are replaced by their bounds, even
+            infinite ones. Means omit infinite operands, so that their value may exceed such a bound.
     """
 
     exact: ClassVar[bool]
@@ -34,37 +37,43 @@ class Semantics(Protocol):
     bounded: ClassVar[bool]
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the parts of each single operand."""
+        """Return the parts (partial result of `pick`) of each single operand."""
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """Merge the parts of two disjoint sets of operands, elementwise."""
+        """Return the parts of two disjoint sets of operands together, elementwise."""
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """Return the value of parts."""
+        """Return the minimum or maximum (`pick`) of the operands that `parts` sums up."""
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """The extremum of two values, elementwise."""
+        """Return the minimum or maximum (`pick`) of two values, elementwise."""
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """The extremum of one or more values, elementwise; a single one is unchanged."""
+        """Return the minimum or maximum (`pick`) of one or more values, elementwise.
+
+        A single value is returned unchanged.
+        """
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """The extremum over time: `(time, batch)` -> `(1, batch)`; a single sample is unchanged."""
+        """Return the minimum or maximum (`pick`) over time: `(time, batch)` -> `(1, batch)`.
+
+        A single sample is returned unchanged.
+        """
 
 
 class Associative:
-    """Base of associative semantics: the parts are the extremum so far."""
+    """Base of associative semantics, whose partial results are extrema themselves."""
 
     __slots__ = ()
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """Return the operands, unchanged."""
+        """Return the operands unchanged, as partial results."""
         return (x,)
 
     def merge(self: Semantics, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """Return the extremum of both."""
+        """Return the extremum of two partial results."""
         return (self.pair(a[0], b[0], pick, ops),)
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:  # noqa: ARG002
-        """Return the extremum so far."""
+        """Return the partial result itself, the extremum of its operands."""
         return parts[0]

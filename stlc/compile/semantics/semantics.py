@@ -1,7 +1,7 @@
 """Robustness semantics: exact or smooth definitions of maximum and minimum.
 
-Otherwise evaluation (`stlc.compile.backends.array.graph`) is independent of the semantics, and so are
-verdicts: satisfaction follows from the truth of the predicates, and the exact robustness has that sign.
+The rest of the evaluation (`stlc.compile.backends.array.graph`) does not depend on the semantics. Neither do
+verdicts: they follow from the truth of the predicates, in agreement with the sign of the exact robustness.
 
 | name     | class                     | is a positive value satisfied, a negative one violated?       |
 |----------|---------------------------|---------------------------------------------------------------|
@@ -10,7 +10,7 @@ verdicts: satisfaction follows from the truth of the predicates, and the exact r
 | `agm`    | `ArithmeticGeometricMean` | yes                                                           |
 | `dgmsr`  | `GeneralizedMean`         | yes                                                           |
 
-A semantics is one file of `stlc.compile.semantics.kinds`, called by its name.
+Each semantics is one file in `stlc.compile.semantics.kinds`; its name is that of the file.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
     """Return the requested semantics.
 
     Args:
-        asked: a semantics, or a name in `SEMANTICS`.
-        smoothing: scale k; selects log-sum-exp in place of `exact` or `smooth`.
+        asked: a semantics, or the name of one in `SEMANTICS`.
+        smoothing: scale k of log-sum-exp, which it selects in place of `exact` or `smooth`.
 
     Raises:
         UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.

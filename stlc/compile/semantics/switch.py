@@ -1,7 +1,7 @@
-"""Switches: conditions as indicators, and choices as blends (Eq. 6 of the paper).
+"""Switches: conditions as numbers from 0 to 1, choices as weighted means of their branches.
 
-A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the paper's
-smooth approximation; `StraightThrough` is exact forward, with a smooth gradient backward.
+A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the smooth
+approximation of the paper (Eq. 6); `StraightThrough` has exact values with smooth gradients.
 """
 
 from __future__ import annotations
@@ -16,27 +16,30 @@ class Switch(Protocol):
     """Evaluation of conditions in a program.
 
     Attributes:
-        exact: only the truth of a condition matters, not its margin: it is evaluated with comparisons and
-            masks, and each predicate keeps its own strictness.
+        exact: whether conditions are evaluated by comparisons and masks, without a margin, so that each
+            predicate keeps its own strictness.
     """
 
     exact: ClassVar[bool]
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:
-        """Return the indicator of a condition with margin `rho`, in [0, 1].
+        """Return the indicator of a condition, from 0 (false) to 1 (true).
 
         Args:
-            rho: margin; true iff > 0 (`strict`) or >= 0.
+            rho: margin of the condition, which is true iff the margin is > 0 (`strict`) or >= 0.
             strict: whether the inequality is strict.
-            sharpness: of this indicator; None takes the default of the switch.
+            sharpness: factor w of this indicator (Eq. 6 of the paper); None: the default of the switch.
             ops: the array library.
         """
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """Adjust the indicator `weight` of a condition of mixed strictness; `truth` is its mask."""
+        """Adjust the indicator of a condition that contains strict and non-strict inequalities.
+
+        `weight` is the indicator of its margin, `truth` the mask of its exact truth.
+        """
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """Return a blend of two values: `yes` where the indicator `weight` is 1, `no` where it is 0."""
+        """Return `no + weight * (yes - no)`, the choice between two values for an indicator `weight`."""
 
 
 @final
@@ -47,11 +50,11 @@ class Hard:
     exact: ClassVar[bool] = True
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """1 where the condition holds, else 0."""
+        """Return 1 where the condition holds, else 0."""
         return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """Return the mask as a number."""
+        """Return the mask `truth` as 0 or 1."""
         return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -62,13 +65,16 @@ class Hard:
 @final
 @dataclass(frozen=True, slots=True)
 class Tanh:
-    """The paper's Eq. 6: `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)`, and a blend of branches."""
+    """Smooth switching by `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)` (Eq. 6 of the paper).
+
+    A choice is the mean of both branches, weighted with the indicator.
+    """
 
     exact: ClassVar[bool] = False
     sharpness: float = 500.0
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """`(1 + tanh(w rho)) / 2` with the indicator's own sharpness where it has one."""
+        """Return `(1 + tanh(w rho)) / 2`, where w is `sharpness` or, if None, that of the switch."""
         width = self.sharpness if sharpness is None else sharpness
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
@@ -77,23 +83,23 @@ class Tanh:
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """`no + weight (yes - no)`."""
+        """Return `no + weight * (yes - no)`."""
         return ops.lerp(no, yes, weight)
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class StraightThrough:
-    """Exact forward; backward the slope of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
+    """Exact switching whose gradient is that of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
 
-    A choice has the value and gradient of the taken branch, plus the gradient of the condition.
+    A choice has the value and gradient of the branch taken, plus the gradient of the condition.
     """
 
     exact: ClassVar[bool] = False
     slope: float = 10.0
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """0 or 1, with a gradient."""
+        """Return 1 where the condition holds, else 0, with the smooth gradient."""
         return ops.straight_through(rho, strict, self.slope)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
@@ -101,5 +107,5 @@ class StraightThrough:
         return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """`no + weight (yes - no)`."""
+        """Return `no + weight * (yes - no)`."""
         return ops.lerp(no, yes, weight)

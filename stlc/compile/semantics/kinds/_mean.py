@@ -1,7 +1,7 @@
 """Mean-based semantics: extrema replaced by means of all operands with the same sign.
 
-Where all operands are positive, the minimum becomes their geometric mean, dominated by the smallest.
-Elsewhere it becomes a power mean of the violated ones, with satisfied operands as 0. A maximum is
+If all operands are positive, their minimum becomes their geometric mean, which the smallest dominates.
+Otherwise it becomes a power mean of the negative operands, in which the others count as 0. A maximum is
 `max(x) = -min(-x)`. Both means are functions of sums over the operands.
 """
 
@@ -19,10 +19,10 @@ from stlc.compile.semantics.protocol import Parts
 
 
 class Mean(ABC):
-    """Minimum as a mean: summands per operand, and the value as a function of the sums.
+    """Minimum as a mean: a function of two sums over the operands.
 
-    The parts are the exact minimum, which decides the sign; the sums over satisfied and over violated
-    operands; and the number of operands that are finite.
+    The parts, which partial results consist of, are the exact minimum, which decides the sign; the sums over
+    the positive and over the negative operands; and the number of finite operands.
     """
 
     __slots__ = ()
@@ -35,22 +35,25 @@ class Mean(ABC):
 
     @abstractmethod
     def gain(self, x: Array, ops: Ops) -> Array:
-        """Summand of an operand x > 0, used where all are satisfied."""
+        """Return the summand of an operand x > 0; the sum is used where all operands are positive."""
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Summand of an operand -x, x >= 0, used where one is violated; 0 at 0."""
+        """Return the summand of an operand -x, x >= 0; it is 0 for x = 0.
+
+        The sum is used where some operand is not positive.
+        """
 
     @abstractmethod
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """Value where all operands are positive."""
+        """Return the mean where all operands are positive; `count` is the number of finite operands."""
 
     @abstractmethod
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """Value where an operand is not positive."""
+        """Return the mean where some operand is not positive; `count` is the number of finite operands."""
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Sums of each single operand."""
+        """Return the parts of each operand: its value, its two summands, and whether it is finite."""
         x = x if pick == "min" else -x
         known = ops.gt(math.inf, ops.abs(x))
         positive = ops.both(known, ops.gt(x, 0.0))
@@ -60,11 +63,14 @@ class Mean(ABC):
         return x, gains, losses, ops.number(known, x)
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """Sums over both sets of operands."""
+        """Return the parts of two disjoint sets of operands together: the least value, and sums."""
         return (ops.minimum(a[0], b[0]), a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """Mean; a single operand is returned unchanged, and -inf stays -inf."""
+        """Return the mean of the operands that `parts` sums up.
+
+        A single operand is returned unchanged, and a minimum of -inf stays -inf.
+        """
         least, gains, losses, known = parts
         several = ops.both(ops.gt(known, 1.0), ops.gt(math.inf, ops.abs(least)))
         count = ops.where(several, known, 1.0)
@@ -73,18 +79,18 @@ class Mean(ABC):
         return value if pick == "min" else -value
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """The mean of two values."""
+        """Return the mean of two values, elementwise."""
         return self.join([a, b], pick, ops)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """The mean of one or more values."""
+        """Return the mean of one or more values, elementwise."""
         if len(items) == 1:
             return items[0]
         lifted = [self.lift(item, pick, ops) for item in items]
         return self.finish(reduce(lambda a, b: self.merge(a, b, pick, ops), lifted), pick, ops)
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """The mean over time."""
+        """Return the mean over time: `(time, batch)` -> `(1, batch)`."""
         if len(x) == 1:
             return x
         least, *sums = self.lift(x, pick, ops)

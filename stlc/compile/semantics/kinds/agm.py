@@ -23,19 +23,19 @@ class ArithmeticGeometricMean(Mean):
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:
-        """log(1 + x)."""
+        """Return log(1 + x), the summand of an operand x > 0."""
         return ops.log1p(x)
 
     def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Magnitude of the violation."""
+        """Return x, the magnitude of the operand -x, as its summand."""
         return x
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """The geometric mean."""
+        """Return the geometric mean of `1 + x` minus 1, for operands that are all positive."""
         return ops.expm1(gains / count)
 
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """The arithmetic mean."""
+        """Return the arithmetic mean of the negative operands, with the others as 0."""
         return -(losses / count)
 
 

@@ -31,21 +31,24 @@ class GeneralizedMean(Mean):
     p: int = 1
 
     def gain(self, x: Array, ops: Ops) -> Array:
-        """log(x^2 / eps)."""
+        """Return log(x^2 / eps), the summand of an operand x > 0."""
         return ops.log(x) * 2.0 - math.log(self.eps)
 
     def loss(self, x: Array, ops: Ops) -> Array:
-        """(x^2 / eps)^p."""
+        """Return (x^2 / eps)^p, the summand of an operand -x, x >= 0."""
         square = ops.square(x) * (1.0 / self.eps)
         return square if self.p == 1 else ops.pow(square, float(self.p))
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """sqrt((eps^n + prod x^2)^(1/n)) - sqrt(eps), stable for large and small gains."""
+        """Return sqrt((eps^n + prod x^2)^(1/n)) - sqrt(eps), for operands that are all positive.
+
+        The computation is stable for large and small sums.
+        """
         soft = ops.maximum(gains, gains * 0.0) + ops.log1p(ops.exp(-ops.abs(gains)))
         return ops.expm1(soft / (count * 2.0)) * math.sqrt(self.eps)
 
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """sqrt(eps) - sqrt((eps^p + mean x^2p)^(1/p))."""
+        """Return sqrt(eps) - sqrt((eps^p + mean x^2p)^(1/p)), where some operand is not positive."""
         return ops.expm1(ops.log1p(losses / count) / (2.0 * self.p)) * -math.sqrt(self.eps)
 
 

@@ -1,4 +1,4 @@
-"""`smooth`: the log-sum-exp of the paper."""
+"""`smooth`: log-sum-exp approximations of minimum and maximum, as in the paper."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ class LogSumExp(Associative):
     `max(x) = log(sum(exp(k x))) / k`, which overestimates by at most log(n) / k, and `min(x) = -max(-x)`,
     which underestimates by as much.
 
-    Not sound: a value within the summed error of all operators from 0 is inconclusive. With minima alone a
-    positive value means satisfied, with maxima alone a negative one means violated.
+    Not sound: a value whose magnitude is below the summed error of all operators has no meaning for the
+    verdict. In a formula of minima alone a positive value means satisfied; in one of maxima alone a negative
+    value means violated.
 
     Attributes:
         k: the scale; larger values approach the exact extrema.
@@ -35,11 +36,11 @@ class LogSumExp(Associative):
     bounded: ClassVar[bool] = True
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """The smooth extremum of two values."""
+        """Return the smooth minimum or maximum (`pick`) of two values, elementwise."""
         return ops.softmax2(a, b, self.k if pick == "max" else -self.k)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """The smooth extremum of one or more values."""
+        """Return the smooth minimum or maximum (`pick`) of one or more values, elementwise."""
         if len(items) == 1:
             return items[0]
         if len(items) == 2:
@@ -47,7 +48,7 @@ class LogSumExp(Associative):
         return self.reduce(ops.stack(items), pick, ops)[0]
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """The smooth extremum over time."""
+        """Return the smooth minimum or maximum (`pick`) over time: `(time, batch)` -> `(1, batch)`."""
         if len(x) == 1:
             return x
         return ops.softmax(x, self.k if pick == "max" else -self.k)
