@@ -1,7 +1,8 @@
-"""Hoisting of absolute intervals out of enclosing operators: their truth is the same at every instant.
+"""Moving absolute operators (`always@[a, b]`) out of the operators around them.
 
-`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. Where this is impossible,
-training reports E307; on recorded traces absolute intervals are evaluated in place.
+The interval of an absolute operator counts from the start of the mission, so its truth is the same at every
+instant: `always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. Where this is
+impossible, training reports E307; on recorded traces absolute operators are evaluated where they stand.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from stlc.diagnostics import Diagnostic, tell
 
 
 def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Move absolute intervals of a formula in negation normal form out of other temporal operators."""
+    """Move absolute operators (`always@[a, b]`) out of other temporal operators.
+
+    The formula is in negation normal form; E307 is appended to `sink` where this is impossible.
+    """
     if not absolute(formula):
         return formula
     match formula:
@@ -32,12 +36,15 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 
 
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
-    """True if the window includes now; a past window that does not may be empty, whatever its body."""
+    """True if the window of `node` contains the present sample.
+
+    A past window that does not may be empty, which decides the operator whatever its body.
+    """
     return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
 
 
 def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Return `op body` with the constant parts of `body` moved out of the operator."""
+    """Return `node` applied to `body`, with the parts of `body` of constant truth moved out of `node`."""
     if _constant(body):
         return body
     if isinstance(body, typed.Logic) and body.op in ("and", "or"):
@@ -64,7 +71,7 @@ def _constant(formula: typed.Formula) -> bool:
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Report E307 for the first absolute interval below `outer`; return `true` in its place."""
+    """Report E307 for the first absolute operator (`always@[a, b]`) below `outer`; return `true`."""
     inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
     finding = Diagnostic(
         "E307",
@@ -78,10 +85,11 @@ def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
 
 
 def from_first_sample(formula: typed.Formula) -> typed.Formula:
-    """Formula of a requirement that is evaluated only at the first sample of a recorded trace.
+    """Return the formula of a requirement that is evaluated only at the first sample of a recorded trace.
 
-    At that sample mission time and relative time agree, so absolute intervals become relative ones. Those
-    under another temporal operator stay absolute and are evaluated at the first sample.
+    At that sample, mission time and relative time are equal, so absolute operators (`always@[a, b]`) become
+    relative ones (`always[a, b]`). Those below another temporal operator stay absolute; they too are
+    evaluated at the first sample.
     """
     if isinstance(formula, (typed.Temporal, typed.Until)):
         return from_now(formula)

@@ -1,9 +1,10 @@
-"""Absolute formulas with a latched status, and their progression over a plan.
+"""Absolute formulas, each with an added state that holds its status, and their progression over a plan.
 
-A status is open, true or false, latched by the mission clock and the state. A plan satisfies an absolute
-formula unless the samples up to the plan's end falsify it: an open formula is evaluated over the horizon and
-assumed satisfiable beyond it. Under any combination of `and`, `or`, `not` and `->`, an executed trace whose
-plans all satisfy the progressed formula satisfies the formula.
+An absolute formula such as `always@[a, b] p` has an interval that counts from the start of the mission. Its
+status is open, true or false; once true or false it stays so. A plan satisfies an absolute formula unless the
+samples up to the plan's end falsify it: an open formula is evaluated over the horizon and assumed satisfiable
+beyond it. This also holds for any combination of absolute formulas by `and`, `or`, `not` and `->`: an
+executed trace whose plans all satisfy the progressed formula satisfies the formula.
 """
 
 from __future__ import annotations
@@ -27,17 +28,20 @@ _KNOWN = ir.Const(0.5)
 
 @dataclass(frozen=True, slots=True)
 class Absolute:
-    """Absolute operator over state formulas, in negation normal form.
+    """Operator with an interval that counts from the start of the mission (`always@[a, b]`).
+
+    Its operands are state formulas in negation normal form.
 
     Attributes:
         op: the operator.
-        window: samples of the mission.
-        span: where it was written.
-        left: left operand of `until` and `release`, as typed; a constant for `always` and `eventually`.
-        right: the other operand, or the only one.
-        left_now: `left` as a condition on the state; ties count as satisfied.
-        right_now: `right` as a condition on the state; ties count as satisfied.
-        margin: `right` as a formula of the IR.
+        window: its samples, counted from the start of the mission.
+        span: its place in the source.
+        left: left operand of `until` and `release`, a typed formula; a constant for `always` and
+            `eventually`.
+        right: right operand, or the only one, a typed formula.
+        left_now: `left` as a condition on the current state, in which ties count as satisfied.
+        right_now: `right` as a condition on the current state, in which ties count as satisfied.
+        margin: `right` as a formula of the IR, for its robustness.
     """
 
     op: AbsoluteOp
@@ -52,7 +56,10 @@ class Absolute:
 
 @dataclass(frozen=True, slots=True)
 class GoalLeaf:
-    """Absolute formula with its status and clock columns."""
+    """Goal of one absolute formula (`always@[a, b] p`), with the states that the compiler adds for it.
+
+    `status` holds whether the formula is open, true or false; `clock` counts the steps of the mission.
+    """
 
     formula: Absolute
     status: ir.Signal
@@ -61,7 +68,7 @@ class GoalLeaf:
 
 @dataclass(frozen=True, slots=True)
 class GoalBranch:
-    """Conjunction or disjunction of goals."""
+    """Conjunction or disjunction (`op`) of goals."""
 
     op: Literal["and", "or"]
     items: tuple[Goal, ...]
@@ -73,19 +80,19 @@ Goal: TypeAlias = GoalLeaf | GoalBranch
 
 
 def last_step(formula: Absolute) -> int:
-    """Last finite step of the mission that the formula refers to."""
+    """Return the last finite step of the mission to which the window of the formula refers."""
     return formula.window.lo if formula.window.hi is None else formula.window.hi
 
 
 def mission_steps(goal: Goal) -> int:
-    """Last finite step of the mission that any formula of the goal refers to."""
+    """Return the last finite step of the mission to which any formula of the goal refers."""
     if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
     return max(map(mission_steps, goal.items))
 
 
 def never_over(goal: Goal) -> bool:
-    """True if a formula of the goal has an unbounded window, so that the mission never ends."""
+    """True if a formula of the goal has a window without end, so that the mission never ends."""
     if isinstance(goal, GoalLeaf):
         return goal.formula.window.hi is None
     return any(map(never_over, goal.items))
@@ -95,13 +102,16 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """Return the update of a status from its own column; a status that is not open stays."""
+    """Return a function from the column of a status to the value of that status one step later.
+
+    A status that is true or false stays so.
+    """
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Return the next value of an open status, after the current sample."""
+    """Return the value of an open status one step later, decided by the current sample."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -120,7 +130,7 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
 
 
 def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """True if the current sample is within a window on the mission clock."""
+    """Return the condition that the current step of the mission is within `window`."""
     started = at_least(clock, ir.Const(float(window.lo)))
     if window.hi is None:
         return started
@@ -129,7 +139,7 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """True if the current sample is at or after the end of the window."""
+    """Return the condition that the current step of the mission is at or after the end of `window`."""
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
@@ -137,7 +147,7 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def progress(goal: Goal, horizon: int) -> typed.Formula:
-    """Return the formula for a plan's first sample that is true unless the plan falsifies the goal."""
+    """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
@@ -148,7 +158,7 @@ def progress(goal: Goal, horizon: int) -> typed.Formula:
 
 
 def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula:
-    """Return that formula for one absolute formula."""
+    """Return the formula that a plan must satisfy in order not to falsify one absolute formula."""
     span, left, right = formula.span, formula.left, formula.right
     known = time_test(leaf.status, _KNOWN, span)
     alive = possible(leaf)
@@ -175,7 +185,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """Return a test of the current state that is true if the mission so far has not falsified the goal."""
+    """Return the condition on the current state that the mission before it has not falsified the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -186,7 +196,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Time test: true if the current sample is within a window on the mission clock."""
+    """Return the test of time that the current step of the mission is within `window`."""
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started
@@ -195,7 +205,7 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
-    """True if the end of the window lies beyond the end of the plan."""
+    """Return the condition that the window of a formula ends beyond the end of the plan."""
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)
@@ -203,10 +213,10 @@ def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
 
 
 def _all_along(body: typed.Formula) -> typed.Formula:
-    """Return: `body` at every sample of the plan."""
+    """Return the formula that `body` holds at every sample of the plan."""
     return typed.Temporal(body.span, "always", _plan(body.span), body)
 
 
 def _plan(span: Span) -> typed.Interval:
-    """Return the interval of the whole plan."""
+    """Return the interval [0, T], which covers the whole plan."""
     return typed.Interval(typed.Time(), typed.Time(horizons=Fraction(1), span=span), span=span)

@@ -1,12 +1,13 @@
-"""Absolute operators over future formulas, rewritten as absolute operators over past formulas.
+"""Absolute operators (`always@[a, b]`) over future formulas, rewritten to be over past formulas.
 
-`eventually@[a, b] always[0, c] p` holds iff at some sample from a + c to b + c p has held for c. Each part is
-stated at the instant at which it is decided, so it needs only memory of the past: one timer per window. Where
-parts are decided at different instants, the earlier ones are delayed in a register.
+The interval of an absolute operator counts from the start of the mission. `eventually@[a, b] always[0, c] p`
+holds iff p has held for c at some sample from a + c to b + c. Each part is stated at the instant at which it
+is decided, so it needs only memory of the past: one timer per window. Where parts are decided at different
+instants, the earlier ones are stored until the last one is decided, in one state per sample.
 
-In that formula `always[0, c] p` must begin by b, so it is violated as soon as p fails after b. The rewritten
-formula is a `left until@ right` whose left side detects that at once, not only at b + c. The method is that
-of Maler, Nickovic and Pnueli, "Real time temporal logic: past, present, future" (2005).
+In the example, `always[0, c] p` must begin by b, so the formula is violated as soon as p fails after b. The
+rewritten formula is a `left until@ right`; its left side detects this at once, not only at b + c. The method
+is that of Maler, Nickovic and Pnueli, "Real time temporal logic: past, present, future" (2005).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Formulas: TypeAlias = tuple[typed.Formula, ...]
 
 
 class TooFarError(Exception):
-    """A formula has unbounded lookahead, or cannot be represented by a finite state; the message says why."""
+    """A formula has unbounded lookahead or needs more than finite memory; the message says why."""
 
     def __init__(self, span: Span, why: str) -> None:
         super().__init__(why)
@@ -46,7 +47,7 @@ def looks_ahead(formula: typed.Formula) -> bool:
 
 
 def _forwards(node: typed.Formula) -> bool:
-    """True for a future operator."""
+    """True if the outermost operator of a formula is a future operator."""
     match node:
         case typed.Temporal(_, op):
             return op in ("always", "eventually")
@@ -61,13 +62,15 @@ def _forwards(node: typed.Formula) -> bool:
 def in_past_form(
     formula: typed.Formula, grid: Grid, table: TimerTable, sink: list[Diagnostic]
 ) -> typed.Formula:
-    """Rewrite a formula in negation normal form, evaluated at the start of the mission, with past operators.
+    """Rewrite a formula in negation normal form so that its absolute operators have past formulas.
 
     Args:
-        formula: absolute operators, and relative ones evaluated at the start, under `and` and `or`.
+        formula: absolute operators (`always@[a, b]`), and relative ones at the start of the mission, joined
+            by `and` and `or`.
         grid: time step and horizon.
-        table: receives the mission clock where deadlines need it.
-        sink: receives findings about bounds.
+        table: table of added states, to which the mission clock (steps since the start of the mission) is
+            added if deadlines need it.
+        sink: list to which findings about bounds are appended.
 
     Raises:
         TooFarError: an operand has unbounded lookahead, or an unsupported operator.
@@ -101,7 +104,10 @@ def in_past_form(
 def _on_grid(
     formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, negated: bool = False
 ) -> typed.Formula:
-    """Return a formula with bounds in whole samples, rounded according to the operator as written."""
+    """Return a formula with its bounds in whole samples, rounded conservatively for each operator.
+
+    `negated` tells that the formula is below a `not`.
+    """
     match formula:
         case typed.Logic(_, _, items):
             return replace(formula, items=tuple(_on_grid(item, grid, sink) for item in items))
@@ -123,12 +129,12 @@ def _on_grid(
 
 
 def _next(span: Span, body: typed.Formula) -> typed.Formula:
-    """Return `next(p)` as a window; a mission always has a next sample."""
+    """Return `next(body)` as `always` with the window [1, 1]; in a mission there is always a next sample."""
     return typed.Temporal(span, "always", in_steps(ir.Window(1, 1), span), body)
 
 
 def _window(node: typed.Temporal | typed.Until) -> ir.Window:
-    """Return the window of an operator whose bounds are whole samples."""
+    """Return the window of an operator whose bounds are whole numbers of samples."""
     lo, hi = node.interval.lo, node.interval.hi
     return ir.Window(int(lo.steps), None if hi is None else int(hi.steps))
 
@@ -138,7 +144,11 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 
 
 def _ahead(formula: typed.Formula) -> int:
-    """Return the lookahead of a formula in samples. Raises TooFarError where it is unbounded."""
+    """Return the lookahead of a formula in samples.
+
+    Raises:
+        TooFarError: the lookahead is unbounded.
+    """
     if isinstance(formula, _OPAQUE):
         return 0
     inner = max(map(_ahead, operands(formula)), default=0)
@@ -150,7 +160,11 @@ _OPAQUE = (typed.Shift, typed.Edge, typed.Freeze, typed.Recalled)
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:
-    """Return the end of a window in samples. Raises TooFarError where it has none."""
+    """Return the end of an operator's window in samples.
+
+    Raises:
+        TooFarError: the window extends to the end of the trace.
+    """
     hi = _window(node).hi
     if hi is None:
         raise TooFarError(node.span, "a window to the end of the trace")
@@ -162,19 +176,20 @@ def _end(node: typed.Temporal | typed.Until) -> int:
 
 @final
 class _Writer:
-    """Rewriter of future operators as past operators.
+    """Rewriter of the future operators below one absolute operator (`eventually@[a, b]`) as past operators.
 
     Args:
-        table: receives the mission clock.
+        table: table of added states, which provides the mission clock (steps since the start of the mission).
         span: place of the absolute operator.
-        soon: whether to detect a violation at once, by the left side of an `until`.
+        soon: whether to detect a violation at once rather than at the deadline, by the left side of an
+            `until`.
     """
 
     def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
         self._table, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
-        """Return: at one sample of `window`, on the mission clock, `what` and all of `when` hold."""
+        """Return a past formula: at some sample of the mission in `window`, `what` and all of `when` hold."""
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))
         match what:
@@ -204,7 +219,7 @@ class _Writer:
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
 
     def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
-        """Return `met` of a conjunction."""
+        """Return the past formula of `met` where `what` is the conjunction of `items`."""
         later = [item for item in items if looks_ahead(item)]
         known = (*when, *(item for item in items if not looks_ahead(item)))
         if len(later) == 1:
@@ -216,7 +231,7 @@ class _Writer:
     def _lasting(
         self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula
     ) -> typed.Formula:
-        """Return `met` of `always[what] body`."""
+        """Return the past formula of `met` where `what` is `always[what] body`."""
         lo, hi = what.lo, what.hi or 0
         late = _ahead(body)
         body = self.delayed(body, late)
@@ -239,7 +254,7 @@ class _Writer:
     def _reached(
         self, window: ir.Window, when: Formulas, inner: ir.Window, left: typed.Formula, right: typed.Formula
     ) -> typed.Formula:
-        """Return `met` of `left until[inner] right`."""
+        """Return the past formula of `met` where `what` is `left until[inner] right`."""
         late = max(_ahead(left), _ahead(right))
         left, right = self.delayed(left, late), self.delayed(right, late)
         begun = self._ago(self._begun(window, when), late) if when else None
@@ -257,7 +272,11 @@ class _Writer:
         return self._on_clock_until(there, self._or(latest, pending), met)
 
     def _freed(self, node: typed.Until, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """Rewrite `left release[l, u] right`: right throughout, left before, or right until left inside."""
+        """Rewrite `left release[l, u] right` as a disjunction of three cases.
+
+        `right` throughout the window; or `left` at some sample up to l; or, from l on, `right` until `left`,
+        within the window.
+        """
         window, span = _window(node), node.span
         hi = _end(node)
         always = typed.Temporal(span, "always", node.interval, right)
@@ -271,7 +290,10 @@ class _Writer:
     # ------------------------------------------------------------------ formulas delayed in time
 
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
-        """Return a past formula with the truth that a formula had `steps` samples ago, when it is decided."""
+        """Return a past formula with the truth that `formula` had `steps` samples ago.
+
+        By then `formula` is decided: its lookahead is at most `steps`.
+        """
         if not looks_ahead(formula):
             return self._ago(formula, steps)
         match formula:
@@ -290,7 +312,7 @@ class _Writer:
     def _written_out(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
     ) -> typed.Formula:
-        """Return `until` or `release` as `steps` samples ago, expanded sample by sample."""
+        """Return the truth of an `until` or `release` `steps` samples ago, expanded sample by sample."""
         window, end, strong = _window(node), _end(node), node.op == "until"
         if end > _LONGEST:
             raise TooFarError(
@@ -314,14 +336,14 @@ class _Writer:
         return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
 
     def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
-        """Return: all of `when` hold, and the mission clock is in `window`."""
+        """Return the formula that all of `when` hold and the current step of the mission is in `window`."""
         if window == ir.Window(0, None):
             return self._and(*when)
         clock = self._table.clock((window.lo if window.hi is None else window.hi) + 1)
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """True if the mission clock is at most `step`; always true for None."""
+        """Return the condition that the current step of the mission is at most `step`; true for None."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._table.clock(step + 1), self._span)

@@ -1,11 +1,12 @@
-"""Past operators as timers, so that a plan carries the history before its first sample.
+"""Past operators as timers (added states), so that a plan carries the history before its first sample.
 
-A timer counts up to the previous sample: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
-`p or since_p <= c`. Windows of the past are cut at the start of the mission.
+A timer counts the samples before the current one: `historically[0, c] p` is `p and held >= c`, where `held`
+is the number of samples for which p has held; `once[0, c] p` is `p or since_p <= c`, where `since_p` is the
+number of samples since p last held. Windows of the past are cut at the start of the mission.
 
-A timer decides truth at one instant, without a gradient. Along a plan the operator is evaluated on the plan's
-samples, and the timer's value at the first sample stands for the samples before the plan: k steps into the
-plan, `historically[0, c] p` lacks `c - held - k` steps.
+At a single instant, timers decide truth without a gradient. Along a plan the operator is evaluated on the
+plan's samples, and the timer's value at the first sample stands for the samples before the plan: k steps into
+the plan, `historically[0, c] p` lacks `c - held - k` steps.
 """
 
 from __future__ import annotations
@@ -43,13 +44,13 @@ _Op: TypeAlias = Literal["and", "or"]
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """Test `left >= right` between a timer and a number.
+    """Test `left >= right` between a timer (added state) and a number.
 
     Attributes:
         left: left side.
         right: right side.
-        span: place of the operator.
-        later: increment of the timer per step while it is not reset.
+        span: place of the past operator.
+        later: increment of the timer per step while it is not reset; 0 for one that does not count.
     """
 
     left: ir.Num
@@ -58,20 +59,20 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test for use in a disjunction, with robustness +inf or -inf."""
+        """Return the test as an operand of `or`: its robustness is +inf or -inf."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test for use in a conjunction: where it fails, the missing steps are its robustness."""
+        """Return the test as an operand of `and`: where it fails, its robustness counts the missing steps."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
         )
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides at a later sample of the plan, extrapolated from the timer at the first sample."""
+        """Both sides at the current sample of a plan, extrapolated from the timer at the first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -84,13 +85,13 @@ class _Test:
 @final
 @dataclass(frozen=True, slots=True)
 class Past:
-    """Rewriter of a requirement's past operators.
+    """Rewriter of a requirement's past operators with timers (added states).
 
     Attributes:
         grid: time step and horizon.
-        table: receives the timers.
-        sink: receives the findings, E309 for operators that no timer represents.
-        name: name of the requirement; prefix of the timers' names.
+        table: table to which the timers are added.
+        sink: list to which findings are appended: E309 for an operator that no timer represents.
+        name: name of the requirement, with which the names of its timers begin.
     """
 
     grid: Grid
@@ -99,7 +100,7 @@ class Past:
     name: str
 
     def rewrite(self, formula: typed.Formula) -> typed.Formula:
-        """Return a formula in negation normal form without past operators."""
+        """Return a formula in negation normal form with its past operators replaced by timers."""
         if not looks_back(formula):
             return formula
         match formula:
@@ -146,7 +147,7 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Return: `body` held at one of the previous `most` samples (None: all)."""
+        """Return the test of a timer: `body` held at some of the previous `most` samples (None: of all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
@@ -158,7 +159,7 @@ class Past:
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Return: `body` held at each of the previous `most` samples (None: all)."""
+        """Return the test of a timer: `body` held at each of the previous `most` samples (None: all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
@@ -172,7 +173,11 @@ class Past:
     # ------------------------------------------------------------------------------ since
 
     def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[0, c] q`, or its negation: p now, and q now or at most c ago with p ever since."""
+        """Rewrite `p since[0, c] q`, or its negation if not `positive`, with a timer.
+
+        It holds if p holds now, and q holds now, or held at most c ago with p at every sample since then.
+        Windows that end before now are rewritten by `_since_before` and `_lasting`.
+        """
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
         if left is None or right is None:
@@ -201,7 +206,10 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """Return: q held at an earlier sample, and p from there to the previous sample; or its negation."""
+        """Return the test that q held at an earlier sample, and p from then to the previous sample.
+
+        If not `positive`, it is the negation, and `left` and `right` are the negations of p and q.
+        """
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
@@ -220,7 +228,10 @@ class Past:
     # ------------------------------------------------------------------------- rise, fall
 
     def _edge(self, node: typed.Edge, *, positive: bool) -> typed.Formula:
-        """Rewrite `rise` (true now and not before; false at the first sample), `fall`, or a negation."""
+        """Rewrite `rise` or `fall`, or its negation if not `positive`, with the truth of the previous sample.
+
+        `rise(p)` holds where p is true and was false at the previous sample; at the first sample it is false.
+        """
         now: Sign = 1 if (node.op == "rise") is positive else -1
         body, before = self._body(normal(node.body, now)), self._body(normal(node.body, flip(now)))
         if body is None or before is None:
@@ -238,7 +249,10 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Return the truth of `body` `steps` samples ago, from a register that starts with `before`."""
+        """Return the truth that `body` had `steps` samples ago, stored in one added state per sample.
+
+        Before the start of the mission the truth is `before`.
+        """
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
@@ -261,7 +275,10 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[a, b] q` or its negation: p in [0, a], and `p since[0, b - a] q` a ago."""
+        """Rewrite `p since[a, b] q`, or its negation if not `positive`, with windows that end now.
+
+        It is `historically[0, a] p` and the truth that `p since[0, b - a] q` had a ago.
+        """
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
         ago = self._delayed(node, self._since(recent, positive=positive), lo, before=not positive)
@@ -272,7 +289,10 @@ class Past:
     def _lasting(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
-        """Rewrite `p since[a, end] q` or its negation by a timer of the first q since which p has held."""
+        """Rewrite `p since[a, end] q`, or its negation if not `positive`, with a timer.
+
+        The timer counts the steps since the first q after which p has held ever since.
+        """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
         from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
@@ -309,14 +329,17 @@ class Past:
     def _throughout(
         self, body: typed.Formula, span: Span, window: ir.Window = _SO_FAR, *, positive: bool
     ) -> typed.Temporal:
-        """Return `historically[window] body`, or its dual if not `positive`."""
+        """Return `historically[window] body`, or `once[window] body` if not `positive`."""
         return typed.Temporal(span, "historically" if positive else "once", in_steps(window, span), body)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
         return tolerant(condition(timer_form(body), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
-        """Return the body without past operators if that is a state formula; else None, and E309."""
+        """Return the operand of a past operator with its own past operators rewritten.
+
+        The result is None, with E309 in `sink`, if it is no state formula.
+        """
         rewritten = self.rewrite(body)
         if is_state(rewritten, augmented=True):
             return rewritten
@@ -339,18 +362,18 @@ class Past:
 
 
 def _counted(own: ir.Num, most: int) -> ir.Num:
-    """Return `own + 1`, saturating at `most`."""
+    """Return the number `own + 1`, but at most `most`."""
     return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
 
 
 def _short(formula: typed.Formula) -> str:
-    """Source text of a formula, truncated where it is long."""
+    """Return the source text of a formula in backticks, cut to 40 characters."""
     text = " ".join(formula.span.text.split())
     return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
 
 
 def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
-    """Return a window as an interval in steps."""
+    """Return a window as an interval in steps, counted from `clock`."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
     return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, clock=clock, span=span)
 
@@ -358,7 +381,10 @@ def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "no
 def _since_inside(
     node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
 ) -> typed.Formula:
-    """Return `left since[window] right` over the plan's samples, or its dual."""
+    """Return `left since[window] right` over the plan's samples; if not `positive`, its dual.
+
+    The dual is the negation of `(not left) since[window] (not right)`.
+    """
     interval = in_steps(window, node.span)
     if positive:
         return replace(node, interval=interval, left=left, right=right)

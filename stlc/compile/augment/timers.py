@@ -1,7 +1,8 @@
 """States that the compiler adds to carry the history before a plan: initial values and updates.
 
-`clock`: steps since the start of the mission. `status`: truth of an absolute formula so far. `latch`: whether
-a formula held at the previous sample, or ever. `timer`: for how long a formula has held, or has not. All are
+`clock`: number of steps since the start of the mission. `status`: whether an absolute formula (`always@[a, b]
+p`, whose interval counts from the start of the mission) is open, true or false. `latch`: whether a formula
+held at the previous sample, or ever. `timer`: for how many steps a formula has held, or has not held. All are
 integers, updated from the state at the start of a step.
 """
 
@@ -30,7 +31,7 @@ MISSING = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """State that the compiler adds to those of the system.
+    """State that the compiler adds to those of the system; called a timer whatever its kind.
 
     Attributes:
         name: name of its column.
@@ -38,8 +39,8 @@ class Timer:
         initial: value at the start of a mission.
         update: value one step later, as a function of the state at the start of the step.
         low: least value.
-        high: greatest value, where the count saturates; larger ones make no difference to any formula.
-        about: meaning in words, for texts.
+        high: greatest value, at which the count saturates; a larger value would change no formula.
+        about: meaning in words, for `stlc compile` and generated code.
     """
 
     name: str
@@ -52,21 +53,21 @@ class Timer:
 
     @property
     def column(self) -> Column:
-        """Column that the timer adds to the state."""
+        """Column of the timer in the state signature."""
         return Column(self.name, kind="int", role="timer", low=self.low, high=self.high, fact=True)
 
 
 def clock_of(name: str, high: int) -> Timer:
-    """Return the mission clock, which counts integer steps up to `high`."""
+    """Return the mission clock: an added state that counts the steps of the mission up to `high`."""
     later = ir.Op("min", (ir.Op("add", (ir.Signal(name), ir.Const(1.0))), ir.Const(float(high))))
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
 class TimerTable:
-    """Timers of a specification, collected over its requirements; equal ones are shared."""
+    """Added states of a specification, collected over its requirements; equal ones are shared."""
 
     def __init__(self, taken: frozenset[str]) -> None:
-        """Create an empty table; names in `taken` are not used for timers."""
+        """Create an empty table that gives no added state a name in `taken`."""
         self._taken = set(taken)
         self._known: dict[tuple[object, ...], Timer] = {}
         self._clock: str | None = None
@@ -74,19 +75,22 @@ class TimerTable:
 
     @property
     def timers(self) -> tuple[Timer, ...]:
-        """Timers in order, the clock first if there is one."""
+        """Added states in order, the mission clock first if there is one."""
         clocks = () if self._clock is None else (clock_of(self._clock, self._latest),)
         return (*clocks, *self._known.values())
 
     def clock(self, latest: int) -> ir.Signal:
-        """Return the mission clock, extended to count up to step `latest`."""
+        """Return the signal of the mission clock, which counts steps, extended to count to `latest`."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")
         return ir.Signal(self._clock)
 
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
-        """Add a timer like `draft`, with `update` applied to its own column, or return an equal one."""
+        """Return the signal of an added state like `draft`, adding it unless there is an equal one.
+
+        `update` maps its own signal to its value one step later.
+        """
         key = (draft.kind, draft.initial, draft.high, update(ir.Signal("")))
         if key not in self._known:
             name = self.fresh(draft.name)
@@ -94,7 +98,7 @@ class TimerTable:
         return ir.Signal(self._known[key].name)
 
     def fresh(self, wanted: str) -> str:
-        """Return `wanted`, with a number appended where that name is taken."""
+        """Return the name `wanted`, with a number appended if it is taken, and mark the result as taken."""
         name, number = wanted, 1
         while name in self._taken:
             number += 1
@@ -107,39 +111,46 @@ class TimerTable:
 
 
 def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
-    """Predicate `left >= right` between integers."""
+    """Return the predicate `left >= right` between integers."""
     return ir.Predicate(ir.Op("sub", (left, right)))
 
 
 def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
-    """Time test `left >= right`: robustness +inf or -inf, so that it never limits the margin."""
+    """Return the test of time `left >= right`, with robustness +inf or -inf.
+
+    So it decides truth but is never the margin of an enclosing formula.
+    """
     return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """Test `left >= right` of samples before the plan; where it fails, its robustness is `-MISSING` per step.
+    """Return the test `left >= right` of the samples before a plan.
 
-    That is less than the robustness of any predicate, so that instants that the plan can influence are
-    preferred; it is finite, so that plans that all fail can still be ranked.
+    Where it fails, its robustness is `-MISSING` per missing step. That is less than the robustness of any
+    predicate, so that instants that the plan can influence are preferred; it is finite, so that plans that
+    all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
 
 
 def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-    """`yes` where a state formula holds, else `no`."""
+    """Return the number that is `yes` where a state formula holds, else `no`."""
     if isinstance(condition, ir.Truth):
         return yes if condition.value else no
     return ir.Where(condition, yes, no)
 
 
 def tolerant(formula: ir.Formula) -> ir.Formula:
-    """State formula that is true where the monitor reports satisfaction: ties within `TOLERANCE` count."""
+    """Return a state formula that holds where the monitor reports `formula` as satisfied.
+
+    Predicates may miss their threshold by `TOLERANCE`.
+    """
     if isinstance(formula, ir.Predicate) and not formula.guard:
         return ir.Predicate(ir.Op("add", (formula.num, ir.Const(formula.sign * TOLERANCE))), formula.sign)
     return map_children(formula, formulas=tolerant)
 
 
 def both(*items: ir.Formula) -> ir.Formula:
-    """Conjunction of formulas, constants folded."""
+    """Return the conjunction of formulas, simplified where one is a constant."""
     return joined("and", items, ir.Truth(True))

@@ -1,1 +1,1 @@
-"""Front end: from the syntax tree to a typed specification, with names, units, sorts and times checked."""
+"""Front end: from the syntax tree to a typed specification, with names, units, types and times checked."""

@@ -1,8 +1,8 @@
 """Arithmetic on numbers and vectors: unit checks, constant folding, broadcasting.
 
-A number in a unit with an offset (`degC`) is a point of a scale. Points can be compared and selected; their
-difference is in kelvin; a point plus kelvin is a point. `abs` and other magnitudes reject points, all other
-functions take them in kelvin.
+A value in a unit with an offset (20 degC) is a point of a scale, as opposed to a difference. Points can be
+compared and selected; the difference of two is in kelvin; a point plus kelvin is a point. `abs` and other
+magnitudes reject points, all other functions take them in kelvin.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
     """Return `name(args)`, with units checked and constants folded.
 
     Args:
-        name: of an entry of `FUNCTIONS`.
-        args: arguments, in a valid number.
-        span: of the whole expression, for findings.
+        name: name of an entry of `stlc.compile.ir.functions.FUNCTIONS`.
+        args: arguments; their number is valid.
+        span: source location of the whole expression, for findings.
         scope: receives findings.
 
     Raises:
-        Failed: units do not agree (E203), a division by zero (E401), or a value that does not exist (E205).
+        Failed: units do not agree (E203), a divisor is zero (E401), or the function has no value for its
+            constant arguments (E205). The error is in the scope already.
     """
     function = FUNCTIONS[name]
     for arg in args:
@@ -71,12 +72,14 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
-    """Convert bare numbers to the common unit; return the arguments and a template number of that unit.
+    """Convert bare numbers to the common unit of all; return the arguments and a template of a result.
+
+    The template is a number of that unit, whose other fields the caller replaces.
 
     Args:
         args: numbers that must have one unit.
-        what: verb of the message: "compare", "add", or `norm`.
-        span: of the finding.
+        what: verb for the message: "compare", "add", or the name of a function.
+        span: source location for the finding.
         scope: receives findings.
     """
     rigid = [arg for arg in args if not arg.flexible]
@@ -97,7 +100,11 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
 
 
 def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
-    """Return `left - right` for a comparison of two points or two numbers. Raises Failed (E203)."""
+    """Return `left - right` of two temperatures (points of a scale) or of two other numbers.
+
+    Raises:
+        Failed: the units do not agree (E203).
+    """
     if not (left.unit.offset or right.unit.offset):
         return apply("sub", (left, right), span, scope)
     sides, _ = agree((left, right), "subtract", span, scope)
@@ -106,7 +113,7 @@ def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
 
 
 def rebased(number: Number, unit: Unit) -> Number:
-    """Convert a number to the offset of `unit`, which becomes its unit."""
+    """Return the same quantity as a number of `unit`, counted from the offset of `unit`."""
     shift = number.unit.offset - unit.offset
     if not shift:
         return replace(number, unit=unit)
@@ -127,26 +134,30 @@ def rebased(number: Number, unit: Unit) -> Number:
 
 
 def absolute(number: Number) -> Number:
-    """Convert to SI units without an offset: 20 degC is 293.15 K."""
+    """Return the same quantity as a number in SI units without an offset: 20 degC is 293.15 K."""
     return rebased(number, number.unit.interval)
 
 
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
-    """Convert a number to `unit`, of equal dimensions. Raises Failed (E203): a difference is no point."""
+    """Return the same quantity as a number of `unit`, which has equal dimensions.
+
+    Raises:
+        Failed: a temperature difference where `unit` needs a temperature (E203).
+    """
     if unit.offset and number.sense == "difference":
         scope.fail(difference_for_point(number, unit, place))
     return rebased(number, unit)
 
 
 def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
-    """Return E203 for a difference where a point of a scale is needed."""
+    """Return E203 for a temperature difference where a temperature is needed."""
     message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
     help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
     return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
 
 
 def too_large(span: Span | None) -> Diagnostic:
-    """Return E005 for a number beyond double precision."""
+    """Return E005 for a number that exceeds the range of double precision."""
     return Diagnostic(
         "E005",
         "this number is beyond double precision",
@@ -156,7 +167,11 @@ def too_large(span: Span | None) -> Diagnostic:
 
 
 def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
-    """Interpret a bare number in `unit`: 30 becomes 30 deg. Raises Failed (E005 beyond double precision)."""
+    """Return a bare number with the unit `unit`: 30 becomes 30 deg.
+
+    Raises:
+        Failed: the result exceeds the range of double precision (E005).
+    """
     if unit.ratio == 1:
         return replace(number, unit=unit, bare=False, flexible=False)
     exact = None if number.exact is None else number.exact * unit.ratio
@@ -181,7 +196,11 @@ def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> N
 def _units(
     function: Function, args: Sequence[Number], span: Span, scope: Scope
 ) -> tuple[tuple[Number, ...], Number]:
-    """Convert the arguments by the function's unit rule; return them and a template of the result."""
+    """Convert the arguments as the unit rule of the function requires.
+
+    The result is the arguments and a template: a number with the unit of the function's result, whose other
+    fields the caller replaces.
+    """
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
         return _alike(function, args, span, scope)
@@ -216,7 +235,7 @@ Agreed = tuple[tuple[Number, ...], Number]
 
 
 def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """Unit rule `same`: convert all arguments to one unit."""
+    """Apply the unit rule `same`: convert all arguments to one unit."""
     name, verb = function.name, _verb(function)
     if name in ("normal", "truncnorm"):
         return _spread(function, args, span, scope)
@@ -256,7 +275,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """True for a plain number times a point, as in a mean or in a conversion between scales."""
+    """True for a plain number times a temperature in degC, as in a mean or a conversion between scales."""
     points = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in points]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
@@ -265,7 +284,10 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 
 
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
-    """Convert numbers, some of them points, to one offset: that of a varying point if there is one."""
+    """Convert numbers, some of which are temperatures, to one offset.
+
+    It is that of a temperature that is not constant, if there is one.
+    """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
     bare = next((arg for arg in args if arg.bare), None)
@@ -288,7 +310,7 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
 
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
-    """Unit rule of a sum or difference with a point."""
+    """Apply the unit rule of a sum or difference in which a temperature in degC takes part."""
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
     point, other = (left, right) if first else (right, left)
@@ -310,7 +332,11 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 
 
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
-    """Unit rule of `left - right` with a point on the right: a difference, or `open` where the point is."""
+    """Apply the unit rule of `left - right` where `right` is a temperature in degC.
+
+    The result is a difference. Where `right` may be a difference itself (its `sense` is `open`), the result
+    may be a temperature too.
+    """
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
         return (left, absolute(right)), Number(
@@ -321,7 +347,10 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
 
 
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """Unit rule of `normal` and `truncnorm`: mean and bounds are points, the deviation is a difference."""
+    """Apply the unit rule of `normal` and `truncnorm`.
+
+    Mean and bounds may be temperatures; the standard deviation is a difference.
+    """
     middle, deviation, *ends = args
     places = [middle, *ends]
     if deviation.unit.offset:
@@ -341,7 +370,13 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
 
 
 def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
-    """Check the argument of `abs` and other magnitudes: no point; an `open` one counts as a difference."""
+    """Return the argument of `abs` or another magnitude, which must not be a temperature in degC.
+
+    A number that may be a difference (`Number.sense` is `open`) counts as one.
+
+    Raises:
+        Failed: the argument is a temperature in degC (E203).
+    """
     if not arg.unit.offset:
         return arg
     if arg.sense == "open":
@@ -351,13 +386,19 @@ def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number
 
 
 def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
-    """Raise Failed (E203) for a point where an amount is needed; `what` names the place."""
+    """Raise Failed (E203) if a number is a temperature in degC where an amount is needed.
+
+    `what` names the operator or function for the message.
+    """
     if number.unit.offset:
         scope.fail(point_for_amount(what, number, span))
 
 
 def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
-    """Return E203 for a point of a scale where an amount is needed; `what` names the place."""
+    """Return E203 for a temperature in degC where an amount is needed.
+
+    `what` names the operator or function for the message.
+    """
     unit = number.unit
     text = (number.span or span).text
     written = _QUANTITY.fullmatch(text)
@@ -371,7 +412,7 @@ def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
 
 
 def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 for a difference compared with a point: `abs(temp - 21 degC) <= 0.5 degC`."""
+    """Return E203 for a difference compared with a temperature: `abs(temp - 21 degC) <= 0.5 degC`."""
     unit = point.unit
     text = (point.span or span).text
     if point.constant is not None:
@@ -406,7 +447,7 @@ def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
 
 
 def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
-    """Return E203 for an ambiguous bare number: on the scale with an offset, or in SI units."""
+    """Return E203 for a number without a unit that may be in `unit` (degC) or in kelvin."""
     text, kelvin = (bare.span or span).text, unit.interval
     help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
     message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
@@ -472,7 +513,7 @@ def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope
 
 
 def _op(name: str, args: Sequence[Number]) -> ir.Num:
-    """Build the node of a function, with neutral elements removed."""
+    """Return the IR node of a function applied to numbers; neutral operands, as in `x + 0`, are dropped."""
     nums = tuple(arg.num for arg in args)
     match name, nums:
         case ("add", (num, ir.Const(0.0))) | ("add", (ir.Const(0.0), num)) | ("sub", (num, ir.Const(0.0))):
@@ -488,7 +529,13 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
 
 
 def _fold(function: Function, args: Sequence[Number], template: Number, scope: Scope) -> Number:
-    """Fold a function of constants; exact where all are exact and the function preserves it."""
+    """Return the value of a function of constants as a number like `template`.
+
+    The value is exact if all arguments are exact and the function preserves this.
+
+    Raises:
+        Failed: the function has no value for these arguments (E205).
+    """
     assert function.fold is not None
     exacts = [arg.exact for arg in args]
     rational = function.exact and all(exact is not None for exact in exacts)
@@ -510,9 +557,9 @@ def _fold(function: Function, args: Sequence[Number], template: Number, scope: S
 
 
 def _whole(function: Function, args: Sequence[Number], template: Number) -> bool:
-    """True if the result is an integer for all values of the arguments.
+    """True if the result of a function is an integer for all values of these arguments.
 
-    `floor` and other roundings act on SI values, which in kilometres need not be integers.
+    `floor` and other roundings act on SI values, which need not be integers in the unit of the result.
     """
     if function.integral:
         return template.unit.ratio == 1
@@ -528,7 +575,7 @@ def _verb(function: Function) -> str:
 
 
 def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 with both places, and a repair that makes the units agree."""
+    """Return E203 for two units that do not agree, with both places and a repair."""
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(
@@ -584,7 +631,7 @@ def half(span: Span) -> Number:
 def broadcast(
     name: str, args: Sequence[Number | VectorValue], span: Span, scope: Scope
 ) -> Number | VectorValue:
-    """Apply `name` component by component; numbers broadcast to vectors."""
+    """Apply the function `name` component by component; a number counts for every component of a vector."""
     lengths = {len(arg.items) for arg in args if isinstance(arg, VectorValue)}
     if not lengths:
         return apply(name, [arg for arg in args if isinstance(arg, Number)], span, scope)
@@ -602,21 +649,25 @@ def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
 
 
 def negate(value: Number | VectorValue, span: Span) -> Number | VectorValue:
-    """`-value`."""
+    """Return a number or vector with its sign reversed."""
     if isinstance(value, Number):
         return negated(value, span)
     return VectorValue(tuple(negated(item, span) for item in value.items), span)
 
 
 def minus(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> VectorValue:
-    """Return the difference of two points of equal dimension. Raises Failed (E203, E205)."""
+    """Return the difference of two vectors of equal length.
+
+    Raises:
+        Failed: the units do not agree (E203), or the lengths (E205).
+    """
     check_lengths({len(left.items), len(right.items)}, span, scope)
     pairs = zip(left.items, right.items, strict=True)
     return VectorValue(tuple(gap(a, b, span, scope) for a, b in pairs), span)
 
 
 def norm(vector: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return the Euclidean length."""
+    """Return the Euclidean length of a vector."""
     return apply("norm", vector.items, span, scope)
 
 
@@ -626,14 +677,18 @@ def total(items: Sequence[Number], span: Span, scope: Scope) -> Number:
 
 
 def dot(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return the inner product."""
+    """Return the inner product of two vectors."""
     products = broadcast("mul", (left, right), span, scope)
     assert isinstance(products, VectorValue)
     return total(products.items, span, scope)
 
 
 def cross(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Number | VectorValue:
-    """Return the cross product: a number in 2D, a vector in 3D."""
+    """Return the cross product: a number for vectors of 2 components, a vector for those of 3.
+
+    Raises:
+        Failed: vectors of other lengths (E205).
+    """
 
     def minor(i: int, j: int) -> Number:
         ahead = apply("mul", (left.items[i], right.items[j]), span, scope)

@@ -1,4 +1,4 @@
-"""Function calls: built-in functions, regions, neighbouring samples, functions of the system."""
+"""Function calls: built-in functions, regions, values of neighbouring samples, functions of the system."""
 
 from __future__ import annotations
 
@@ -62,7 +62,11 @@ FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Region:
-    """Return the region that a call constructs. Raises Failed (E105 arguments, E205 sorts)."""
+    """Return the region that a call such as `circle(...)` constructs.
+
+    Raises:
+        Failed: wrong arguments (E105), or arguments of a wrong type (E205).
+    """
     if name not in FORMALS:
         _positional(name, call, scope)
         pairs = [(arg.value, value) for arg, value in zip(call.args, values, strict=True)]
@@ -91,7 +95,11 @@ def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> 
 def _bound(
     name: str, call: ast.Call, values: Sequence[Value], scope: Scope
 ) -> tuple[tuple[ast.Expr, Value], ...]:
-    """Return positional and named arguments in the order of the formals."""
+    """Return (expression, value) of each argument in the order of the function's parameter names.
+
+    Raises:
+        Failed: an argument is unknown, repeated or missing (E105).
+    """
     formals = FORMALS[name]
     found: dict[str, tuple[ast.Expr, Value]] = {}
     shape = f"{name}({', '.join(formals)})"
@@ -175,7 +183,13 @@ _SECOND = SYMBOLS["s"]
 
 
 def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """Evaluate a `STEPPING` function with a valid number of arguments. Raises Failed (E201, E205)."""
+    """Return the value of a function that reads other samples, such as `next`, `shift` or `rise`.
+
+    The number of arguments is valid.
+
+    Raises:
+        Failed: an argument is no formula (E201) or has a wrong type (E205).
+    """
     value, expr = values[0], call.args[0].value
     match name:
         case "rise" | "fall":
@@ -194,7 +208,10 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
 
 
 def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: str, scope: Scope) -> Value:
-    """Return a number, a vector or a formula shifted in time."""
+    """Return a number, a vector or a formula shifted in time by `delay`.
+
+    `name` is that of the function, for messages.
+    """
     match value:
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
@@ -217,13 +234,13 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Shift one component; for a choice between bools also its formula."""
+    """Return one component shifted in time by `delay`, and with it the formula of a choice between bools."""
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
-    """Return the difference from the previous sample."""
+    """Return the change of a number or vector since the previous sample."""
     now = (
         value
         if isinstance(value, VectorValue)
@@ -235,9 +252,10 @@ def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
 
 
 def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
-    """Delay as a number of samples (`3`, `-1`, `3 steps`), or as a time (`0.1 s`), before discretization.
+    """Return a delay: a number of samples (`3`, `-1`, `3 steps`), or a time (`0.1 s`) not yet on the grid.
 
-    Raises Failed: E205 where it is neither.
+    Raises:
+        Failed: the expression is neither (E205).
     """
     match value:
         case TimeExpr(end=False):
@@ -259,7 +277,11 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
 
 
 def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """Return a call of a function of the system. Raises Failed (E105, E202, E205)."""
+    """Return the value of a call of a function that the system provides.
+
+    Raises:
+        Failed: wrong arguments (E105), or arguments of a wrong type (E202, E205).
+    """
     _positional(entry.name, call, scope, "give its arguments in order")
     count_arguments(entry.name, call, len(entry.arguments), len(entry.arguments), scope)
     flat: list[ir.Num] = []
@@ -288,7 +310,11 @@ def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
 
 
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """Return `name(values)` for a built-in function. Raises Failed; E101 for an unknown function."""
+    """Return the value of a call of a built-in function.
+
+    Raises:
+        Failed: among other errors, E101 for an unknown function.
+    """
     if name in REGIONS:
         return region(name, call, values, scope)
     if name == "ind":
@@ -313,7 +339,7 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
 
 
 def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
-    """Return the diagnostic for a part of the language that is not supported in this context."""
+    """Return the error for a construct that is not supported: S201 in a system file, else E015."""
     if not scope.in_spec:
         return Diagnostic("S201", f"{what} is not part of the expression language of system files", span)
     return Diagnostic("E015", f"{what} is not compiled by this version", span)
@@ -335,7 +361,7 @@ def count_arguments(name: str, call: ast.Call, least: int, most: int | None, sco
 
 
 def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
-    """Raise Failed (E105) for an argument with a name."""
+    """Raise Failed (E105) if an argument of a call is named."""
     for arg in call.args:
         if arg.name is not None:
             message = f"`{name}` has no argument called `{arg.name}`"
@@ -343,7 +369,10 @@ def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
 
 
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """Apply a function of the table component by component, or over all components at once."""
+    """Return the value of a function in `FUNCTIONS`.
+
+    It is applied component by component or, if it takes any number of arguments, to all components together.
+    """
     items: list[Number | VectorValue] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
         need = Expectation(f"`{name}` takes numbers", f"argument {index}")
@@ -384,7 +413,7 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
 
 
 def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """`deg(x)`: an angle as a number of degrees; `rad(x)`: a number of degrees as an angle."""
+    """Return `deg(angle)`, an angle as a number of degrees, or `rad(angle)`, degrees as an angle."""
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)
     (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)
@@ -392,7 +421,10 @@ def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
 
 
 def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
-    """`ind(phi, sharpness = w)`: 1 where phi holds, else 0 (the paper's Eq. 6 in training)."""
+    """Return `ind(phi, sharpness = w)`: 1 where the state formula phi holds, else 0.
+
+    In training it is smoothed (Eq. 6 of the paper), with the factor w.
+    """
     if not call.args or call.args[0].name is not None or len(call.args) > 2:
         message = "`ind` takes a formula, and perhaps `sharpness = w`"
         scope.fail(Diagnostic("E105", message, call.span, help=("ind(x > 0, sharpness = 500)",)))

@@ -1,4 +1,4 @@
-"""Coercion of values to the sort that their place in an expression requires."""
+"""Conversion of values to the type that their place in an expression requires."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Expected sort of a place in an expression, for messages.
+    """Expected type of a value at its place in an expression, for messages.
 
     Attributes:
         who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".
-        which: role of the value: "the right side", "argument 2"; "" for "this".
-        span: of the operator, for a second label.
+        which: role of the value: "the right side", "argument 2", "this".
+        span: place of the operator, for a second label in the message.
     """
 
     who: str
@@ -34,7 +34,11 @@ class Expectation:
 
 
 def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """Return the value as a real, an integer or an enum. Raises Failed (E202, E205)."""
+    """Return a value as a real, an integer or an enum member's number.
+
+    Raises:
+        Failed: it is a formula or a bool (E202), or no number (E205).
+    """
     match value:
         case Number(kind="bool"):
             help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
@@ -54,7 +58,11 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """Like `as_number`, but a bool counts as 0 or 1, for values that are stored or compared."""
+    """Return a value as a number, in which a bool counts as 0 or 1; for values stored or compared.
+
+    Raises:
+        Failed: as for `as_number`.
+    """
     match value:
         case Number():
             return value
@@ -65,7 +73,11 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
 
 
 def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """Return the value as a formula; a bool signal holds above 1/2. Raises Failed (E201)."""
+    """Return a value as a formula; a bool signal holds where it is at least 1/2.
+
+    Raises:
+        Failed: it is neither a formula nor a bool (E201).
+    """
     match value:
         case Number(formula=formula) if formula is not None:
             return formula
@@ -79,7 +91,11 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
 
 
 def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> ir.Formula:
-    """Return the value as a state formula in negation normal form. Raises Failed (E201, E202)."""
+    """Return a value as a state formula, whose truth depends on one instant, in negation normal form.
+
+    Raises:
+        Failed: it is no formula (E201), or depends on other instants (E202).
+    """
     formula = as_formula(value, expr, need, scope)
     if not is_state(formula):
         message = f"{need.who}, but this looks at other times"
@@ -89,7 +105,11 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
 
 
 def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> VectorValue:
-    """Return the value as a vector of numbers. Raises Failed (E205)."""
+    """Return a value that must be a vector of numbers.
+
+    Raises:
+        Failed: it is none (E205).
+    """
     if isinstance(value, VectorValue):
         return value
     message = f"{need.who}; {need.which} is {noun(value)}"
@@ -97,7 +117,11 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def member_number(member: Member, span: Span, scope: Scope) -> Number:
-    """Return the number of an enum member, where all enums that contain it agree."""
+    """Return the number of an enum member.
+
+    Raises:
+        Failed: enums that contain the member give it different numbers (E101).
+    """
     values = {dict(labels)[member.name] for labels in member.options}
     if len(values) > 1:
         message = f"`{member.name}` is a member of several enums, with different values"

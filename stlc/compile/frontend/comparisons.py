@@ -46,7 +46,7 @@ def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> type
 
 
 def sign_span(sign: str, left: Span, right: Span) -> Span:
-    """Span of an operator between its operands."""
+    """Return the source location of the operator `sign` between its operands."""
     gap = left.source.text[left.end : right.start]
     at = gap.find(sign)
     if at < 0:
@@ -85,10 +85,10 @@ def _pair(
 
 
 def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Predicate:
-    """Return `big > small` (`strict`) or `big >= small`; between integers with a margin of 1/2.
+    """Return the predicate `big > small` (`strict`) or `big >= small`.
 
-    Integers differ by 0 or at least 1: with the threshold halfway, neither rounding nor ties matter, and the
-    margin agrees with that of `==`.
+    For integers the threshold is shifted by 1/2, halfway between whole numbers: rounding and ties then do not
+    matter, and the margin agrees with that of `==`.
     """
     written = _compared(big, small)
     if (big.kind, small.kind) == ("int", "int"):
@@ -106,7 +106,7 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Unit of a comparison: that of the side that is not constant."""
+    """Return the unit in which a comparison is reported: that of a side that is not constant, if any."""
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 
@@ -121,7 +121,13 @@ def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> Non
 
 
 def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
-    """Return `==` between integers, truth values or enums, with margin 1/2 - |a - b|."""
+    """Return `left == right` for integers, bools or enums, with margin 1/2 - |a - b|.
+
+    For formulas it is `<->`, for which their own margins count.
+
+    Raises:
+        Failed: a side is real (E204) or has another type (E205).
+    """
     _refuse_vectors(left, right, "==", scope)
     if any(is_formula(value) for _, value in (left, right)):
         need = Expectation("`==` between truth values", "the other side")
@@ -137,7 +143,7 @@ def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Sc
 
 
 def _meet(side: Operand, other: Operand, scope: Scope) -> Number:
-    """Return a side as a number; an enum member is resolved in the enum of the other side."""
+    """Return one side of `==` as a number; an enum member gets its number in the enum of the other side."""
     expr, value = side
     labels = other.value.labels if isinstance(other.value, Number) else ()
     if isinstance(value, Member) and labels:
@@ -169,7 +175,11 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
 
 
 def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
-    """Check that an enum is compared with the same enum, or with the number of one of its members."""
+    """Check that an enum is compared with the same enum, or with the number of one of its members.
+
+    Raises:
+        Failed: it is not (E205).
+    """
     if a.labels and b.labels:
         if a.labels != b.labels:
             scope.fail(Diagnostic("E205", "these are members of different enums", place))
@@ -187,13 +197,13 @@ def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
 
 
 def in_set(item: Operand, members: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """Return `s in {1, 2}`: equality with one of the members."""
+    """Return `item in {1, 2}`: equality with one of the members."""
     equals = tuple(_equality(item, member, span, span, scope) for member in members)
     return equals[0] if len(equals) == 1 else typed.Logic(span, "or", equals)
 
 
 def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """Return `x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
+    """Return `item in [lo, hi]`: both comparisons or, under `@product`, (x - lo) (hi - x) >= 0."""
     need = "`in [lo, hi]` compares numbers"
     x = as_number(item.value, item.expr, Expectation(need, "the left side"), scope)
     low, high = (as_number(value, expr, Expectation(need, "a bound"), scope) for expr, value in ends)
@@ -215,7 +225,10 @@ def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -
 
 
 def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: Scope) -> typed.Formula:
-    """Return `sweep(p) in R`, the whole segment, or `not in`, no part of it (which is not its negation)."""
+    """Return `sweep(p) in R`: the whole segment from p to its next sample is in the region.
+
+    `sweep(p) not in R` says that no point of the segment is in the region, which is not its negation.
+    """
     if isinstance(expr.region, ast.SetLiteral):
         help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)
         scope.fail(
@@ -237,7 +250,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
 
 
 def in_region(item: Operand, region: Operand, span: Span, scope: Scope) -> typed.Formula:
-    """Return `p in R`: signed distance >= 0."""
+    """Return `p in R`: the signed distance of the point to the region, positive inside, is >= 0."""
     (point_expr, point), (region_expr, place) = item, region
     if not isinstance(place, REGION_TYPES):
         help_ = ("write a range `[lo, hi]`, a set `{a, b}`, or a region like `circle(center, radius)`",)

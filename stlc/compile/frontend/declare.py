@@ -1,4 +1,4 @@
-"""Declarations of a file: names, columns of signals, and functions of the system."""
+"""Declarations of a file: names, columns (name, unit and range) of signals, functions of the system."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_d
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
-    """Report every name in a macro's body that nothing declares (E101)."""
+    """Report E101 for every name in the body of a macro that nothing declares."""
     functions = {*callable_names(), *sampler_names()}
     for name, called in _free(entry.body, frozenset(entry.formals)):
         if name.name in scope.entries or (name.name in BUILT_IN and not name.quoted):
@@ -49,7 +49,7 @@ def check_names(entry: Definition, scope: Scope) -> None:
 
 
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
-    """Yield free names, and whether each is called."""
+    """Yield (name, whether it is called) of each name that an expression does not bind itself."""
     if isinstance(node, ast.Name):
         if node.name not in bound:
             yield node, False
@@ -71,7 +71,7 @@ def _binds(node: object) -> frozenset[str]:
 
 
 def _parts(node: object) -> Iterator[object]:
-    """Children of a node, without called functions and module names."""
+    """Yield the children of a syntax node, except the names of called functions and of modules."""
     if isinstance(node, tuple):
         yield from node
     elif isinstance(node, ast.Node) and not isinstance(node, ast.Attr):
@@ -83,7 +83,11 @@ _EXTERN_KINDS: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
 def external(item: ast.Extern, interface: Interface | None, about: str, scope: Scope) -> External:
-    """Return the function that `item` declares. Raises Failed (E005, E101, E107)."""
+    """Return the function that an `extern fn` declares.
+
+    Raises:
+        Failed: an invalid type (E101) or vector size (E005), or a function that the system lacks (E107).
+    """
     types = [formal.type for formal in item.formals]
     for written in (*types, item.type):
         if written is not None:
@@ -137,7 +141,11 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """Return the bracketed unit of a declaration. Raises Failed (E203)."""
+    """Return the unit that a declaration has in brackets.
+
+    Raises:
+        Failed: it is unknown (E203).
+    """
     if not text:
         return DIMENSIONLESS
     try:
@@ -153,7 +161,11 @@ def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
 
 
 def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Scope) -> None:
-    """Raise Failed for an undeclared type (E101), or a size out of bounds (E005)."""
+    """Check the type in a declaration.
+
+    Raises:
+        Failed: it is not declared (E101), or its vector size is invalid (E005).
+    """
     if type_ is None:
         return
     if type_.name not in _KINDS and type_.name not in enums and type_.name != "formula":
@@ -168,10 +180,12 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
 def columns_of(
     decl: ast.Signal | ast.Param, enums: Mapping[str, Labels], interface: Interface | None, scope: Scope
 ) -> tuple[Column, ...]:
-    """Return the columns of a declaration without ranges, matched with those of the system if there is one.
+    """Return the columns of a signal or parameter, one per component, without ranges.
+
+    If there is a system, they are matched with its columns.
 
     Raises:
-        Failed: E101 unknown type, E103 signal missing in the system, E104 or E203 signal that differs there.
+        Failed: E101 unknown type, E103 signal that the system lacks, E104 or E203 signal that differs there.
     """
     check_type(decl.type, enums, scope)
     name = decl.column or decl.name if isinstance(decl, ast.Signal) else decl.name
@@ -188,7 +202,11 @@ def columns_of(
 
 
 def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface, scope: Scope) -> Column:
-    """Return the column as stored by the system."""
+    """Return a declared column with the unit and range of the same column of the system.
+
+    Raises:
+        Failed: the system lacks it (E103), or it has another unit (E203) or type (E104) there.
+    """
     if column.name not in interface.signature:
         if isinstance(decl, ast.Param):
             return column
@@ -222,7 +240,7 @@ def _members(labels: Labels) -> str:
 
 
 def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Interface) -> Diagnostic:
-    """Return E103 with the closest signal name."""
+    """Return E103 for a signal that the system lacks, with the signal that may be meant."""
     names = interface.signature.names
     near = closest(column.name, names)
     alike = [c.name for c in interface.signature.columns if c.unit.text and c.unit == column.unit]
@@ -249,7 +267,9 @@ def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Inte
 def ranged(
     columns: Sequence[Column], unit: Unit, decl: ast.Signal | ast.Param, scope: Scope
 ) -> tuple[Column, ...]:
-    """Return the columns with ranges in stored units; ranges of env signals are enforced, others nominal.
+    """Return the columns with their declared ranges, in stored units.
+
+    The ranges of `env` signals are enforced: analyses may rely on them. Those of others are nominal.
 
     Raises:
         Failed: a bound that is not constant (E205) or has another unit (E203), or an empty range (E205).
@@ -271,7 +291,10 @@ def ranged(
 def _ends(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, column: Column, unit: Unit, scope: Scope
 ) -> tuple[float | None, float | None] | None:
-    """Least and greatest value of a domain; None for a distribution, and for a bound `inf`."""
+    """Return the least and greatest value of a declared range or set.
+
+    An end is None for `inf`; the result is None for a distribution.
+    """
     if isinstance(domain, tuple):
         low, high = _stored(domain, column, unit, scope)
         if low is not None and high is not None and low > high:
@@ -288,12 +311,15 @@ def _ends(
 def ends_of(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, column: Column, unit: Unit, scope: Scope
 ) -> Iterator[float | None]:
-    """Yield the bounds of a range or the members of a set, in the unit of the column; None for `inf`."""
+    """Yield the ends of a range or the members of a set, in the unit of the column; None for `inf`."""
     return _stored(domain if isinstance(domain, tuple) else domain.items, column, unit, scope)
 
 
 def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope) -> Iterator[float | None]:
-    """Evaluate constants in the unit of the column; bare numbers take the declared unit."""
+    """Yield the values of constant expressions in the unit of the column; None for `inf`.
+
+    A bare number is in the declared `unit`.
+    """
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, TimeExpr) and value.end:
             yield None
@@ -319,9 +345,9 @@ class Declared:
     """Declarations of a file.
 
     Attributes:
-        entries: value namespace.
-        enums: type namespace.
-        columns: of signals and parameters, without ranges, with the declared unit.
+        entries: names of values: signals, constants, definitions, functions, enum members.
+        enums: (member, value) pairs of each enum, by its name.
+        columns: (declaration, columns without ranges, declared unit) of each signal and parameter.
         broken: names with an invalid declaration, whose uses are not reported again.
     """
 
@@ -334,13 +360,13 @@ class Declared:
 def declare(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
 ) -> Declared:
-    """Return the declarations of the file; findings go to the scope (E101, E102, E103, E104, E203, E501).
+    """Return the declarations of a file; E101, E102, E103, E104, E203 and E501 go to `scope`.
 
     Args:
-        spec: as parsed.
-        interface: of the system, or None.
-        overrides: constant or parameter -> replacing value.
-        scope: receives findings; its names are not read.
+        spec: syntax tree of the file.
+        interface: interface of the system, or None.
+        overrides: expression that replaces the value of a constant or parameter, by its name.
+        scope: receives the findings; its names are not used.
     """
     _check_twice(spec, scope)
     builder = _EntryBuilder(interface, overrides, scope)
@@ -370,7 +396,7 @@ def _keyword(item: ast.Item) -> str:
 
 
 def _check_twice(spec: ast.Spec, scope: Scope) -> None:
-    """Report E102 for duplicate values, types, requirements and imports."""
+    """Report E102 for a value, type, requirement or import that is declared twice."""
     spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}, "file": {}}
     for written in spec.imports:
         if written.alias is not None:
@@ -388,7 +414,10 @@ def _check_twice(spec: ast.Spec, scope: Scope) -> None:
 
 
 def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]], scope: Scope) -> None:
-    """Register a name, or report E102 with its first declaration; enums may share members."""
+    """Record the declaration of a name, or report E102 if it has one already.
+
+    Different enums may have members of the same name.
+    """
     if name not in space:
         space[name] = (span, enum)
         return
@@ -419,7 +448,7 @@ def _declare_enum(item: ast.Enum, found: Declared, scope: Scope) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _EntryBuilder:
-    """Builder of name-table entries of one file, a method for each class of declarations."""
+    """Builder of the entries in the name table of a file, with a method for each kind of declaration."""
 
     interface: Interface | None
     overrides: Mapping[str, ast.Expr]
@@ -479,7 +508,7 @@ def _about(item: ast.Item) -> str:
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """Return a signal with the unit that the file declares, independent of the system's stored unit."""
+    """Return the value of a signal in the unit that the file declares, whatever the system stores."""
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value

@@ -1,7 +1,7 @@
-"""Evaluation of syntax to values: the only recursion over expressions.
+"""Evaluation of expressions to values: the only recursion over the syntax tree.
 
-Other modules of the front end work on values. This one resolves names, expands macros (hygienically:
-arguments are values), unrolls quantifiers and collects independent findings.
+The other modules of the front end work on values. This one resolves names, expands macros (hygienically:
+arguments are values), unrolls quantifiers, and reports all independent errors.
 """
 
 from __future__ import annotations
@@ -50,7 +50,11 @@ from stlc.units import nearest, parse_unit
 
 
 def member_of(expr: ast.Attr, scope: Scope) -> tuple[ast.Name, Scope]:
-    """Return the name of `m.name` and the scope that declares it. Raises Failed (E101)."""
+    """Return `name` of an expression `m.name`, and the scope of the imported file that declares it.
+
+    Raises:
+        Failed: `m` is not an imported file (E101).
+    """
     if not scope.in_spec:
         scope.fail(unsupported(f"`{expr.span.text}`", expr.span, scope))
     place = expr.span.source.span(expr.span.end - len(expr.name), expr.span.end)
@@ -73,11 +77,13 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
 
 
 def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
-    """Return a choice between formulas, numbers or vectors; between bools, a number and a formula.
+    """Return the value of `if ... then ... else ...` between formulas, numbers or vectors.
+
+    Between bools it is both a number and a formula.
 
     Args:
-        expr: as written.
-        values: of the condition and of both branches.
+        expr: the expression.
+        values: values of the condition and of both branches.
         scope: receives findings.
 
     Raises:
@@ -106,7 +112,7 @@ def _is_bool(value: Value) -> bool:
 def _choice_of_formulas(
     expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope
 ) -> typed.Formula:
-    """`(cond and yes) or (not cond and no)`."""
+    """Return the formula `(cond and yes) or (not cond and no)`."""
     yes = as_formula(branches[0], expr.yes, Expectation("`then`"), scope)
     no = as_formula(branches[1], expr.no, Expectation("`else`"), scope)
     first = typed.Logic(expr.yes.span, "and", (cond, yes))
@@ -115,7 +121,7 @@ def _choice_of_formulas(
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
-    """Return a choice between numbers by a state formula; between bools also as a formula."""
+    """Return the number that a state formula selects; between bools it also has a formula."""
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
     yes = loose_number(branches[0], expr.yes, need, scope)
@@ -137,7 +143,10 @@ _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%":
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """Evaluation rule of a node class: its operands in order, and its value as a function of theirs."""
+    """Evaluation rule of a class of syntax nodes.
+
+    `parts` returns the operands of a node in order; `value` computes its value from theirs.
+    """
 
     parts: Callable[[Any], Sequence[ast.Expr]]
     value: Callable[[Any, Sequence[Value], Scope], Value]
@@ -161,7 +170,11 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
 
 @lru_cache(maxsize=256)
 def _measured(value: Fraction, unit_text: str) -> Number | None:
-    """Return a number with a unit; None if beyond double precision. Raises ValueError for an unknown unit."""
+    """Return a number with a unit, or None if it exceeds the range of double precision.
+
+    Raises:
+        ValueError: the unit is unknown.
+    """
     unit = parse_unit(unit_text)
     exact = value * unit.ratio
     if not math.isfinite(nearest(exact)):
@@ -224,7 +237,7 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
 def _refuse_products(
     expr: ast.Binary, sides: Sequence[Number | VectorValue], place: Span, scope: Scope
 ) -> None:
-    """Reject sums of a vector and a number, and products of two vectors."""
+    """Raise Failed (E205) for a sum of a vector and a number, or a product of two vectors."""
     vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
         scope.fail(Diagnostic("E205", f"`{expr.op}` does not mix a vector and a number", place))
@@ -283,7 +296,11 @@ OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
 
 
 def evaluate(expr: ast.Expr, scope: Scope) -> Value:
-    """Return the value of an expression. Raises Failed, with all independent findings in the sink."""
+    """Return the value of an expression.
+
+    Raises:
+        Failed: the expression has errors; all independent ones are in `scope.sink`.
+    """
     meter = scope.meter
     meter.enter()
     before = meter.nodes
@@ -305,12 +322,16 @@ def _value(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
-    """Return the values of independent expressions, each evaluated even if another failed."""
+    """Return the values of independent expressions; each is evaluated even if another one fails."""
     return _all(partial(evaluate, expr, scope) for expr in exprs)
 
 
 def _all(steps: Iterable[Callable[[], T]]) -> list[T]:
-    """Return the result of each step. Raises Failed after all steps if one of them did."""
+    """Return the results of `steps`, all of which are executed.
+
+    Raises:
+        Failed: a step failed.
+    """
     results: list[T] = []
     failed = False
     for step in steps:
@@ -324,12 +345,20 @@ def _all(steps: Iterable[Callable[[], T]]) -> list[T]:
 
 
 def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """Return the expression as a formula. Raises Failed."""
+    """Return the value of an expression as a formula.
+
+    Raises:
+        Failed: it has errors, or is no formula.
+    """
     return as_formula(evaluate(expr, scope), expr, need, scope)
 
 
 def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> list[typed.Formula]:
-    """Return independent expressions as formulas. Raises Failed."""
+    """Return the values of independent expressions as formulas.
+
+    Raises:
+        Failed: one of them has errors, or is no formula.
+    """
     return _all(partial(formula, expr, need, scope) for expr, need in exprs)
 
 
@@ -347,13 +376,13 @@ def _name(expr: ast.Name, scope: Scope) -> Value:
 
 
 def _attr(expr: ast.Attr, scope: Scope) -> Value:
-    """Return the value of a name of an imported file."""
+    """Return the value of `m.name`, a name that an imported file declares."""
     name, home = member_of(expr, scope)
     return _named(name, home, scope)
 
 
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Return the value of a name declared in `home`, used in `scope`."""
+    """Return the value of a name that the file of `home` declares and an expression in `scope` uses."""
     entry = home.entries.get(expr.name)
     if entry is None:
         return home.unknown(expr)
@@ -375,7 +404,10 @@ def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
 
 
 def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
-    """Return the value of a definition without arguments, cached; its cost is charged at every use."""
+    """Return the value of a definition without arguments.
+
+    It is computed once, but its size counts at every use towards the limit on expanded expressions.
+    """
     if entry.name not in scope.cache:
         if entry.name in scope.open:
             scope.fail(cycle(entry, scope))
@@ -400,7 +432,7 @@ def _measured_value(expr: ast.Expr, scope: Scope) -> tuple[Value, Cost]:
 
 
 def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
-    """Expand a macro declared in `home`."""
+    """Return the value of a macro, declared in the file of `home`, for the arguments of a call."""
     if home.cache.get(entry.name, entry) is None:
         raise Failed
     if entry.name in home.open:
@@ -415,7 +447,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> V
 
 @contextmanager
 def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Evaluate a macro; findings inside it also show the call."""
+    """Add the place of the call to the findings of the block, which expands a macro."""
     before = len(scope.sink)
     try:
         yield
@@ -436,7 +468,7 @@ def _charge(cost: Cost, place: Span, scope: Scope) -> None:
 
 
 def _refuse_excess(place: Span, scope: Scope) -> None:
-    """Raise Failed above the size limit, reporting E005 once per declaration."""
+    """Raise Failed if the expanded declaration exceeds the size limit; E005 is reported once."""
     meter = scope.meter
     if not meter.over:
         return
@@ -460,7 +492,7 @@ def _call(expr: ast.Call, scope: Scope) -> Value:
 
 
 def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Return a call of a name declared in `home`, or of a built-in function."""
+    """Return the value of a call of a name that the file of `home` declares, or of a built-in function."""
     entry = home.entries.get(name.name)
     if isinstance(entry, Definition) and entry.formals:
         return _expanded(entry, expr, scope, home)
@@ -486,7 +518,10 @@ def _not(expr: ast.Not, scope: Scope) -> Value:
 
 
 def _logic(expr: ast.Logic, scope: Scope) -> Value:
-    """Return a connective; chains of `and` or `or` become one node, without recursion along the chain."""
+    """Return the formula of a logical connective.
+
+    A chain of `and` or `or` becomes one node, without recursion along the chain.
+    """
     operands: list[ast.Expr] = [expr.right]
     left = expr.left
     while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
@@ -517,7 +552,10 @@ def _timed(
     place: Span,
     scope: Scope,
 ) -> typed.Formula:
-    """Evaluate operands and interval of a temporal operator, each even if the other failed."""
+    """Return the formula of a temporal operator.
+
+    Its operands and its interval are both evaluated, even if one of them fails.
+    """
     if not scope.temporal:
         scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
     window: typed.Interval | None = None
@@ -534,14 +572,17 @@ def _timed(
 
 @cache
 def _expansion(op: str) -> ast.Expr:
-    """Return the formula of `p` and `q` that defines a temporal operator, without windows."""
+    """Return the formula of `p` and `q`, without windows, that defines a temporal operator."""
     plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
     return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))
 
 
 @cache
 def _repeats_operand(op: str) -> bool:
-    """True if the meaning of a temporal operator has an operand twice; `unless` is expanded later."""
+    """True if the definition of a temporal operator contains an operand twice.
+
+    `unless` counts as well, which is expanded at a later stage.
+    """
     names = [node.name for node in descendants(_expansion(op)) if isinstance(node, ast.Name)]
     return op == "unless" or len(names) > len(set(names))
 
@@ -549,7 +590,10 @@ def _repeats_operand(op: str) -> bool:
 def _timed_node(
     pattern: ast.Node, operands: Mapping[str, typed.Formula], window: typed.Interval, span: Span
 ) -> typed.Formula:
-    """Return an expansion with its operands, and with the window for each of its temporal operators."""
+    """Return the definition of a temporal operator with its operands in place of `p` and `q`.
+
+    Each temporal operator in it gets the window.
+    """
     if isinstance(pattern, ast.Name):
         return operands[pattern.name]
     inner = [_timed_node(part, operands, window, span) for part in children(pattern)]
@@ -567,14 +611,14 @@ def _timed_node(
 
 
 def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
-    """Span of a prefix operator, without its operand."""
+    """Return the source location of a prefix operator, without its operand."""
     end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
     text = span.source.text[span.start : end].rstrip(" \t\n(")
     return span.source.span(span.start, span.start + max(1, len(text)))
 
 
 def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
-    """Return the conjunction or disjunction over a finite domain."""
+    """Return the conjunction (`forall`) or disjunction (`exists`) of the body over a finite domain."""
     items: list[typed.Formula] = []
     need = Expectation(f"`{expr.kind}`")
     for value in _domain(expr, scope):
@@ -588,7 +632,7 @@ def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
 
 
 def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
-    """Return the body with the bound names as values at the instant of evaluation."""
+    """Return `freeze a = x in p`: p, in which a has the value of x at the instant of the `freeze`."""
     if not scope.temporal:
         scope.fail(unsupported("`freeze`", expr.span, scope))
     names = [name for name, _ in expr.bindings]
@@ -610,7 +654,10 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 
 
 def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """Return the bound number as a frozen value with a unique name."""
+    """Return a number bound by `freeze` as a frozen value with a unique name, added to `bindings`.
+
+    A constant is returned unchanged.
+    """
     if number.constant is not None:
         return number
     key = f"{name}#{expr.span.start}@{expr.span.source.name}"

@@ -1,4 +1,4 @@
-"""Resolution of expressions in system files and declarations to numbers, state formulas and regions."""
+"""Evaluation of expressions in system files and declarations to numbers, state formulas and regions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from stlc.units import Unit, nearest, same_dims
 
 @contextmanager
 def _raising(scope: Scope) -> Iterator[None]:
-    """Resolve one expression: raise `scope.error` with its errors where resolution fails."""
+    """Evaluate one expression in the block; if it fails, raise `scope.error` with its errors."""
     before = len(scope.sink)
     try:
         with scope.meter.fresh():
@@ -42,15 +42,17 @@ def _raising(scope: Scope) -> Iterator[None]:
 
 
 def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condition") -> ir.Formula:
-    """Return the expression as a state formula in negation normal form.
+    """Return an expression as a state formula, whose truth depends on one instant.
+
+    The result is in negation normal form.
 
     Args:
-        expr: as parsed.
-        scope: names; findings are appended to its sink.
+        expr: syntax tree of the expression.
+        scope: names that it may use; findings are appended to `scope.sink`.
         what: role of the formula, for messages: "a guard".
 
     Raises:
-        StlcError: `scope.error`, with the findings.
+        StlcError: of class `scope.error`, with the findings.
     """
     with _raising(scope):
         formula = _formula(evaluate(expr, scope), expr, what, scope)
@@ -60,10 +62,10 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
 
 
 def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
-    """Return the expression as a region.
+    """Return an expression as a region.
 
     Raises:
-        StlcError: `scope.error`, with the findings.
+        StlcError: of class `scope.error`, with the findings.
     """
     with _raising(scope):
         value = evaluate(expr, scope)
@@ -73,10 +75,10 @@ def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
 
 
 def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement") -> typed.Formula:
-    """Return the expression as a formula, with temporal operators if `scope.temporal`.
+    """Return an expression as a formula, with temporal operators if `scope.temporal`.
 
     Raises:
-        Failed: the findings are in the sink.
+        Failed: the expression has errors, which are in `scope.sink`.
     """
     with scope.meter.fresh():
         return as_formula(evaluate(expr, scope), expr, Expectation(what), scope)
@@ -94,17 +96,19 @@ def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.For
 def resolve_number(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> Number:
-    """Return the expression as one number, in SI units relative to the offset of its unit.
+    """Return an expression as one number, in SI units relative to the offset of its unit.
+
+    So 20 degC is 20.
 
     Args:
-        expr: as parsed.
-        scope: names; findings are appended to its sink.
-        expected: column of the number: its enum members are in scope, `true` is 1, a formula is 1 where it
-            holds, a bare number takes its unit, other units are E203.
+        expr: syntax tree of the expression.
+        scope: names that it may use; findings are appended to `scope.sink`.
+        expected: column that stores the number. The members of its enum are in scope; `true` is 1, and a
+            formula is 1 where it holds; a bare number takes its unit, and any other unit is E203.
         what: role of the number, for messages: "the flow of `x`".
 
     Raises:
-        StlcError: `scope.error`, with the findings.
+        StlcError: of class `scope.error`, with the findings.
     """
     numbers = resolve_numbers(expr, scope, expected=expected, what=what)
     if len(numbers) == 1:
@@ -119,7 +123,10 @@ def resolve_number(
 def resolve_numbers(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> tuple[Number, ...]:
-    """Return the components of a vector expression; a number is a vector of one. See `resolve_number`."""
+    """Return the components of a vector expression; a number is a vector of one component.
+
+    Arguments and errors are those of `resolve_number`.
+    """
     with _raising(scope):
         value = evaluate(expr, scope)
         items: tuple[Value, ...] = value.items if isinstance(value, VectorValue) else (value,)
@@ -127,7 +134,7 @@ def resolve_numbers(
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
-    """Convert a number to the stored form of a column in `unit`: the SI value divided by the unit's scale."""
+    """Return a number in the stored form of a column in `unit`: the SI value divided by the unit's scale."""
     number = rebased(number, unit)
     if unit.ratio == 1:
         return number.num
@@ -138,7 +145,7 @@ def stored(number: Number, unit: Unit) -> ir.Num:
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
-    """Convert a value to the number that a column stores."""
+    """Return a value as the number that a column stores."""
     if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
         cond = condition(value)
         truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
@@ -166,7 +173,7 @@ def _member_of_column(value: EnumMember, expr: ast.Expr, column: Column, scope: 
 
 
 def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:
-    """Check kind and unit against the column; a bare number takes its unit."""
+    """Return a number after checking its type and unit against the column; a bare one takes its unit."""
     values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
     if column.kind in ("bool", "enum"):
         fits = (number.kind == column.kind and number.labels == column.labels) or number.constant in values

@@ -13,20 +13,20 @@ from stlc.units import Unit
 
 
 class InterfaceFunction(Protocol):
-    """Function of the system, such as forward kinematics."""
+    """Function that a system provides, such as forward kinematics."""
 
     def bound(
         self, arguments: tuple[int | None, ...], result: int | None
     ) -> Callable[..., Sequence[Any]] | Body:
-        """Return the function on components.
+        """Return the function in the form that the compiler calls, on the components of its arguments.
 
         Args:
             arguments: size of each vector argument; None for a number.
             result: size of the result; None for a number.
 
         Returns:
-            Function from all components, as broadcastable arrays, to those of the result; or its body in the
-            IR.
+            Function from the components of all arguments, as broadcastable arrays, to those of the result; or
+            its body in the IR.
         """
 
 
@@ -35,13 +35,13 @@ class Interface:
     """States, constants and functions that a system provides to a specification.
 
     Attributes:
-        name: of the system.
+        name: name of the system.
         signature: states in order, with stored units.
-        constants: name -> (value in SI units, unit).
+        constants: (value in SI units, unit) of each constant, by name.
         externs: names of the functions that the system provides.
         functions: loaded functions, by name.
-        path: of the system file, for messages.
-        places: name of a state or constant -> its declaration in the system file.
+        path: path of the system file, for messages.
+        places: source location of each state and constant in the system file, by name.
     """
 
     name: str
@@ -54,5 +54,5 @@ class Interface:
 
     @property
     def where(self) -> str:
-        """Name for messages: the path of the file, else the system's name."""
+        """Path of the system file or, without one, the name of the system; for messages."""
         return self.path or self.name

@@ -29,7 +29,7 @@ TIME_WORDS = MappingProxyType(
 
 
 def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
-    """Return a sum with, or a multiple of, a time on the grid."""
+    """Return a sum or difference with a time, or a multiple of one."""
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
         if not (a.end or b.end):
@@ -52,13 +52,17 @@ def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) ->
 
 
 def out_of_place(span: Span) -> Diagnostic:
-    """Return E311 for `T`, `dt` or a number of steps in ordinary arithmetic."""
+    """Return E311 for `T`, `dt` or a number of steps outside of an interval or delay."""
     message = f"`{span.text}` is only known inside the interval of a temporal operator"
     return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
 
 
 def negative(value: TimeExpr, span: Span, scope: Scope) -> TimeExpr:
-    """Return `-value`. Raises Failed (E205) for `end`."""
+    """Return the time with its sign reversed.
+
+    Raises:
+        Failed: the time is `end` (E205).
+    """
     if value.end:
         scope.fail(Diagnostic("E205", "`end` has no sign", span))
     return value.times(Fraction(-1))
@@ -73,7 +77,11 @@ def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
 
 
 def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
-    """Return a value as a time. Raises Failed (E303 not constant, E203 not a time)."""
+    """Return a value as a time.
+
+    Raises:
+        Failed: it is not constant (E303), or no time (E203, E205).
+    """
     if isinstance(value, TimeExpr):
         return value
     if not isinstance(value, Number) or value.kind in ("bool", "enum"):
@@ -89,7 +97,10 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
 
 
 def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
-    """Return a bare number in the unit of the `time` pragma, or in seconds with a warning without one."""
+    """Return a bare number as a time in the unit of the `time` pragma or, without one, in seconds.
+
+    In seconds it is reported by W101, unless it is 0.
+    """
     if scope.time_unit in ("step", "steps"):
         return TimeExpr(steps=value, span=expr.span)
     if not scope.time_unit and value != 0:
@@ -140,18 +151,19 @@ def interval(
     body: ast.Expr,
     scope: Scope,
 ) -> typed.Interval:
-    """Return the bounds of a temporal operator, checked as far as possible without a grid.
+    """Return the interval of a temporal operator, checked as far as possible without a time step.
 
     Args:
-        node: as written; None for no interval: from now to the end.
+        node: interval in the source; None if there is none, which means from now to the end.
         bounds: values of its two bounds.
         op: name of the operator.
-        place: span of the operator.
-        body: span of the operand, for the help.
+        place: source location of the operator.
+        body: operand, for the help of a message.
         scope: receives findings.
 
     Raises:
-        Failed: E301 reversed, E302 negative, E303 not constant, E203 not a time.
+        Failed: the interval ends before it starts (E301), begins before now (E302), is not constant (E303),
+            or has a bound that is no time (E203).
     """
     if node is None:
         return typed.Interval(typed.Time(), None, span=place)
@@ -167,7 +179,7 @@ def interval(
 
 
 def _sign(value: TimeExpr) -> int:
-    """Return -1 if the time is negative on every grid, 0 if it is zero, else 1."""
+    """Return -1 if a time is negative for every time step, 0 if it is zero, else 1."""
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0
@@ -202,6 +214,6 @@ def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], bo
 
 
 def _shown(value: TimeExpr, expr: ast.Expr) -> str:
-    """Source text of a bound, without its sign."""
+    """Return the source text of an interval bound, without its sign."""
     text = expr.span.text.strip()
     return text.removeprefix("-").strip() if _sign(value) < 0 else text

@@ -1,4 +1,4 @@
-"""Definitions: sorts of bodies, binding of arguments, and their errors."""
+"""Definitions (`def`, `const`, `region`): types of their bodies, binding of arguments, and errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ from stlc.units import Unit, same_dims
 
 
 def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.Expr]:
-    """Return formal -> expression for positional and named arguments. Raises Failed (E105)."""
+    """Return the expression that a call passes for each argument name, by position or by name.
+
+    Raises:
+        Failed: an argument is missing, unknown or repeated (E105).
+    """
     shape = (f"{entry.name}({', '.join(entry.formals)})",)
     count, given = len(entry.formals), len(call.args)
     if given != count:
@@ -36,7 +40,11 @@ def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.
 
 
 def finished(entry: Definition, value: Value, scope: Scope) -> Value:
-    """Convert the value of a definition's body to the declared sort and unit. Raises Failed."""
+    """Return the value of a definition's body, converted to the declared type and unit.
+
+    Raises:
+        Failed: it has another type or unit.
+    """
     body = entry.body
     match entry.sort:
         case "formula":
@@ -67,7 +75,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Convert to the declared unit: a bare number takes it, any other must agree."""
+    """Return a value in the declared unit: a bare number takes it, any other number must agree."""
     if isinstance(value, VectorValue):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)
@@ -84,7 +92,7 @@ def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
 
 
 def cycle(entry: Definition, scope: Scope) -> Diagnostic:
-    """Return E105 for a recursive definition."""
+    """Return E105 for a definition that refers to itself, directly or through others."""
     start = scope.open.index(entry.name)
     chain = " -> ".join((*scope.open[start:], entry.name))
     note = (f"{chain}",) if len(scope.open) - start > 1 else ()
@@ -92,7 +100,7 @@ def cycle(entry: Definition, scope: Scope) -> Diagnostic:
 
 
 def too_big(meter: Meter, span: Span) -> Diagnostic:
-    """Return E005 for an expression beyond the size limits when expanded."""
+    """Return E005 for an expression that is too large or too deeply nested when expanded."""
     if meter.nodes > MAX_NODES:
         message = f"this expands to more than {MAX_NODES:,} operations"
         help_ = ("definitions are written out where they are used, and quantifiers are unrolled",)

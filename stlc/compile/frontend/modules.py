@@ -1,7 +1,8 @@
-"""`import` of other specifications, from files or from the texts stored with a run or a trace.
+"""Imports of other specifications, from files or from the texts stored with a run or a trace.
 
-The key of a file is its path relative to the folder of the root specification, `@std` for the library. Stored
-texts have the same keys, so that a specification keeps its meaning in another place.
+An imported file is identified by its key: its path relative to the folder of the specification read first, or
+`@std` for the library. Stored texts have the same keys, so that a specification keeps its meaning in another
+place.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _MOST = 100
 
 @dataclass(frozen=True, slots=True)
 class Module:
-    """An imported specification.
+    """Imported specification.
 
     Attributes:
-        key: its path from the folder of the specification that is read first, or `@std`.
+        key: path relative to the folder of the specification that is read first, or `@std`.
         alias: name in the importing file.
         written: import declaration.
-        spec: as parsed.
-        imports: modules that it imports itself.
+        spec: syntax tree of the file.
+        imports: modules that the file imports itself.
     """
 
     key: str
@@ -45,16 +46,16 @@ class Module:
 
 
 def load_modules(spec: ast.Spec) -> tuple[Module, ...]:
-    """Return all direct and indirect imports of `spec`.
+    """Return the modules that `spec` imports; each contains those that it imports itself.
 
     Raises:
-        SpecError: E106, a file that cannot be read or imports itself; its syntax errors.
+        SpecError: a file cannot be read or imports itself (E106), or has syntax errors.
     """
     return _Loader(spec).imports(spec, "", ())
 
 
 def library_of(spec: ast.Spec) -> dict[str, str]:
-    """Return the texts of all imported files by key, so that `spec` can be stored without its folder."""
+    """Return the text of each imported file by its key, so that `spec` can be stored without its folder."""
     found: dict[str, str] = {}
     for module in _every(load_modules(spec)):
         found[module.key] = module.spec.source.text
@@ -62,12 +63,12 @@ def library_of(spec: ast.Spec) -> dict[str, str]:
 
 
 def spec_sha256(text: str, library: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a specification and its imports, hexadecimal."""
+    """Return the SHA-256 of a specification and its imports, in hexadecimal digits."""
     return sha256(text + dumps(dict(sorted(library.items())))) if library else sha256(text)
 
 
 def file_of(key: str) -> str:
-    """Return a relative path within one folder for the text of a key."""
+    """Return the relative path at which the text of an imported file is stored; it has no `..`."""
     return "/".join("__" if part == ".." else part for part in key.split("/") if part) + (
         ".stl" if key == STD else ""
     )
@@ -80,7 +81,7 @@ def _every(modules: tuple[Module, ...]) -> Iterator[Module]:
 
 
 class _Loader:
-    """Loader that reads each file once."""
+    """Loader of imported files that reads each file once."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.library = spec.library
@@ -90,7 +91,7 @@ class _Loader:
         self.found: dict[str, tuple[Module, ...] | SpecError] = {}
 
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
-        """Return the modules of one file; `around` are the keys of its importing files."""
+        """Return the modules that one file imports; `around` are the keys of the files that import it."""
         if key not in self.found:
             try:
                 self.found[key] = self._imports(spec, key, around)

@@ -1,4 +1,4 @@
-"""Parameters (`param`), drawn once per trajectory, their distributions, and `--set NAME=VALUE`."""
+"""Parameters (`param`), which are drawn once per trajectory, and `--set NAME=VALUE`."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from stlc.units import Unit, same_dims
 def read_overrides(
     overrides: Mapping[str, str], spec: ast.Spec, interface: Interface | None
 ) -> dict[str, ast.Expr]:
-    """Return constant or parameter of the specification -> expression of its value.
+    """Return the expressions that `--set` gives to constants and parameters of a specification, by name.
 
-    Names of the system alone (constants, states, its own parameters, dotted keys) are skipped.
+    Names that only the system has (constants, states, its own parameters, dotted keys) are skipped.
 
     Raises:
         UsageError: U101, an unknown name, or a value that is not an expression.
@@ -71,17 +71,17 @@ def _unknown(name: str, names: set[str]) -> Diagnostic:
 def parameters(
     decl: ast.Param, columns: Sequence[Column], unit: Unit, interface: Interface | None, scope: Scope
 ) -> tuple[typed.Parameter, ...]:
-    """Return the components of a `param`.
+    """Return the components of a `param`, each with its distribution.
 
     Args:
-        decl: as written.
-        columns: of its components, with their ranges.
-        unit: declared unit, also of bare numbers.
-        interface: of the system, which may have the parameter as a state.
-        scope: names; receives findings.
+        decl: declaration.
+        columns: columns of its components, with their ranges.
+        unit: declared unit, which bare numbers take.
+        interface: interface of the system, which may have the parameter as a state.
+        scope: names that the distribution may use; receives findings.
 
     Raises:
-        Failed: E205 or E203, an invalid distribution; E104, the system's distribution differs.
+        Failed: an invalid distribution (E205, E203), or one that differs from the system's (E104).
     """
     carried = interface is not None and columns[0].name in interface.signature
     if carried and interface is not None:
@@ -100,7 +100,7 @@ def parameters(
 
 
 def _text(decl: ast.Param) -> str:
-    """Source text of a parameter's distribution."""
+    """Return the source text of a parameter's distribution."""
     match decl.domain:
         case (low, high):
             return f"in [{low.span.text}, {high.span.text}]"
@@ -113,7 +113,7 @@ def _text(decl: ast.Param) -> str:
 def _even(
     decl: ast.Param, values: Sequence[float | None], columns: Sequence[Column], scope: Scope
 ) -> tuple[ir.Num, ...]:
-    """Return the uniform distribution over the range or over the members of the set."""
+    """Return the uniform distribution over the declared range or set, for each column."""
     if any(value is None for value in values):
         message = f"`{decl.name}` is drawn for every trajectory: its range must have both ends"
         help_ = ("give it a finite range, or a distribution: `param r ~ normal(1, 0.1)`",)
@@ -126,9 +126,10 @@ def _even(
 
 
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
-    """Return the sampler of each column, in its unit; a single number applies to all components.
+    """Return the distribution of each column, in its unit; a single number applies to all components.
 
-    Raises Failed: E203 for another unit, E205 for a value unknown before the trajectory begins.
+    Raises:
+        Failed: another unit (E203), or a value that is unknown before the trajectory begins (E205).
     """
     here = scope.extended({}, samplers=True)
     first = evaluate(expr, here)
@@ -147,7 +148,7 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
 
 
 def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
-    """Convert a drawn number to the stored form of its column."""
+    """Return a drawn number in the unit that its column stores."""
     if columns_of(number.num):
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))
@@ -164,7 +165,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
 
 
 def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:
-    """Report E104 if the system has the parameter with other values."""
+    """Report E104 if the system has a parameter of the same name with another range or distribution."""
     place = interface.places.get(columns[0].name)
     labels = () if place is None else (Label(place, "declared here"),)
     if not isinstance(decl.domain, tuple | ast.SetLiteral):
@@ -181,11 +182,13 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
 
 
 def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
-    """Return the parameters, with those in `values` fixed for all trajectories, within their range or not.
+    """Return the parameters, those named in `values` with a constant in place of their distribution.
+
+    A constant may be outside the declared range.
 
     Args:
-        parameters: components.
-        values: name -> value as text, `0.8 m`, or `[1 m, 2 m]` for a vector.
+        parameters: components of all parameters.
+        values: value of each parameter to be fixed, as text: `0.8 m`, or `[1 m, 2 m]` for a vector.
 
     Raises:
         UsageError: U101, a value is not valid for its parameter.
@@ -200,7 +203,7 @@ def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> t
 
 
 def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed.Parameter]:
-    """Return the components of one parameter with the value in `text`."""
+    """Return the components of one parameter, fixed to the value in `text`."""
     what = f"`{name}`"
     column = group[0].column
     try:

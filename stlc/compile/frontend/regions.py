@@ -1,7 +1,8 @@
-"""Regions and their signed distance, positive inside.
+"""Regions and the signed distance of a point to them, positive inside.
 
-Distances are exact Euclidean for ball, box, half-space and polygon. A union is the max, an intersection the
-min of its parts: exact in sign, and inside a union or outside an intersection a lower bound of the distance.
+Distances to balls, boxes, half-spaces and polygons are Euclidean and exact. A union takes the greatest, an
+intersection the least distance of its parts; its sign is exact, and inside a union or outside an intersection
+its magnitude is a lower bound.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ T = TypeVar("T")
 
 
 def points(corners: Sequence[VectorValue]) -> tuple[PlanePoint, ...] | None:
-    """Return the corners as floats in SI units, or None unless all are constant points in 2D."""
+    """Return the corners as floats in SI units, or None unless all are constant points of the plane."""
     found: list[PlanePoint] = []
     for corner in corners:
         values = [item.constant for item in corner.items]
@@ -55,12 +56,12 @@ def turn(a: PlanePoint, b: PlanePoint, c: PlanePoint) -> float:
 
 
 def area(corners: Sequence[PlanePoint]) -> float:
-    """Return the signed area: positive for counter-clockwise corners."""
+    """Return the signed area of a polygon: positive for counter-clockwise corners."""
     return sum(a[0] * b[1] - a[1] * b[0] for a, b in edges(corners)) / 2
 
 
 def simple(corners: Sequence[PlanePoint]) -> bool:
-    """True if no two edges cross and no adjacent corners coincide."""
+    """True if a polygon is simple: no two edges cross, and no adjacent corners coincide."""
     return all(a != b for a, b in edges(corners)) and not any(
         turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
         for (a, b), (c, d) in combinations(edges(corners), 2)
@@ -68,17 +69,17 @@ def simple(corners: Sequence[PlanePoint]) -> bool:
 
 
 def convex(corners: Sequence[VectorValue]) -> bool:
-    """True if a simple polygon with known, counter-clockwise corners is convex."""
+    """True if a simple polygon with constant, counter-clockwise corners is convex."""
     plain = points(corners)
     assert plain is not None
     return all(turn(plain[i - 2], plain[i - 1], plain[i]) >= 0 for i in range(len(plain)))
 
 
 def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
-    """Decompose a polygon into triangles by ear clipping; a convex one is returned whole.
+    """Return triangles that together are a polygon, cut off by ear clipping; a convex one is returned whole.
 
     Args:
-        corners: of a simple polygon, known, counter-clockwise.
+        corners: corners of a simple polygon, constant and counter-clockwise.
     """
     plain = points(corners)
     assert plain is not None
@@ -97,7 +98,7 @@ def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
 
 
 def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
-    """True if corner `k` can be cut off: it is convex and its triangle holds no other corner."""
+    """True if corner `k` can be cut off: it is convex, and its triangle contains no other corner."""
     a, b, c = (plain[left[i % len(left)]] for i in (k - 1, k, k + 1))
     if turn(a, b, c) <= 0:
         return False
@@ -159,14 +160,15 @@ def composed(
     span: Span,
     scope: Scope,
 ) -> Number:
-    """Return the signed distance to a union, intersection, dilation or complement.
+    """Return the signed distance to a union, intersection, dilation or complement of other regions.
 
     Args:
-        region: composed of others.
-        inner: distance to a part.
-        opposite: distance to a complemented part, before negation: the greatest where `inner` is the least.
-        margin: value of the margin of a dilation.
-        span: of the expression.
+        region: the composed region.
+        inner: function that returns the signed distance to a part.
+        opposite: function that returns the signed distance to a region of which the complement is taken,
+            still without its sign reversed. It returns the greatest one where `inner` returns the least.
+        margin: function that returns the margin of a dilation.
+        span: source location of the expression.
         scope: receives findings.
     """
     match region:
@@ -179,7 +181,10 @@ def composed(
 
 
 def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
-    """Signed distance to a box: min distance to a face inside; minus the Euclidean distance outside."""
+    """Return the signed distance to a box.
+
+    Inside it is the least distance to a face, outside minus the Euclidean distance.
+    """
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
             (_, low, high), _ = agree((p, low, high), "compare", span, scope)
@@ -197,7 +202,7 @@ def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span,
 
 
 def _polygon(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> Number:
-    """Signed distance to a polygon: distance to the nearest edge, positive inside one of its triangles."""
+    """Return the signed distance to a polygon: the distance to the nearest edge, negative outside."""
     nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges(corners)], span, scope)
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
     inside = parts[0] if len(parts) == 1 else ir.BoolOp("or", tuple(parts), span)
@@ -216,13 +221,16 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
 
 
 def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return `turn(start, end, point)` of points that vary: positive where `point` lies left of the edge."""
+    """Return twice the signed area of a triangle of varying points: positive if `point` is left of it.
+
+    This is `turn(start, end, point)`, and "left" is seen along the edge from `start` to `end`.
+    """
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)
     return found
 
 
 def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
-    """True if the point lies left of every edge of a convex, counter-clockwise polygon."""
+    """Return the condition that a point is left of every edge of a convex, counter-clockwise polygon."""
     sides = (side(point, start, end, span, scope) for start, end in edges(corners))
     return ir.BoolOp("and", tuple(ir.Predicate(each.num, span=span) for each in sides), span)

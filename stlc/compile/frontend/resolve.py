@@ -1,8 +1,8 @@
-"""Resolution of syntax to a typed specification, with names bound, sorts and units checked.
+"""Resolution of syntax to a typed specification, with names, types and units checked.
 
     ast.Spec --declare--> entries --evaluate--> typed.Spec
 
-Formulas keep negations, implications and spans; times stay in seconds, steps and horizons.
+Formulas keep their negations, implications and source locations; times stay in seconds, steps and horizons.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from stlc.units import same_dims
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """File with its declarations.
+    """File of a specification, with its declarations.
 
     Attributes:
-        spec: as parsed.
+        spec: syntax tree of the file.
         found: its declarations.
-        scope: of its names.
-        files: imported files.
+        scope: scope in which its names are resolved.
+        files: files that it imports.
     """
 
     spec: ast.Spec
@@ -61,7 +61,7 @@ def declared(
     overrides: Mapping[str, ast.Expr],
     scope: Scope,
 ) -> File:
-    """Declare the names of a file and of its imports; findings go to the scope."""
+    """Return a file with its declarations and those of its imports; findings go to `scope`."""
     loaded = [(module.alias, _of_module(module, interface, scope)) for module in modules]
     found = declare(spec, interface, overrides, scope)
     scopes = {alias: file.scope for alias, file in loaded}
@@ -75,9 +75,9 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
 
 
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
-    """Return the distinct columns of a file and its imports, and those that are parameters.
+    """Return the distinct columns of a file and its imports, and the components of their parameters.
 
-    Reports E104 where two files differ about a column, or the system about a parameter.
+    E104 is reported if two files disagree about a column, or a file and the system about a parameter.
     """
     columns: dict[str, tuple[Column, Span]] = {}
     drawn: dict[str, typed.Parameter] = {}
@@ -123,7 +123,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
 
 
 def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """Return the file with the enforced ranges of all columns in scope."""
+    """Return a file with `facts` as the enforced ranges of columns, in its scope and in its imports."""
     files = tuple(with_facts(part, facts) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
@@ -140,13 +140,15 @@ def resolve(
     overrides: Mapping[str, str] | None = None,
     sink: list[Diagnostic] | None = None,
 ) -> typed.Spec:
-    """Bind names, check sorts and units, expand macros. The result is independent of the time grid.
+    """Return the typed specification: names resolved, types and units checked, macros expanded.
+
+    The result is independent of the time step and horizon.
 
     Args:
-        spec: as parsed.
-        interface: of the system; signals and constants are matched with it.
-        overrides: constant -> replacing expression (`--set`).
-        sink: receives warnings, those of the result, even if errors are raised.
+        spec: syntax tree of the specification.
+        interface: interface of the system, with which signals and constants are matched.
+        overrides: expression that replaces each constant in it, by name (`--set`).
+        sink: list to which warnings are appended, also when errors are raised.
 
     Raises:
         SpecError: all independent errors of the file in source order, at most `MAX_ERRORS`.
@@ -185,7 +187,7 @@ def resolve(
 
 
 def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:
-    """Append warnings to the sink; raise errors together, in source order."""
+    """Append the warnings to `sink`; raise all errors together, in source order."""
 
     def place(finding: Diagnostic) -> tuple[bool, int]:
         span = finding.span
@@ -205,7 +207,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 def _system_hints(interface: Interface | None) -> dict[str, str]:
-    """Return advice for each name that only the system declares."""
+    """Return the advice for an undeclared name that only the system has, by name."""
     if interface is None:
         return {}
     found = {}
@@ -222,7 +224,7 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
 
 
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
-    """Give overrides without a unit the unit of the replaced value."""
+    """Give each override without a unit the unit of the value that it replaces."""
     for item in spec.items:
         entry = found.entries.get(item.name)
         if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
@@ -237,7 +239,10 @@ def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Decla
 
 
 def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
-    """Return constants in SI units, vectors by component; compare them with the system's (E104)."""
+    """Return (name, value in SI units) of each constant, one entry per component of a vector.
+
+    E104 is reported for a constant that differs from the system's.
+    """
     values: list[tuple[str, float]] = []
     for item in _items(spec, ast.Const):
         try:
@@ -264,7 +269,7 @@ def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
 
 
 def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope) -> None:
-    """Report E104 if a constant differs from the system's."""
+    """Report E104 if a constant differs from the system's constant of the same name."""
     if item.name not in interface.constants or value.constant is None:
         return
     theirs, unit = interface.constants[item.name]
@@ -289,7 +294,7 @@ def _amount(value: float, unit: str) -> str:
 
 
 def _check_definitions(file: File) -> None:
-    """Check all definitions of all files, used or not."""
+    """Evaluate the definitions of all files, even unused ones, to report their errors."""
     for part in file.files:
         _check_definitions(part)
     scope = file.scope
@@ -346,7 +351,11 @@ def _requirements(
 
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
-    """Return the divisor of the robustness. Raises Failed (E205) for an unknown range."""
+    """Return the divisor of the robustness that `@scale` asks for.
+
+    Raises:
+        Failed: `@scale(auto)`, and the range of a signal is unknown (E205).
+    """
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value
     place = tags.scale_span or formula.span
@@ -358,7 +367,7 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """Return W502, W503 and W505 of a requirement."""
+    """Return the warnings W502, W503 and W505 about a requirement."""
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
     weak = safety_never_violated(requirement, tag)

@@ -1,4 +1,4 @@
-"""Scope of name resolution: entries, findings, and limits on expression size."""
+"""Scope of name resolution: known names, findings, and limits on the size of expressions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_LEVELS = 120
 
 @dataclass(slots=True)
 class Cost:
-    """Size and depth of an expression when fully expanded."""
+    """Size (number of nodes) and depth of an expression when fully expanded."""
 
     nodes: int = 0
     levels: int = 0
@@ -33,13 +33,15 @@ class Cost:
 
 @dataclass(slots=True)
 class Meter:
-    """Counter of nodes in the full expansion, although each definition is evaluated once.
+    """Counter of the nodes of a declaration when fully expanded.
+
+    Each definition is evaluated once, but counted at every use.
 
     Attributes:
-        nodes: count so far.
+        nodes: number of nodes counted.
         level: current nesting level.
-        deepest: greatest level so far.
-        reported: whether the current declaration's excess has been reported.
+        deepest: greatest nesting level reached.
+        reported: whether the current declaration has been reported as too large.
     """
 
     nodes: int = 0
@@ -49,11 +51,11 @@ class Meter:
 
     @property
     def over(self) -> bool:
-        """True if a limit is exceeded."""
+        """True if the size or the depth exceeds its limit."""
         return self.nodes > MAX_NODES or self.deepest > MAX_LEVELS
 
     def enter(self) -> None:
-        """Enter a child node."""
+        """Count a child node and enter it."""
         self.nodes += 1
         self.level += 1
         self.deepest = max(self.deepest, self.level)
@@ -63,13 +65,13 @@ class Meter:
         self.level -= 1
 
     def charge(self, cost: Cost) -> None:
-        """Add the cost of a previously evaluated expression."""
+        """Add the cost of an expression that was evaluated before and is used again."""
         self.nodes += cost.nodes
         self.deepest = max(self.deepest, self.level + cost.levels)
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Measure the evaluations in a block without charging them; the `Cost` is set when the block ends."""
+        """Measure the evaluations in a block without counting them; the `Cost` is set when the block ends."""
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
         cost = Cost()
@@ -81,7 +83,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Count the evaluations in a block with a budget of their own, for one declaration."""
+        """Count the evaluations in a block from zero, as those of one declaration."""
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
@@ -97,7 +99,7 @@ _COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
 
 
 class Failed(Exception):  # noqa: N818 - control flow inside this package; the finding is in the sink already
-    """Failure to resolve an expression whose findings have been reported."""
+    """An expression could not be resolved; its errors have been reported to the scope."""
 
 
 Sort: TypeAlias = Literal["any", "constant", "region", "number", "formula"]
@@ -108,9 +110,9 @@ class Known:
     """Name with a value: a signal, a constant, an enum member.
 
     Attributes:
-        value: in SI units.
+        value: its value, in SI units.
         about: description for messages: "env signal, declared at line 14".
-        span: of its declaration.
+        span: source location of its declaration.
     """
 
     value: Value
@@ -120,16 +122,16 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """Name with an expression (macro, constant, region), resolved on first use.
+    """Name that stands for an expression (macro, constant, region), which is evaluated on first use.
 
     Attributes:
-        name: of the definition.
+        name: name of the definition.
         body: the expression.
         formals: names of the arguments.
-        unit: required unit, also of bare numbers; None for any.
-        sort: required sort of the body.
+        unit: unit that the value must have, and that bare numbers take; None for any.
+        sort: type that the value must have.
         about: description, for messages.
-        span: of its declaration.
+        span: source location of its declaration.
     """
 
     name: str
@@ -146,14 +148,15 @@ class External:
     """Function that the system provides.
 
     Attributes:
-        name: of the function.
+        name: name of the function.
         arguments: size of each vector argument; None for a number.
         result: size of the result; None for a number.
-        unit: of the result.
-        kind: of the result.
-        function: from components to components, or its body in the IR; None if not loaded.
+        unit: unit of the result.
+        kind: kind of the result: real, int or bool.
+        function: function from the components of all arguments to those of the result, or its body in the IR;
+            None if it is not loaded.
         about: description, for messages.
-        span: of its declaration.
+        span: source location of its declaration.
     """
 
     name: str
@@ -176,15 +179,15 @@ class Scope:
     Attributes:
         entries: declarations of the file, by name.
         sink: receives findings.
-        error: class that public functions raise: `SpecError`, or `SystemFileError` in a system file.
-        samplers: random draws such as `uniform(…)` are allowed.
-        temporal: temporal operators are allowed.
+        error: class of the errors raised: `SpecError`, or `SystemFileError` in a system file.
+        samplers: whether random draws such as `uniform(…)` are allowed.
+        temporal: whether temporal operators are allowed.
         time_unit: unit of bare numbers in intervals; "" without a `time` pragma.
-        facts: enforced ranges of columns, in stored units.
-        system_hints: name that only the system declares -> advice.
+        facts: ranges that columns never leave, in stored units.
+        system_hints: advice for names that only the system declares, by name.
         modules: scopes of imported files, by alias.
-        product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
-        locals: arguments of the current macro and quantifier variables, with their costs.
+        product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)` (`@product`).
+        locals: value and expanded size of each argument of the current macro and each quantifier variable.
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
@@ -209,7 +212,7 @@ class Scope:
 
     @property
     def sort_error(self) -> str:
-        """Code of an error about the sort of a value: E205 in a specification, S203 in a system file."""
+        """Code of an error about the type of a value: E205 in a specification, S203 in a system file."""
         return "E205" if self.in_spec else "S203"
 
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
@@ -222,13 +225,13 @@ class Scope:
         )
 
     def as_products(self) -> Scope:
-        """Return the scope under `@product`, with an empty cache of definitions."""
+        """Return the scope for requirements with `@product`, with an empty cache of definitions."""
         broken = dict.fromkeys(name for name, value in self.cache.items() if value is None)
         modules = {alias: module.as_products() for alias, module in self.modules.items()}
         return replace(self, product=True, cache=broken, modules=modules)
 
     def report(self, finding: Diagnostic) -> None:
-        """Add a finding unless present (a macro used twice is reported once)."""
+        """Add a finding unless it was reported before, as for a macro that is used twice."""
         tell(self.sink, finding)
 
     def fail(self, finding: Diagnostic) -> NoReturn:
@@ -237,7 +240,7 @@ class Scope:
         raise Failed
 
     def unknown(self, name: ast.Name, *, called: bool = False) -> NoReturn:
-        """Report an undeclared name (E101)."""
+        """Report an undeclared name (E101) and raise Failed; `called` if it is used as a function."""
         candidates = [*self.locals, *self.entries]
         if called:
             candidates += [*callable_names(), *(sampler_names() if self.samplers else ())]
@@ -256,7 +259,7 @@ class Scope:
 
 
 def column_value(column: Column, origin: Origin | None = None) -> Number:
-    """Return the value of a column, in SI units relative to the offset of its unit."""
+    """Return the value of a column, in SI units relative to the offset of its unit (20 degC is 20)."""
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
         num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
@@ -267,7 +270,7 @@ def column_value(column: Column, origin: Origin | None = None) -> Number:
 def column_entries(
     columns: Iterable[Column], *, about: str = "", span: Span | None = None
 ) -> dict[str, Known]:
-    """Return entries for columns; `q[0]`, `q[1]`, … form the vector `q`."""
+    """Return the name-table entries of columns; `q[0]`, `q[1]`, … form the vector `q`."""
     entries: dict[str, Known] = {}
     for column in columns:
         value = column_value(column)
@@ -282,7 +285,10 @@ def column_entries(
 
 
 def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, Known]:
-    """Return entries for enum members; a member of several enums is resolved by the other operand."""
+    """Return the name-table entries of enum members.
+
+    A name may be a member of several enums; the other operand of a comparison then decides.
+    """
     options: dict[str, list[tuple[tuple[str, float], ...]]] = {}
     for labels in dict.fromkeys(enums):
         for name, _ in labels:
@@ -291,7 +297,7 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
-    """Return a constant given in SI units; without a written unit it counts as bare."""
+    """Return a constant given in SI units; one without a unit takes any unit that is needed."""
     bare = not unit.text
     exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
@@ -301,12 +307,15 @@ def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
 def constant_entries(
     constants: Mapping[str, tuple[float, Unit]], *, about: str = "constant"
 ) -> dict[str, Known]:
-    """Return entries for constants given as (value in SI units, unit)."""
+    """Return the name-table entries of constants, given as (value in SI units, unit) by name."""
     return {name: Known(constant_value(value, unit), about) for name, (value, unit) in constants.items()}
 
 
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Return the enforced ranges: of clamped columns, booleans, enums, and columns marked as enforced."""
+    """Return the ranges that columns never leave, in stored units.
+
+    These are the ranges of bools and enums, and those that the column declares as a fact.
+    """
     facts: dict[str, Bounds] = {}
     for column in columns:
         if column.kind == "bool":

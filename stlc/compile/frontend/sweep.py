@@ -1,11 +1,12 @@
 """`sweep(p)`: signed distances of the straight segment from a point to its position at the next sample.
 
-`sweep(p) in R` is the least signed distance along the segment, `sweep(p) not in R` the least signed distance
-to the complement. Both are exact for balls, boxes, half-spaces and convex polygons; `in` of an intersection
-and `not in` of a union are exact where their parts are, the other two are lower bounds. For a polygon that is
-not convex the sign is exact, and so is the value where it is not negative.
+`sweep(p) in R` is the least signed distance along the segment to the region R; `sweep(p) not in R` is the
+least signed distance to its complement. Both are exact for balls, boxes, half-spaces and convex polygons.
+Where the parts are exact, so are `in` of an intersection and `not in` of a union; `in` of a union and `not
+in` of an intersection are lower bounds. For a polygon that is not convex the sign is exact, and so is the
+value where it is not negative.
 
-A moving region is assumed to move in a straight line too.
+A region that moves is assumed to move in a straight line too.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ T = TypeVar("T")
 
 
 def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
-    """Return the least signed distance along the segment that starts at `point` now.
+    """Return the least signed distance to a region along the segment from `point` to its next sample.
 
     Raises:
-        Failed: the point has another number of components, or another unit (E205, E203).
+        Failed: the point has another number of components (E205) or another unit (E203) than the region.
     """
     check_dimension(point, region, span, scope)
     return _Sweep(point, span, scope).extreme(region, "min")
