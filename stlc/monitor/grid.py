@@ -1,4 +1,4 @@
-"""Values of `T` and `dt` for a monitor: from its arguments, the trace, or the system that the spec names."""
+"""Horizon `T` and time step `dt` of a monitor: from arguments, from the trace, or from a system file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A time step and a horizon, both in seconds and exact; None where unknown.
+    """Time step and horizon, exact, in seconds; None if unknown.
 
-    `trace` names the file that the step was measured in, "" where it was given.
+    `trace` is the name of the file whose time step is taken; "" if the time step was given as an argument.
     """
 
     dt: Fraction | None = None
@@ -34,7 +34,7 @@ class Times:
     trace: str = ""
 
     def or_else(self, other: Times) -> Times:
-        """Return these times, with unknown ones taken from `other`."""
+        """Return these times; where one is unknown, take it from `other`."""
         step = self if self.dt is not None else other
         return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
@@ -44,11 +44,11 @@ class Times:
         return self.dt is not None and self.horizon is not None
 
     def grid(self) -> Grid:
-        """The time grid, in steps.
+        """Return the time grid, with the horizon in steps.
 
         Raises:
-            TraceError: E602, the horizon is not a whole number of steps of a trace.
-            UsageError: U101, it is not a whole number of the requested steps.
+            TraceError: E602, the horizon is not a whole number of time steps of the trace.
+            UsageError: U101, the horizon is not a whole number of the given time steps.
         """
         if self.dt is None or self.horizon is None:
             return Grid(self.dt, None)
@@ -65,7 +65,7 @@ class Times:
 
 
 def _dividing(horizon: float, dt: float) -> str:
-    """Advice: a step of four digits, at most the given one, that divides the horizon."""
+    """Help text that proposes a time step (four digits, at most `dt`) that divides the horizon."""
     least = math.ceil(horizon / dt)
     short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
     step = horizon / next(short, least)
@@ -73,7 +73,7 @@ def _dividing(horizon: float, dt: float) -> str:
 
 
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
-    """Return the arguments of a monitor as times. Raises UsageError (U101) where they are not positive."""
+    """Return the arguments `dt` and `horizon` as exact times. Raises UsageError (U101) if not positive."""
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
@@ -88,7 +88,7 @@ def _declared(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
-    """Return times and interface of a system file, its functions loaded.
+    """Return the time step and horizon, and the signals and functions, that a system file declares.
 
     Raises:
         UsageError: U102, there is no such file.
@@ -101,7 +101,7 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
-    """Return the times of the system that the specification names; None without one, or without its file."""
+    """Return the times of the system that the specification names; None without a name or a file."""
     if spec.system is None:
         return None
     try:
@@ -112,7 +112,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 
 
 def recorded_times(trace: Trace, given: Times) -> Times:
-    """Return the times of a trace. Raises TraceError (E602) where they contradict the monitor's time step."""
+    """Return the times of a trace. Raises TraceError (E602) if its time step differs from the given one."""
     dt = as_fraction(trace.dt)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"

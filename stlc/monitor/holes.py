@@ -1,8 +1,9 @@
-"""Unknown samples: least and greatest value of a formula over all values that they may have.
+"""Unknown samples: bounds of a formula's robustness over all values that the unknown samples may have.
 
-In arrays an unknown value is NaN. Bounds are those of open traces (`stlc.monitor.prefix_bounds`): a predicate
-that reads an unknown value is unknown, -inf at least and +inf at most, and all operators are monotone in
-their predicates. So a verdict that follows from the bounds holds for every value that the samples may have.
+In arrays an unknown value is NaN. The bounds are computed as for a trace that is still growing
+(`stlc.monitor.prefix_bounds`): a predicate that reads an unknown value is -inf in the lower bound and +inf in
+the upper one. All operators are monotone in their predicates, so a verdict that follows from the bounds holds
+for every value that the samples may have.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ KNOWN = "@known "
 
 
 def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
-    """Return the names of the columns that hold NaN."""
+    """Return the names of the signals that contain NaN."""
     return frozenset(name for name, values in env.items() if np.isnan(values).any())
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """Return the columns (samples, batch), unknown values replaced, and columns that mark known values."""
+    """Return the signals (samples, batch) without NaN, and for each one in `holes` a column of known samples.
+
+    In the added column 1 marks a known sample and -1 an unknown one.
+    """
     filled = dict(env)
     for name in holes:
         unknown = np.isnan(env[name])
@@ -42,12 +46,12 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """Return the formula whose value is the least, or the greatest, possible value of `formula`.
+    """Return the formula whose value is the least, or the greatest, value that `formula` may have.
 
     Args:
         formula: in negation normal form.
-        holes: signals with unknown values; names that a `freeze` binds to them are added here.
-        least: the least value; else the greatest.
+        holes: signals with unknown values; names that a `freeze` binds to them count as unknown, too.
+        least: True for the least value, False for the greatest.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -63,7 +67,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
 
 
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
-    """A number that is 1 where all signals in `num` are known, else -1; None if they are known everywhere."""
+    """An expression that is 1 where all signals in `num` are known, else -1; None if always known."""
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)

@@ -1,7 +1,8 @@
 """Instants at which a requirement is evaluated, and its values there.
 
-A requirement that mentions `T` concerns every planning window: it is evaluated at each start whose window
-fits, with `end` at the end of the window. Others, and those with an interval on the mission clock, are
+A requirement that mentions the horizon `T` holds for every planning window: it is evaluated at each sample
+that has a full window of length `T` after it, and `end` is the end of that window. Other requirements, and
+those with absolute operators (`always@[a, b]`, whose interval counts from the start of the mission), are
 evaluated once, at the start of the trace.
 """
 
@@ -50,14 +51,17 @@ def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: 
 
 
 def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
-    """Samples from an instant to its `end`; None where `end` does not move with the instant."""
+    """Samples from an instant to its `end`; None if `end` is not at a fixed distance from the instant."""
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
 def rule_bounds(
     rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
-    """Least and greatest values at the evaluated instants, each `(count, batch)`; one array if all known."""
+    """Least and greatest robustness at the instants `starts`, each `(count, batch)`.
+
+    Both are one and the same array if nothing is unknown.
+    """
     window = window_of(rule, horizon)
     if window is None:
         return bounds(rule.under(record.semantics), record, starts, ends)
@@ -67,7 +71,7 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """True if values at the evaluated instants are independent of samples from `samples` on, (count,)."""
+    """True per start if the value there depends on the first `samples` samples only, (count,)."""
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
@@ -76,10 +80,11 @@ def rule_known(
 
 
 def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: Boundary) -> Array:
-    """Return values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
+    """Return the robustness at every sample, `(samples, batch)`.
 
-    They are also NaN where they depend on unknown values, unless `end` is "lower" or "upper".
-    A requirement on the mission clock has one value at all samples.
+    Values are NaN where the window extends beyond the trace and `end` is "strict", and where they depend on
+    unknown samples unless `end` is "lower" or "upper". A requirement with absolute operators (`always@[a,
+    b]`) has one value at all samples.
     """
     if record.holes:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
@@ -94,7 +99,10 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
 
 
 def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
-    """`rule_signal` with a moving `end`: windows that do not fit are NaN under "strict"."""
+    """`rule_signal` for a requirement whose `end` is `window` samples after each instant.
+
+    With `end` "strict", values are NaN where that window extends beyond the trace.
+    """
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
     ends: Ends = "truncate" if end == "truncate" else "open"
@@ -111,7 +119,7 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
 def rules_at(
     rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
 ) -> list[Array]:
-    """Values at one sample, `(1, batch)` each; NaN as in `rule_signal`."""
+    """Robustness of several requirements at sample `at`, `(1, batch)` each; NaN as in `rule_signal`."""
     if record.holes:
         sides = [_sides(rule, record) for rule in rules]
         least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
@@ -133,7 +141,7 @@ def rules_at(
 
 
 def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
-    """The requirement at its least and at its greatest value over all values of unknown samples."""
+    """The requirement with its formula replaced by its lower and its upper bound over unknown samples."""
     formula = rule.under(record.semantics)
     least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)
@@ -163,7 +171,7 @@ def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | No
 
 
 def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: Grid) -> Diagnostic | None:
-    """E306 where a value at `starts` needs more samples than there are."""
+    """Return finding E306 if the robustness at `starts` needs more samples than the trace has, else None."""
     window = window_of(rule, grid.horizon) or 0
     fits = starts.stop - 1 + window < samples
     if fits and defined(rule.formula, samples)[starts.start : starts.stop].all():

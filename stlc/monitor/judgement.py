@@ -24,13 +24,13 @@ Bools: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Signals laid out for the evaluation of requirements.
+    """Signals and compiled requirements, ready for evaluation.
 
     Attributes:
         compiled: the specification, compiled for the time step of the signals.
         rules: the requirements to evaluate.
-        signals: source of the columns.
-        record: the columns, and their array library.
+        signals: the signals with their shape and times.
+        record: signals as arrays (time, batch), with the array library that evaluates them.
     """
 
     compiled: Compiled
@@ -50,15 +50,15 @@ class Prepared:
 
     @property
     def gaps(self) -> dict[str, Gap]:
-        """Gaps in the needed signals."""
+        """Unknown samples of each signal that the requirements read, by name."""
         return self.signals.gaps
 
     def under(self, semantics: Semantics) -> Prepared:
-        """Return the same signals, to be evaluated in another semantics."""
+        """Return a copy that is evaluated in another semantics (definition of minimum and maximum)."""
         return replace(self, record=replace(self.record, semantics=semantics))
 
     def time(self, sample: int) -> float:
-        """Time of a sample in seconds; its number where the time step is unknown."""
+        """Time of a sample in seconds; the sample number if the time step is unknown."""
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
 
     def moment(self, sample: int) -> str:
@@ -72,14 +72,15 @@ class Judgement:
 
     Attributes:
         rule: the requirement.
-        start: the first evaluated sample; the others follow one by one.
+        start: the first sample at which the requirement is evaluated; the others follow one by one.
         low: least robustness over all continuations of the traces, (instants, traces).
-        high: greatest robustness; the array `low` itself where nothing is unknown.
-        holds: certainly satisfied, (instants, traces).
-        fails: certainly violated, (instants, traces).
-        shape: of the signals before their time axis; () for a single trace.
-        scope: traces that satisfy the assumptions, (traces,); None means all. Others are not counted.
-        reported: `low` and `high` in the requested semantics; None where that is the exact one.
+        high: greatest robustness; the same array as `low` if nothing is unknown.
+        holds: whether the requirement is certainly satisfied, (instants, traces).
+        fails: whether the requirement is certainly violated, (instants, traces).
+        shape: axes of the signals before their time axis; () for a single trace.
+        scope: True for traces that satisfy the assumptions, (traces,); None: all do. Other traces are not
+            counted.
+        reported: `low` and `high` in the requested semantics; None if that is the exact one.
     """
 
     rule: CompiledRequirement
@@ -104,7 +105,7 @@ class Judgement:
 
     @property
     def unit(self) -> str:
-        """Unit of the robustness: that of the compared quantities; "" where there are several."""
+        """Unit of the robustness, that of the compared quantities; "" if the predicates' units differ."""
         return self.rule.unit
 
     @property
@@ -122,7 +123,7 @@ class Judgement:
 
     @property
     def status(self) -> Any:
-        """`satisfied`, `violated` or `inconclusive`; an array of them for a batch."""
+        """`satisfied`, `violated` or `inconclusive`; for a batch of traces an array of these."""
         return _shaped(np.array(self.statuses), self.shape)
 
     @property
@@ -133,20 +134,21 @@ class Judgement:
 
     @property
     def satisfied(self) -> bool | None:
-        """True if all traces satisfy it: True, False, or None where that is unknown."""
+        """True if all traces satisfy the requirement, False if one violates it, None if that is unknown."""
         return _known(self.overall)
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """Bounds of the robustness over all continuations, the least over the evaluated instants."""
+        """Bounds on the least robustness of the evaluated instants, over all continuations of the trace."""
         low, high = self.margins
         return _shaped(low.min(axis=0), self.shape), _shaped(high.min(axis=0), self.shape)
 
     @property
     def robustness(self) -> Any:
-        """The least robustness over the evaluated instants; a float, or an array for a batch.
+        """The least robustness over the evaluated instants: a float, or an array for a batch of traces.
 
-        Where a trace is too short: the known bound if the verdict follows from it, else NaN.
+        If a trace is too short, the value is the bound from which the verdict follows, or NaN without a
+        verdict.
         """
         return _shaped(self.least, self.shape)
 
@@ -160,7 +162,7 @@ class Judgement:
 
     @property
     def share(self) -> float:
-        """Share of the evaluated instants of all traces at which it certainly holds."""
+        """Share of the evaluated instants of all traces at which the requirement certainly holds."""
         holds = self.counted(self.holds)
         return float(holds.mean()) if holds.size else 0.0
 
@@ -171,7 +173,7 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """(trace, sample) of the least robustness; where violated, that of a violation."""
+        """Indices (trace, sample) of the least robustness; if violated, of the worst violation."""
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
@@ -184,8 +186,8 @@ class Verdict:
     """Verdicts of all requirements of a specification on one or many traces.
 
     Attributes:
-        requirements: one judgement each, in the order of the specification.
-        subject: the prepared signals and requirements.
+        requirements: one judgement per requirement, in the order of the specification.
+        subject: the evaluated signals and the compiled requirements.
     """
 
     requirements: tuple[Judgement, ...]
@@ -197,7 +199,7 @@ class Verdict:
         return self.subject.signals.shape
 
     def __getitem__(self, name: str) -> Judgement:
-        """The judgement of one requirement. Raises UsageError (U101) for an unknown name."""
+        """Return the judgement of the requirement `name`. Raises UsageError (U101) for an unknown name."""
         for judgement in self.requirements:
             if judgement.name == name:
                 return judgement
@@ -213,7 +215,7 @@ class Verdict:
 
     @property
     def statuses(self) -> list[Status]:
-        """Status of each trace: violated if a requirement is, satisfied if all are."""
+        """Status of each trace: violated if any requirement is violated, satisfied if all are satisfied."""
         rows = [judgement.statuses for judgement in self.requirements]
         return [
             "out of scope"
@@ -224,11 +226,11 @@ class Verdict:
 
     @property
     def status(self) -> Any:
-        """`satisfied`, `violated` or `inconclusive`; an array of them for a batch."""
+        """`satisfied`, `violated` or `inconclusive`; for a batch of traces an array of these."""
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return the verdict on the traces in `scope` (traces,) alone: those that satisfy the assumptions."""
+        """Return the verdict on the traces that satisfy the assumptions alone, True in `scope` (traces,)."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
@@ -247,12 +249,12 @@ class Verdict:
 
     @property
     def satisfied(self) -> bool | None:
-        """True if all traces satisfy all requirements: True, False, or None where that is unknown."""
+        """True if all traces satisfy all requirements, False if one violates one, None if that is unknown."""
         return _known(self.overall)
 
     @property
     def robustness(self) -> Any:
-        """The least `weight * robustness / scale` over the requirements; a float, or an array for a batch."""
+        """The least `weight * robustness / scale` of all requirements: a float, or an array for a batch."""
         rows = [j.least[None] * (j.rule.weight / j.rule.scale) for j in self.requirements]
         return _shaped(self.subject.record.semantics.join(rows, "min", NUMPY)[0], self.shape)
 
@@ -260,20 +262,20 @@ class Verdict:
     def share(self) -> float:
         """Share of the instants of all traces at which all requirements certainly hold.
 
-        Requirements that are evaluated once hold, or not, at every instant.
+        The verdict of a requirement that is evaluated only once counts at every instant.
         """
         most = self._most_instants
         return self._mean(np.logical_and.reduce([self._spread(j, j.holds, most) for j in self.requirements]))
 
     @property
     def failed_share(self) -> float:
-        """Share of the instants of all traces at which a requirement is certainly violated."""
+        """Share of the instants of all traces at which at least one requirement is certainly violated."""
         most = self._most_instants
         return self._mean(np.logical_or.reduce([self._spread(j, j.fails, most) for j in self.requirements]))
 
     @property
     def _most_instants(self) -> int:
-        """The greatest number of instants of a requirement."""
+        """Number of evaluated instants of the requirement that has the most."""
         return max(judgement.instants for judgement in self.requirements)
 
     def _mean(self, truth: Bools) -> float:
@@ -281,7 +283,7 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Truth at `most` instants, a single instant repeated: (instants, traces)."""
+        """Truth values at `most` instants, those of a single instant repeated: (instants, traces)."""
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)
@@ -294,12 +296,12 @@ class Verdict:
 
 
 def beside(moment: str, start: str) -> str:
-    """Return an instant and, where it differs, the start of its window: `t = 4.6 s (window from 2 s)`."""
+    """Return an instant and, if different, the start of its window as text: `t = 4.6 s (window from 2 s)`."""
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
 
 
 def unknown_requirement(name: str, names: list[str]) -> UsageError:
-    """U101: no requirement is called `name`."""
+    """Return the error U101: no requirement is called `name`."""
     near = closest(name, names)
     help_ = (f"did you mean `{near}`?",) if near else ()
     note = (f"requirements: {', '.join(names)}",)

@@ -1,9 +1,10 @@
-"""Cause of a violation at an instant: the least tree of sub-formulas, instants and signals that explains it.
+"""Cause of a violation at an instant: the smallest tree of sub-formulas, instants and signals behind it.
 
-A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant,
-`eventually` at every one, of which the closest is shown. The main path follows the parts that attain each
-minimum and maximum, down to one predicate at one instant: its value is the robustness. Where several values
-equal the robustness, one is chosen whose change alone changes the robustness, if there is one.
+A violated conjunction is explained by one operand, a violated disjunction by all operands; a violated
+`always` by one instant, a violated `eventually` by all instants, of which the one closest to satisfaction is
+shown. The main path of the tree follows the operands that attain each minimum and maximum, down to one
+predicate at one instant, whose value is the robustness. If several predicate values equal the robustness, the
+path leads to one whose change alone changes the robustness, if there is one.
 """
 
 from __future__ import annotations
@@ -50,19 +51,21 @@ _MOST_LATER = 64
 
 @dataclass(frozen=True, slots=True)
 class CauseNode:
-    """A sub-formula whose truth value is not the wanted one.
+    """Node of a cause tree: a sub-formula whose truth value is the opposite of the one that was wanted.
 
     Attributes:
-        formula: as typed.
-        holds: its truth value (the other one is wanted).
-        sample: the instant.
-        rho: its robustness there, by whose sign it `holds`.
-        until: for an operator that fails at every instant of a window: the last one.
-        reads: the signals that a predicate reads, and how many samples later; else empty.
-        parts: causes among its operands; empty for a predicate.
-        main: index of the part that decides.
-        premise: it is the left side of an implication.
-        moves: its value changes with the value that decides; False where a frozen value changes, too.
+        formula: the sub-formula, type-checked.
+        holds: truth value of the sub-formula; the opposite value was wanted.
+        sample: the instant, as a sample number.
+        rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
+        until: last instant of the window, if a temporal operator fails at every instant of its window.
+        reads: for a predicate, the signals that it reads, each with the offset in samples at which it reads
+            it.
+        parts: causes among the operands; empty for a predicate.
+        main: index in `parts` of the operand that decides.
+        premise: whether the sub-formula is the left side of an implication.
+        moves: whether the value of the sub-formula changes when the deciding value changes; False if a value
+            that `freeze` bound changes with it.
     """
 
     formula: typed.Formula
@@ -83,27 +86,27 @@ class CauseNode:
 
     @property
     def instants(self) -> set[tuple[str, int]]:
-        """The signals that a predicate reads, with the samples at which it reads them."""
+        """Pairs (signal, sample) that a predicate reads."""
         return {(name, self.sample + later) for name, later in self.reads}
 
     @property
     def span(self) -> Span:
-        """Its place in the source text."""
+        """Source location of the sub-formula."""
         return self.formula.span
 
     @property
     def leaf(self) -> CauseNode:
-        """The predicate that decides."""
+        """Node of the predicate at the end of the main path, whose value decides."""
         return self.parts[self.main].leaf if self.parts else self
 
     @property
     def path_moves(self) -> bool:
-        """True if `moves` holds for all nodes on the path to the predicate that decides."""
+        """True if `moves` holds for all nodes on the path to the deciding predicate."""
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
     def leaves(self) -> tuple[CauseNode, ...]:
-        """All predicates of the tree."""
+        """All predicate nodes of the tree."""
         return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
 
 
@@ -113,14 +116,17 @@ Spot: TypeAlias = tuple[ir.Formula, int]
 
 @dataclass(frozen=True, slots=True)
 class _Tied:
-    """A formula over the values of its predicates, of which one may be raised to the next larger float.
+    """Predicate values of a trace, one of which may be raised to the next larger float.
+
+    Used to test whether one predicate value alone determines the robustness of a formula.
 
     Attributes:
         record: the trace.
-        names: predicate -> its column.
-        env: column -> values (samples, 1); columns of predicates that come later are added.
-        raised: the value that is raised.
-        stop: final number of samples, where it exceeds the known ones.
+        names: predicate -> name of the column (time series) with its values.
+        env: name of a column -> values (samples, 1); `coded` adds columns for predicates that are not yet in
+            it.
+        raised: the value to raise, as (predicate, sample); None raises no value.
+        stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
     """
 
     record: Record
@@ -131,7 +137,7 @@ class _Tied:
 
     @property
     def columns(self) -> dict[str, Floats]:
-        """The columns, with that value raised."""
+        """Predicate values by column name, the value `raised` replaced by the next larger float."""
         return self.env if self.raised is None else self._with(self.raised)
 
     def _with(self, spot: Spot) -> dict[str, Floats]:
@@ -140,7 +146,7 @@ class _Tied:
         return {**self.env, name: column}
 
     def coded(self, formula: ir.Formula) -> ir.Formula:
-        """The formula with its predicates replaced by the columns of their values."""
+        """Replace the predicates of a formula by columns that hold their values."""
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
@@ -149,7 +155,7 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """The robustness of a formula at a sample with one value raised, or none."""
+        """Robustness of a formula at a sample, with the first of the values in `raised`, if any, raised."""
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
@@ -157,7 +163,7 @@ class _Tied:
 
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
-    """The predicates of a formula; a `freeze` counts as one."""
+    """Predicates of a formula; a `freeze` counts as one predicate."""
     if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return {formula: None}
     return {leaf: None for part in operands(formula) for leaf in _leaves_of(part)}
@@ -171,15 +177,15 @@ def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Fo
 
 @dataclass(frozen=True, slots=True)
 class CauseFinder:
-    """Finder of causes on one trace.
+    """Finder of the causes of violations on one trace.
 
     Attributes:
-        record: columns of the one trace, (samples, 1), up to `end`.
-        grid: of time.
-        cache: (formula, wanted) -> the lowered formula, negated where it is not wanted.
-        known: lowered formula -> instants and its upper bounds there.
+        record: signals of the trace, (samples, 1), up to the end of the evaluated window.
+        grid: time grid.
+        cache: (formula, wanted) -> the lowered formula, negated if `wanted` is False.
+        known: lowered formula -> evaluated instants with upper bounds of its robustness there.
         tied: predicate values that replace those of the trace, one of them slightly raised.
-        stop: final number of samples, where it exceeds the known ones.
+        stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
     """
 
     record: Record
@@ -192,9 +198,9 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Return the cause of `formula` not being `wanted`, and whether one predicate value decides alone.
+        """Return why `formula` does not have truth value `wanted`, and if one predicate value alone decides.
 
-        Where several predicate values equal the robustness, the main path leads to one whose change alone
+        If several predicate values equal the robustness, the main path leads to one whose change alone
         changes the robustness, if there is one among the first `MOST_TIED`.
         """
         tree = self.blame(formula, sample, wanted=wanted)
@@ -218,7 +224,7 @@ class CauseFinder:
         return tree, False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
-        """The predicates of a formula, with the instants, whose value equals that of the formula."""
+        """Pairs (predicate, instant) whose value equals the robustness `worth`, in order of time."""
         wanted = _leaves_of(lowered)
         found = {
             (node, its.start + int(k)): None
@@ -230,7 +236,10 @@ class CauseFinder:
         return sorted(found, key=lambda spot: spot[1])
 
     def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
-        """Predicate values as columns; None where some lie beyond the last sample, or they are too many."""
+        """Values of all predicates on the trace.
+
+        None if one of the instants in `equal` lies beyond the last sample, or if there are too many values.
+        """
         leaves = list(_leaves_of(lowered))
         samples = self.record.samples
         if any(instant >= samples for _, instant in equal) or samples * len(leaves) > _MOST_NUMBERS:
@@ -241,7 +250,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """Return the cause of `formula` not being `wanted` at `sample`."""
+        """Return the cause tree of `formula` not having the truth value `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -274,7 +283,7 @@ class CauseFinder:
     # ------------------------------------------------------------------- values
 
     def _frozen(self, formula: typed.Freeze, sample: int) -> set[tuple[str, int]]:
-        """The signals that a formula freezes, and the samples at which it reads them."""
+        """Pairs (signal, sample) that a `freeze` formula reads to bind its names."""
         return {
             (leaf.name, sample + self._later(leaf, sample))
             for _, num in formula.bindings
@@ -283,7 +292,10 @@ class CauseFinder:
         }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
-        """The values that the formula binds at a sample; missing ones become a sample beyond the trace."""
+        """Values that a `freeze` formula binds at a sample.
+
+        An unknown value is bound to a sample beyond the trace.
+        """
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
         for name, num in formula.bindings:
@@ -296,7 +308,7 @@ class CauseFinder:
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
-        """The lowered formula, or its negation where it is not wanted: the one that fails.
+        """The lowered formula, negated if `wanted` is False: the formula whose violation is explained.
 
         Signals on which a requirement does not depend may be missing.
         """
@@ -308,7 +320,7 @@ class CauseFinder:
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
-        """Upper bound of the margin by which the formula is as wanted, at instants in order, (instants,)."""
+        """Upper bound, per instant, on the margin by which `formula` has value `wanted`: (instants,)."""
         lowered = self._lowered(formula, wanted)
         if self.tied is not None:
             lowered = self.tied.coded(lowered)
@@ -325,11 +337,11 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """True if the formula is undecided since the trace ends too early: its margin has no upper bound."""
+        """True if the trace ends too early to decide the formula, so that its margin has no upper bound."""
         return self._margin(formula, sample, wanted) == math.inf
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
-        """Values that an evaluation of an enclosing formula has already stored."""
+        """Values at `instants` that an earlier evaluation stored; None if there are none."""
         for known, values in self.known.get(lowered, ()):
             if known.start <= instants.start and instants.stop <= known.stop:
                 rows = values[instants.start - known.start : instants.stop - known.start]
@@ -350,18 +362,18 @@ class CauseFinder:
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
     def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
-        """Samples from an instant to the one at which a predicate reads a signal."""
+        """Offset in samples at which a predicate evaluated at `sample` reads a signal."""
         if isinstance(leaf, ir.Signal):
             return 0
         there = sample + leaf.steps
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
-        """The part with the least margin."""
+        """The (formula, sample, wanted) triple with the least margin."""
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
 
     def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
-        """Upper bound of the margin by which the formula is as wanted, at one instant."""
+        """Upper bound, at one instant, on the margin by which the formula has the truth value `wanted`."""
         return float(self._margins(formula, wanted, range(sample, sample + 1))[0])
 
     # ---------------------------------------------------------------- connectives
@@ -394,7 +406,11 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """The part with the least margin in each of the two cases in which an equivalence is as wanted."""
+        """The operand with the least margin, for each of two ways to give an equivalence the value `wanted`.
+
+        An equivalence holds if both sides are true or both are false, an exclusive or if exactly one side is
+        true.
+        """
         left, right = formula.items
         same = (formula.op == "<->") is wanted
         ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
@@ -416,7 +432,7 @@ class CauseFinder:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """The instants in the window of a temporal operator at which something is known, in order of time."""
+        """Instants in the window of a temporal operator at which its operands are not wholly unknown."""
         lowered = self._lowered(formula, wanted)
         match lowered:
             case ir.Windowed(window=window, back=False):
@@ -434,7 +450,7 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """The first instant after the last sample at which the operands of a formula are unknown."""
+        """The first instant after the last sample from which on the operands of a formula are unknown."""
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
     def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> CauseNode:
@@ -493,7 +509,7 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """True if the window extends to instants at which everything is unknown."""
+        """True if the window extends beyond the instants at which an operand has known values."""
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
             return False
@@ -501,7 +517,7 @@ class CauseFinder:
         return not instants or instants[-1] < sample + lowered.window.hi
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
-        """`always[0, b] left or left until[a, b] right`."""
+        """Cause of a failed `unless`, rewritten as `always[0, b] left or left until[a, b] right`."""
         whole = replace(formula.interval, lo=typed.Time(), lo_open=False)
         held = typed.Temporal(formula.span, "always", whole, formula.left)
         met = typed.Until(formula.span, "until", formula.interval, formula.left, formula.right)
@@ -509,10 +525,10 @@ class CauseFinder:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """The closest attempt of `until`: its offset from now, and whether the left side decides there.
+    """The closest attempt of a failed `until`: its offset from now, and whether the left side decides there.
 
-    Its value is the maximum, over the instants of the right side, of the minimum of that and the left side
-    so far.
+    The robustness of `until` is the maximum, over the instants k of its window, of the minimum of the right
+    side at k and of the left side at all instants up to k.
     """
     skipped = len(left) - len(right)
     held = np.minimum.accumulate(left)[skipped:]
@@ -523,7 +539,12 @@ def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
 
 
 def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
-    """Failure of `release`: offsets of the right side and of the best left value so far; which decides."""
+    """Decomposition of a failed `release`.
+
+    Returns:
+        The offset at which the right side fails, the offset of the greatest left value up to there, and which
+        of the two decides: 0 left, 1 right.
+    """
     skipped = len(left) - len(right)
     freed = np.maximum.accumulate(left)[skipped:]
     worst = int(np.argmin(np.maximum(freed, right)))

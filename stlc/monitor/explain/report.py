@@ -26,10 +26,10 @@ class SignalValue:
     """Value of a signal at the instant that decides.
 
     Attributes:
-        signal: its name.
-        value: in its unit.
-        unit: as declared, "" without one.
-        text: `x = 0.27 m`, `sign = stop`.
+        signal: name of the signal.
+        value: value in the unit of the signal.
+        unit: declared unit; "" if there is none.
+        text: name and value in words: `x = 0.27 m`, `sign = stop`.
     """
 
     signal: str
@@ -40,22 +40,22 @@ class SignalValue:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Cause of a violation: one requirement, one trace, one window.
+    """Cause of a violation of one requirement by one trace in one window.
 
     Attributes:
-        judgement: of the requirement.
+        judgement: verdict and robustness of the requirement.
         trace: index of the trace.
         start: sample at which the requirement was evaluated.
-        sample: sample of the predicate that decides.
-        time: of that sample in seconds.
-        predicate: its text.
-        span: of the predicate.
-        readings: the signals that it reads, at that sample.
+        sample: sample at which the deciding predicate was evaluated.
+        time: time of `sample` in seconds.
+        predicate: text of the deciding predicate.
+        span: source location of the deciding predicate.
+        readings: values of the signals that the predicate reads at `sample`.
         place: the part of the requirement to underline first, and its label.
         labels: the other parts to underline.
         because: the cause in words, on one line.
-        tree: the sub-formulas that explain the violation, down to predicates.
-        alone: raising the margin of `predicate` at `sample` alone raises the robustness.
+        tree: tree of the sub-formulas that explain the violation, down to predicates.
+        alone: whether raising the margin of `predicate` at `sample` alone raises the robustness.
     """
 
     judgement: Judgement
@@ -74,7 +74,7 @@ class Cause:
 
     @property
     def unit(self) -> str:
-        """Unit of the value that decides."""
+        """Unit of the deciding predicate's values."""
         return margin_unit(self.tree.leaf.formula)
 
 
@@ -83,7 +83,7 @@ MOST = 500
 
 
 def explain(verdict: Verdict, name: str) -> Cause | None:
-    """Return the cause of a violated requirement; None where it is not violated.
+    """Return the cause of the worst violation of a requirement; None if it is not violated.
 
     Raises:
         UsageError: U101, there is no such requirement.
@@ -105,7 +105,7 @@ def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
 
 
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
-    """Return the causes of the first `MOST` violated requirements, by name."""
+    """Return the causes of the first `MOST` violated requirements, by name of the requirement."""
     definitions = _definitions(verdict.subject.compiled.spec)
     violated = [judgement for judgement in verdict if judgement.overall == "violated"]
     return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
@@ -154,10 +154,10 @@ class _Words:
     """Wording of causes of one requirement.
 
     Attributes:
-        subject: the signals.
+        subject: the evaluated signals and requirements.
         record: the trace, up to the end of the window.
-        written: the requirement as written.
-        definitions: expressions by the names that the specification gives them.
+        written: source expression of the requirement.
+        definitions: name defined in the specification -> its expression.
     """
 
     subject: Prepared
@@ -166,7 +166,7 @@ class _Words:
     definitions: dict[str, ast.Expr]
 
     def readings(self, cause: CauseNode) -> tuple[SignalValue, ...]:
-        """The values that the predicates of a tree read, each signal at each instant once."""
+        """Signal values that the predicates of a cause tree read, without duplicates."""
         seen: dict[tuple[str, int], SignalValue] = {}
         read = self.subject.compiled.signature
         for leaf in cause.leaves:
@@ -181,7 +181,7 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """Labels of the parts to underline, the predicate that decides first."""
+        """Labels of the parts of the source text to underline, that of the deciding predicate first."""
         found: dict[Span, str] = {}
         for node in _labelled(tree):
             found.setdefault(self.site(node.span), self.label(node))
@@ -190,7 +190,7 @@ class _Words:
         return [Label(span, found[span]) for span in spans]
 
     def label(self, node: CauseNode) -> str:
-        """The label of an underlined part: its truth and instant, of a premise also the values."""
+        """Label of an underlined part: truth value and instant; for a premise also signal values."""
         moment = self.subject.moment(node.sample)
         if node.until is not None:
             window = f"from {moment} to {self.subject.moment(node.until)}"
@@ -199,7 +199,7 @@ class _Words:
         return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
 
     def because(self, tree: CauseNode) -> str:
-        """The cause in words; where a premise decides, the conclusion is described, too."""
+        """The cause in words; if the premise of an implication decides, the conclusion is described, too."""
         text = self.reason(tree)
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
@@ -208,7 +208,7 @@ class _Words:
         return text
 
     def reason(self, tree: CauseNode) -> str:
-        """The sentence `before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
+        """Sentence on the deciding predicate: `before_junction means x < x_inter / 2, and x = 0.27 m …`."""
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))
@@ -223,12 +223,12 @@ class _Words:
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
-        """The part of the requirement that contains `span`, or refers to its definition."""
+        """Part of the requirement that contains `span`, or that refers to the definition containing it."""
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
-        """The chain of names from `expr` to the definition that holds `span`; None if there is none."""
+        """Chain of names that leads from `expr` to the definition containing `span`; None without one."""
         if _within(span, expr.span):
             return ()
         for name in names_in(expr):
@@ -240,7 +240,7 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """The signals of a predicate in the order of its text; those behind a name come last."""
+    """Pairs (signal, sample) of a predicate in the order of its text, signals of named definitions last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
     return sorted(
@@ -249,7 +249,7 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 
 
 def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
-    """The nodes with a label: premises as a whole, bodies of windows without success, predicates."""
+    """Nodes that get a label: whole premises, bodies of temporal operators that never hold, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
         yield _body(tree)
         return
@@ -258,12 +258,12 @@ def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
 
 
 def _deciding(tree: CauseNode) -> CauseNode:
-    """The labelled node that decides."""
+    """The labelled node that contains the deciding predicate."""
     return _body(tree) if tree.until is not None or not tree.parts else _deciding(tree.parts[tree.main])
 
 
 def _closest(tree: CauseNode) -> bool:
-    """True if the predicate that decides is the closest attempt of a window in which nothing succeeds."""
+    """True if the deciding predicate is the closest attempt in a window in which the body never holds."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]
@@ -271,7 +271,7 @@ def _closest(tree: CauseNode) -> bool:
 
 
 def _body(node: CauseNode) -> CauseNode:
-    """The node of a window without success with its formula replaced by the body of the window."""
+    """For a temporal operator whose body holds nowhere in its window, the node with the body as formula."""
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
         return replace(node, formula=operands(node.formula)[-1])
     return node

@@ -1,4 +1,4 @@
-"""Bounds of a requirement on a growing trace, and the interface of the trackers that compute them."""
+"""Bounds on the robustness of a requirement while a trace grows, and the interface of their evaluators."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ Ending: TypeAlias = Literal["open", "truncate"]
 
 @dataclass(frozen=True, slots=True)
 class TrackingOptions:
-    """Options for the values of a requirement.
+    """Options for the evaluation of one requirement on a growing trace.
 
     Attributes:
-        ending: treatment of windows that the end of the trace cuts.
-        truth: predicates are true or false (+inf or -inf), without any tolerance.
+        ending: treatment of windows that extend beyond the end of the trace: "open" leaves missing samples
+            unknown, "truncate" clips the windows.
+        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
         begin: the first sample at which the requirement is evaluated.
     """
 
@@ -29,34 +30,34 @@ class TrackingOptions:
 
 
 class Bounds(NamedTuple):
-    """Least and greatest robustness at consecutive instants, each (instants,)."""
+    """Least and greatest robustness at consecutive instants, (instants,) each."""
 
     low: Floats
     high: Floats
 
 
 class Tracker(Protocol):
-    """Incremental evaluator of one requirement.
+    """Incremental evaluator of one requirement on a growing trace.
 
-    Instants are settled in order: the value of a settled instant cannot change.
+    Instants become settled in order: the value at a settled instant can no longer change.
     """
 
     @property
     def samples(self) -> int:
-        """Number of samples taken in."""
+        """Number of samples received."""
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples; the arguments are those of `Side.grow`."""
+        """Add new samples; the arguments are those of `Side.grow`."""
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """The first instant whose value may still change with later samples."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations at instants that are not settled, or just were."""
+        """Bounds over all continuations of the trace at the instants from `start` up to `stop`."""
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds: the trace has ended, and windows to its end are clipped at the last sample."""
+        """Bounds at instants `starts` after the trace has ended; unbounded windows are clipped at its end."""
 
     def drop(self, start: int) -> int:
-        """Drop instants before `start`; returns the number of the first sample that is still needed."""
+        """Free the memory of instants before `start`; returns the first sample that is still needed."""

@@ -1,7 +1,7 @@
-"""Columns that grow sample by sample, in memory bounded by the windows of a formula.
+"""Time series of robustness values that grow sample by sample, in memory bounded by the windows of a formula.
 
-Every column is stored twice, as the least and as the greatest value over all continuations; where nothing is
-unknown the two agree.
+Each such column is stored twice, as the least and as the greatest value over all continuations of the trace;
+the two are equal where nothing is unknown.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ _EXACT = Windows(Exact(), NUMPY)
 
 
 class ColumnReader:
-    """Repeated evaluator of the same formulas; the schedule of each extent is cached.
+    """Evaluator of fixed formulas over growing columns (time series); its evaluation schedules are cached.
 
     Args:
-        formulas: over columns.
-        end: treatment of rows beyond the last one.
-        going_on: the trace does not end with the last row.
+        formulas: formulas whose predicates are columns.
+        end: value of rows after the last one: least, greatest, both, or none, which clips windows there.
+        going_on: whether the trace continues after the last row.
         back: lookback in rows.
     """
 
@@ -70,7 +70,7 @@ class ColumnReader:
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
-        """Return values (count, traces) from row `start` on; the columns are of one length."""
+        """Return the values (count, traces) of each formula from row `start` on; columns are equally long."""
         names = self.names or (NOTHING if NOTHING in env else next(iter(env)),)
         length = len(env[next(iter(names))])
         if count <= 0:
@@ -87,9 +87,9 @@ class ColumnReader:
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
     ) -> list[Floats]:
-        """Values of columns in which NaN is an unknown value, taken at its least or at its greatest.
+        """Values of each formula from row `start` on, for NaN (unknown) at its least or greatest value.
 
-        Where `least` is None the columns (rows, 1) give both, (count, 2).
+        If `least` is None, both bounds are returned side by side, (count, 2), for columns (rows, 1).
         """
         rows = {name: env[name] for name in self.names}
         near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
@@ -103,7 +103,7 @@ class ColumnReader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
-        """The reader of the formulas at their least or greatest value."""
+        """The evaluator of the lower or of the upper bounds of the formulas, for the signals in `holes`."""
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
@@ -113,15 +113,16 @@ class ColumnReader:
 
 @dataclass(slots=True)
 class Side:
-    """The columns of a plan, at their least or greatest values or at both.
+    """Columns (time series of predicates and past operators) of a formula, evaluated for one or both bounds.
 
     Attributes:
         plan: the columns to compute.
-        end: the bound: least, greatest, with windows cut at the last sample, or least and greatest side by
-            side, (rows, 2).
-        beyond: rows after the last sample that the formula over the columns reads.
-        truth: predicates are true or false, +inf or -inf.
-        least: unknown values of a signal are taken at their least, else at their greatest; None at both.
+        end: value of predicates after the last sample: "lower" -inf, "upper" +inf, "both" the two side by
+            side as (rows, 2); "truncate" clips windows at the last sample.
+        beyond: number of rows after the last sample that the formula reads.
+        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
+        least: unknown values of signals (NaN) are taken at their least (True), at their greatest (False), or
+            at both (None).
         rows: views of the columns from sample `base` on.
         history: the stored rows.
     """
@@ -158,7 +159,7 @@ class Side:
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
 
     def _farthest(self) -> int:
-        """Rows after the last sample that are needed: those of the formula, and those that columns read."""
+        """Number of rows after the last sample that the formula or the columns of other columns need."""
         if self.end == "truncate":
             return 0
         pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
@@ -173,12 +174,12 @@ class Side:
         return self.history.first
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples.
+        """Add new samples and compute the columns there.
 
         Args:
-            signals: columns (stored, traces) that end with the last sample.
-            first: number of their first row.
-            samples: total number of samples.
+            signals: signal name -> stored samples (stored, traces), up to the newest sample.
+            first: sample number of their first row.
+            samples: total number of samples of the trace.
         """
         self._last = (signals, first, samples)
         width = 2 if self.end == "both" else next(iter(signals.values())).shape[1]
@@ -209,7 +210,7 @@ class Side:
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
-        """Return the columns with the last sample as the end of the trace: windows beyond it are clipped."""
+        """Return a copy for which the trace ends with the last sample: windows are clipped there."""
         if self._last is None or all(stream.ahead == 0 for stream in self.plan.streams):
             return self
         last = replace(self, _settled=dict(self._settled), _over=True)
@@ -239,14 +240,17 @@ _UNKNOWN: Mapping[Beyond, float | tuple[float, float]] = {
 
 
 def _of_the_present(stream: DerivedColumn) -> bool:
-    """True for a predicate of its own sample, which is unknown after the last one."""
+    """True for a predicate that reads the signals at its own sample only: it is unknown after the last."""
     return isinstance(stream, PredicateColumn) and not (
         stream.back or stream.ahead or isinstance(stream.formula, ir.Freeze)
     )
 
 
 def shareable(plans: ColumnPlans) -> bool:
-    """True if both bounds follow from one formula, over predicates of the present and past operators."""
+    """True if both bounds are values of the same formula, so that one evaluation gives both.
+
+    This holds if the formula has only past operators and predicates that read the present sample.
+    """
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(
         _of_the_present(stream) or (isinstance(stream, RecursiveColumn) and not stream.ahead)
@@ -255,7 +259,7 @@ def shareable(plans: ColumnPlans) -> bool:
 
 
 def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:
-    """The values of a past operator, given its operands and the value before them."""
+    """Values of an unbounded past operator from its operands and its previous value (None at the start)."""
     match op:
         case "once":
             found = np.maximum.accumulate(parts[0], axis=0)
@@ -274,7 +278,7 @@ _SINCE = ColumnReader([ir.Since("since", ir.Window(0, None), column("left"), col
 
 
 def _since(left: Floats, right: Floats, last: Floats | None) -> Floats:
-    """`s(k) = min(left(k), max(right(k), s(k - 1)))`."""
+    """Values of an unbounded `since`: `s(k) = min(left(k), max(right(k), s(k - 1)))`."""
     (found,) = _SINCE({"left": left, "right": right}, 0, len(left))
     if last is None:
         return np.asarray(found)

@@ -1,4 +1,4 @@
-"""History of columns: consecutive rows, appended or replaced at the end and dropped at the front."""
+"""Storage of growing time series (columns): rows are added or replaced at the end, dropped at the front."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _SPARE = 64
 
 
 class ColumnHistory:
-    """Columns (rows, width) in growing arrays; appending a row takes amortized constant time.
+    """Storage of columns (rows, width) in growing arrays; appending a row takes amortized constant time.
 
     Args:
-        beyond: rows after the last sample that are stored, too.
-        fill: content of rows until they are written, a number or one per column of the array.
+        beyond: number of rows stored after the last sample.
+        fill: value of rows that are not written yet: one number, or one per column of the array.
 
     Attributes:
         first: number of the first stored sample.
-        samples: total number of samples taken in.
+        samples: total number of samples received.
     """
 
     def __init__(self, beyond: int = 0, fill: ArrayLike = 0.0) -> None:
@@ -33,7 +33,7 @@ class ColumnHistory:
         self._origin = self._room = 0
 
     def grow(self, names: Iterable[str], count: int, width: int = 1) -> None:
-        """Append unwritten samples to the columns `names`, which are the same in every call."""
+        """Append `count` unwritten samples to the columns `names`; every call names the same columns."""
         stop = self.samples + count + self._beyond
         if stop - self._origin > self._room:
             known = slice(self.first - self._origin, self.samples - self._origin)
@@ -63,5 +63,5 @@ class ColumnHistory:
         return {name: rows[low:high] for name, rows in self._rows.items()}
 
     def forget(self, before: int) -> None:
-        """Drop the samples before one; their memory is freed when the columns are next moved."""
+        """Drop the samples before sample `before`; their memory is freed at the next copy of the arrays."""
         self.first = min(max(before, self.first), self.samples)

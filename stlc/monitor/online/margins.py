@@ -1,4 +1,4 @@
-"""Robustness margins of many growing traces side by side: the bounds of `Online`, for all traces at once."""
+"""Robustness margins of many growing traces, all evaluated together; for one trace, see `Online`."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Counts: TypeAlias = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """Bounds of a requirement at the present sample of every trace, (traces,) each.
+    """Bounds on the robustness margin of a requirement at the latest sample, (traces,) each.
 
     Attributes:
-        low: least robustness over all continuations, the least over the windows that contain this sample;
-            for a requirement that is evaluated once, over its one window.
-        high: greatest robustness over all continuations, the least over the same windows.
-        violated: number of starts at which it is already violated, whatever follows.
-        open: whether a start so far is still undecided.
+        low: least robustness over all continuations of the trace; for a requirement that is evaluated at
+            every sample, the minimum over the windows that contain the latest sample.
+        high: greatest robustness over all continuations, with the same minimum over windows.
+        violated: number of window starts at which the requirement is violated, whatever samples follow.
+        open: whether at some window start the requirement is still undecided.
     """
 
     low: Floats
@@ -41,7 +41,7 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Violated if it is at one start, satisfied if it is at all starts so far."""
+        """Violated if violated at any window start, satisfied if satisfied at every one."""
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -49,15 +49,15 @@ class Margin:
 
 @dataclass(slots=True)
 class _Watched:
-    """A requirement and its running counts: starts before `next` are settled.
+    """A requirement with its running counts; window starts before `next` are settled (their value is final).
 
     Attributes:
         rule: the requirement.
         horizon: value of `T`, in steps.
-        whole: tracker of its bounds, wherever the traces end.
-        next: the first start that is not settled.
-        violated: settled starts that are violated, (traces,).
-        last: the least margins of the windows that closed with the last sample; None before there is one.
+        whole: evaluator of the bounds over all continuations of the traces.
+        next: the first window start that is not settled.
+        violated: number of settled window starts that are violated, (traces,).
+        last: margins at the latest sample; None before the first evaluation.
     """
 
     rule: CompiledRequirement
@@ -69,12 +69,12 @@ class _Watched:
 
     @property
     def everywhere(self) -> bool:
-        """True if it is evaluated at every start, and not only at the first sample."""
+        """True if the requirement is evaluated at every sample, False if only at the first one."""
         return self.rule.windowed and not self.rule.absolute and self.horizon is not None
 
     @property
     def ahead(self) -> int | None:
-        """Lookahead in samples; None where the end of the trace decides it."""
+        """Lookahead in samples; None if the requirement depends on the end of the trace."""
         moving = window_of(self.rule, self.horizon)
         if moving is not None:
             return max(moving, self.rule.reach)
@@ -84,13 +84,13 @@ class _Watched:
         return max(self.rule.reach, counted or 0)
 
     def needs(self) -> int:
-        """The first sample that is still read."""
+        """Number of the first sample that is still needed."""
         if not self.everywhere:
             return 0
         return max(self.next - history(self.rule.formula), 0)
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """The margin at the last of `samples` samples; `env` (stored, traces) begins with sample `first`."""
+        """Margin at the latest of `samples` samples; `env` holds them (stored, traces) from `first` on."""
         if not self.everywhere and self.next:
             assert self.last is not None
             return self.last
@@ -117,14 +117,14 @@ class _Watched:
         return self.last
 
     def _settled(self, samples: int) -> int:
-        """The first start whose value may still change."""
+        """The first window start whose value may still change."""
         if self.ahead is None:
             return 0
         whole = max(samples - self.ahead, 0)
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """The first start that is not settled and whose window holds the last sample."""
+        """Index, among the unsettled window starts, of the first whose window contains the latest sample."""
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)
@@ -133,8 +133,9 @@ class _Watched:
 class Margins:
     """Robustness margins of every requirement on many traces that grow together.
 
-    Memory is bounded by the windows of the requirements, except those that read the whole trace. `push` only
-    stores the sample; `evaluate` takes all samples since the last call, and all traces, in one evaluation.
+    Memory is bounded by the windows of the requirements; requirements that read the whole trace are the
+    exception. `push` only stores a sample; `evaluate` processes all samples since the previous call, for all
+    traces, at once.
 
     Args:
         rules: compiled requirements.
@@ -155,16 +156,16 @@ class Margins:
 
     @property
     def samples(self) -> int:
-        """Number of samples taken in."""
+        """Number of samples received."""
         return self._history.samples
 
     def push(self, signals: Mapping[str, Floats]) -> None:
-        """Take in one sample of every trace: (traces,) by name."""
+        """Add one sample of every trace: signal name -> values (traces,)."""
         names = self._names or list(signals)[:1]
         self._history.take({name: np.asarray(signals[name])[None] for name in names}, 1)
 
     def evaluate(self) -> dict[str, Margin]:
-        """Return the margins of every requirement at the last sample; there has to be one."""
+        """Return the margins of every requirement at the latest sample; needs at least one sample."""
         if self._evaluated != self.samples:
             env, first = self._history.columns(), self._history.first
             found = [each.evaluate(env, first, self.samples) for each in self._watched]

@@ -1,4 +1,4 @@
-"""Online monitor: samples in, verdicts as soon as they are decided, bounds before, in bounded memory."""
+"""Online monitor: bounds on the robustness after each sample, verdicts once decided, in bounded memory."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Decision:
     """A final verdict.
 
     Attributes:
-        requirement: its name.
+        requirement: name of the requirement.
         start: sample at which the requirement was evaluated.
-        time: of that sample in seconds; its number where the time step is unknown.
+        time: time of `start` in seconds; the sample number if the time step is unknown.
         status: satisfied or violated.
-        low: least robustness over all continuations.
-        high: greatest robustness.
-        sample: the sample that decided it.
+        low: least robustness over all continuations of the trace.
+        high: greatest robustness over all continuations.
+        sample: number of the sample that decided the verdict.
     """
 
     requirement: str
@@ -61,11 +61,13 @@ class How:
     """Options of an online monitor.
 
     Attributes:
-        at: "all" evaluates every requirement at every sample, a number at that one; None as each requires.
-        end: treatment of windows cut by the end of the stream: bounds, an error, or clipping.
-        tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
+        at: where to evaluate the requirements: "all", at every sample; a number, at that sample; None, at the
+            instants that each requirement prescribes (`stlc.monitor.instants`).
+        end: treatment of windows cut by the end of the stream: "open" gives bounds, "strict" an error,
+            "truncate" clips the windows.
+        tolerance: robustness values down to minus this count as satisfied; 0 distinguishes `<` from `<=`.
         t0: time of the first sample in seconds.
-        reasons: keep the samples that `Online.cause` needs.
+        reasons: whether to store the samples that `Online.cause` needs.
     """
 
     at: At = None
@@ -78,7 +80,7 @@ class How:
 @final
 @dataclass(slots=True)
 class Watched:
-    """A requirement with its tracker and its running verdict."""
+    """A requirement with its incremental evaluators (trackers) and its running verdict."""
 
     rule: CompiledRequirement
     everywhere: bool
@@ -90,11 +92,11 @@ class Watched:
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
-        """The trackers of robustness and, where the tolerance is 0, of truth."""
+        """The evaluator of robustness and, if the tolerance is 0, that of truth values."""
         return (self.values,) if self.truths is None else (self.values, self.truths)
 
     def grow(self, history: ColumnHistory) -> None:
-        """Take in new samples."""
+        """Pass new samples to the evaluators."""
         if self.over or self.values.samples == history.samples:
             return
         signals = history.columns()
@@ -102,12 +104,12 @@ class Watched:
             tracker.grow(signals, history.first, history.samples)
 
     def due(self, samples: int) -> bool:
-        """True if it is due for evaluation after so many samples."""
+        """True if the requirement is to be evaluated now that `samples` samples have been received."""
         return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
 
     @property
     def over(self) -> bool:
-        """True if it is evaluated once and that instant is settled."""
+        """True if the requirement is evaluated only once and that verdict is final."""
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> JudgedInstants:
@@ -125,7 +127,7 @@ class Watched:
         return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Drop settled instants; returns the first sample that is still needed."""
+        """Free the memory of settled instants; returns the first sample that is still needed."""
         return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
 
 
@@ -171,12 +173,13 @@ class Online:
     # ------------------------------------------------------------------------ samples
 
     def push(self, sample: Sample) -> tuple[Decision, ...]:
-        """Take in one sample; returns the verdicts that it decides, in the order of the requirements.
+        """Add one sample; returns the verdicts that it decides, in the order of the requirements.
 
         NaN is an unknown value.
 
         Raises:
-            TraceError: E601, a signal is missing; E604, one is infinite; E605, one is not a single number.
+            TraceError: E601, a signal is missing; E604, a value is infinite; E605, a value is not a single
+                number.
         """
         values = [_number(sample, need) for need in self._needs]
         for need, value in zip(self._needs, values, strict=True):
@@ -194,9 +197,9 @@ class Online:
         return tuple(found)
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> None:
-        """Take in many samples at once, arrays (time,) by name or a piece of a trace.
+        """Add many samples at once: arrays (time,) by signal name, or a piece of a trace.
 
-        Verdicts are counted, not reported.
+        Verdicts are counted, but not returned one by one.
 
         Raises:
             TraceError: as `push`.
@@ -212,7 +215,7 @@ class Online:
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
-        """Note which of the next samples (samples,) of a signal are NaN. Raises TraceError (E604) for inf."""
+        """Record which of a signal's next samples (samples,) are NaN. Raises TraceError (E604) for inf."""
         if np.isinf(values).any():
             first = int(np.argmax(np.isinf(values)))
             moment = f"sample {self.samples + first}"
@@ -222,7 +225,11 @@ class Online:
         self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
 
     def _take(self, columns: dict[str, Floats], count: int) -> None:
-        """Store samples (time, 1) by name; first the causes that need samples which are then dropped."""
+        """Store samples (time, 1) by name.
+
+        If the trace buffer is full, causes of violations are computed first, and then its older samples are
+        dropped.
+        """
         columns = columns or {"": np.zeros((count, 1))}
         if self._buffer is not None:
             self._buffer.take(columns, count)
@@ -240,12 +247,12 @@ class Online:
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
-        """The range of instants that are not counted yet."""
+        """Range (start, stop) from the first uncounted instant to the last one that can be evaluated."""
         start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
         return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Record the verdicts that the last sample decided; earlier ones stay."""
+        """Append the verdicts that the latest sample decided to `found`, without those appended earlier."""
         start, stop = self._pending(watched)
         judged = watched.judged(start, stop)
         known = judged.holds | judged.fails
@@ -262,20 +269,20 @@ class Online:
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
 
     def _countable(self, watched: Watched) -> int:
-        """The first instant that is unsettled, or whose window is incomplete."""
+        """The first instant that cannot be counted yet: its value may change, or its window is incomplete."""
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Count those of the pending instants that are settled; returns how many."""
+        """Count those of the uncounted instants that are settled (their value is final); returns how many."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count
 
     def _count_settled(self, requirements: Sequence[Watched]) -> None:
-        """Bring requirements up to date, and count their settled instants."""
+        """Pass the latest samples to the requirements' evaluators, and count newly settled instants."""
         for watched in requirements:
             if watched.due(self.samples):
                 watched.grow(self._history)
@@ -283,7 +290,7 @@ class Online:
                 self._count(watched, watched.judged(start, min(stop, self._countable(watched))))
 
     def time(self, sample: int) -> float:
-        """Time of a sample in seconds; its number where the time step is unknown."""
+        """Time of a sample in seconds; the sample number if the time step is unknown."""
         dt = self.compiled.grid.dt
         return float(sample) if dt is None else self.how.t0 + sample * float(dt)
 
@@ -295,25 +302,25 @@ class Online:
         return tuple(watched.rule.name for watched in self._watched)
 
     def rule(self, name: str) -> CompiledRequirement:
-        """A requirement. Raises UsageError (U101) for an unknown name."""
+        """Return the requirement `name`. Raises UsageError (U101) for an unknown name."""
         return self._find(name).rule
 
     def repeats(self, name: str) -> bool:
-        """True if a requirement is evaluated at every start, and not only at the first sample."""
+        """True if the requirement is evaluated at every sample, False if it is evaluated once."""
         return self._find(name).everywhere
 
     @property
     def kept(self) -> int:
-        """Number of stored samples of the signals."""
+        """Number of samples of the signals in memory."""
         return self.samples - self._history.first
 
     @property
     def samples(self) -> int:
-        """Number of samples taken in."""
+        """Number of samples received."""
         return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Sample, least and greatest robustness of every start that is not settled yet."""
+        """Sample number, least and greatest robustness of every window start whose value may still change."""
         watched = self._find(name)
         if watched.over or not self.samples:
             return []
@@ -323,7 +330,7 @@ class Online:
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
     def standing(self, name: str) -> Tally:
-        """Running verdict of a requirement, its open starts included."""
+        """Verdict of a requirement up to now; window starts that may still change count with their bounds."""
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> Tally:
@@ -335,7 +342,7 @@ class Online:
 
     @property
     def in_scope(self) -> bool | None:
-        """Whether the assumptions hold at the first sample: True, False, or None where that is undecided."""
+        """True or False if the assumptions hold or fail at the first sample, None if that is undecided."""
         if not self.samples:
             return None if self._scope else True
         found = {self._standing(watched).status for watched in self._scope}
@@ -344,10 +351,10 @@ class Online:
         return True if found <= {"satisfied"} else None
 
     def finish(self) -> dict[str, Tally]:
-        """End the trace, and return the summary of each requirement by name, as `Monitor.check` gives it.
+        """End the trace; returns the summary of each requirement by name, equal to that of `Monitor.check`.
 
         Raises:
-            TraceError: E306 where `end` is "strict" and it is too short; E605, there was no sample.
+            TraceError: E306, `end` is "strict" and the trace is too short; E605, there was no sample.
         """
         if not self.samples:
             raise TraceError(Diagnostic("E605", "there are no samples"))
@@ -373,17 +380,18 @@ class Online:
         return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
 
     def _worst(self, watched: Watched) -> Worst | None:
-        """The start of the worst violation of a requirement if the trace ended now."""
+        """Start and margin of a requirement's worst violation if the trace ended now; None without one."""
         if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
             return None
         tally = self._ended(watched, self._starts(watched))
         return Worst(tally.high_at, tally.high) if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
-        """Return the cause of a violation at its worst start so far, as `explain` does for a recording.
+        """Return the cause of the worst violation of a requirement up to now, as `explain` does for a trace.
 
-        None without `reasons`, where nothing is violated, and where the samples that show the cause are
-        dropped: about two million numbers are stored, and causes found before samples are dropped.
+        None if the monitor was made without `reasons`, if nothing is violated, or if the samples that show
+        the cause were dropped. The monitor stores about two million numbers and finds causes before it drops
+        samples.
         """
         watched = self._find(name)
         worst = None if self._buffer is None else self._worst(watched)
@@ -397,7 +405,7 @@ class Online:
 
 
 def _number(sample: Sample, need: Need) -> float:
-    """The value of a signal in a sample; `q[0]` is also a component of `q`."""
+    """Value of a signal in a sample; `q[0]` may also be given as a component of the vector `q`."""
     value = sample.get(need.column.name)
     if isinstance(value, float):
         return value

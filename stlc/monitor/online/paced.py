@@ -1,9 +1,10 @@
 """Evaluation of requirements with wide windows in a stream, at a bounded cost per sample.
 
-Unsettled instants are recomputed at every evaluation. Requirements with narrow windows are evaluated after
-every sample; those with wide windows only every n samples, so that the cost per sample is bounded. A window
-that is longer than the stream is cut to a few times the number of samples and lengthened as the stream grows:
-memory grows with the number of samples, not with the width of the windows.
+Instants whose value may still change are recomputed at every evaluation. Requirements with narrow windows are
+evaluated after every sample; those with wide windows only after every n-th sample, so that the cost per
+sample is bounded. A window longer than the stream is shortened to a few times the number of samples and
+lengthened as the stream grows, so that memory grows with the number of samples, not with the width of the
+windows.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ _FROZEN = 500
 
 
 def span(formula: ir.Formula) -> Reach:
-    """Return the greatest sums of lookback and of lookahead along nested operators, in samples.
+    """Return the lookback and lookahead of a formula in samples, each the largest sum along nested operators.
 
-    Of an unbounded window only the lower bound counts.
+    An unbounded window counts with its lower bound only.
     """
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
@@ -55,12 +56,12 @@ def span(formula: ir.Formula) -> Reach:
 
 @dataclass(frozen=True, slots=True)
 class PacedWork:
-    """Number of rows computed for one evaluation of a formula.
+    """Number of rows (values of a subformula at one instant) computed for one evaluation of a formula.
 
     Attributes:
-        rows: all of them.
-        own: those not shared between instants: of a `freeze`.
-        heaviest: the formula that needs most of these.
+        rows: all rows.
+        own: rows that instants do not share, such as those of a `freeze`.
+        heaviest: the subformula that causes most of the unshared rows.
     """
 
     rows: int = 0
@@ -76,9 +77,9 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
     """Return the work of evaluating a formula at several instants.
 
     Args:
-        formula: to evaluate.
-        instants: how many.
-        samples: width of an unbounded window.
+        formula: the formula to evaluate.
+        instants: number of instants.
+        samples: width assumed for an unbounded window.
     """
     if isinstance(formula, ir.Freeze):
         spanned = sum(span(formula.body)) + (samples if _unbounded(formula.body) else 0)
@@ -94,7 +95,7 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
 
 
 def _unbounded(formula: ir.Formula) -> bool:
-    """True if the formula has an unbounded window, of the future or the past."""
+    """True if the formula has an unbounded window, in the future or in the past."""
     return any(isinstance(node, ir.Windowed) and node.window.hi is None for node in nodes(formula))
 
 
@@ -102,11 +103,11 @@ def _unbounded(formula: ir.Formula) -> bool:
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return a formula of equal value as long as a stream has no more than `samples` samples.
+    """Return a formula with shorter windows, of equal value while a stream has at most `samples` samples.
 
-    Beyond the last sample only bounded past windows and shifts still read known values; further on, all
-    instants are alike. Future windows are cut where past ones are narrow, else past windows where future ones
-    are narrow; if both are wide, the formula is unchanged.
+    After the last sample, only bounded past windows and shifts still read known values; further on, all
+    instants have equal values. Future windows are shortened if past windows are narrow, past windows if
+    future ones are narrow; if both are wide, the formula is unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))
@@ -118,7 +119,7 @@ def cut(formula: ir.Formula, samples: int) -> ir.Formula:
 
 
 def _cut(formula: ir.Formula, most: Reach) -> ir.Formula:
-    """The formula with windows and shifts no longer than `most`; a `freeze` is unchanged."""
+    """The formula with windows and shifts no longer than `most`; the inside of a `freeze` is unchanged."""
     if isinstance(formula, (ir.Freeze, ir.AtStart)):
         return formula
     if isinstance(formula, ir.Windowed):
@@ -135,15 +136,16 @@ def _cut(formula: ir.Formula, most: Reach) -> ir.Formula:
 
 @dataclass(slots=True)
 class PacedTracker:
-    """Tracker of a requirement that is evaluated only after some of the samples.
+    """Incremental evaluator of a requirement that is evaluated only after every n-th sample.
 
     Attributes:
         rule: the requirement.
-        make: returns the tracker of the requirement, or of one with shorter windows.
-        everywhere: it is evaluated at every instant, and not only at the first one.
-        stores_all: its tracker stores and reads all samples.
-        window: number of samples from each instant to the end of its record, where that is fixed.
-        samples: number of samples taken in.
+        make: returns an evaluator of the requirement, or of the requirement with shorter windows.
+        everywhere: whether the requirement is evaluated at every instant or only at the first one.
+        stores_all: whether that evaluator stores and reads all samples.
+        window: number of samples from each instant to the end of its planning window; None if that is not
+            fixed.
+        samples: number of samples received at the last evaluation.
     """
 
     rule: CompiledRequirement
@@ -157,18 +159,18 @@ class PacedTracker:
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of one evaluation of the formula of the requirement over `spanned` samples."""
+        """Return the work of evaluating `formula`, shortened or not, over `spanned` samples."""
         many = self.everywhere or _unbounded(formula)
         found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)
         own = (self.window or 0) * (spanned if self.everywhere else 1)
         return found + PacedWork(own, own, formula) if self.window is not None else found
 
     def due(self, samples: int) -> bool:
-        """True if it is due for evaluation after so many samples."""
+        """True if the requirement is to be evaluated now that `samples` samples have been received."""
         return samples - self.samples >= self._pace
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples."""
+        """Add new samples, evaluate, and choose after how many samples to evaluate next."""
         if self._most is not None and samples > self._most:
             most = max(samples, _SHORT) * _GROWN
             formula = cut(self.rule.formula, most)
@@ -190,7 +192,7 @@ class PacedTracker:
         return self._inner.settled
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
+        """Bounds over all continuations of the trace."""
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> Bounds:
@@ -198,6 +200,6 @@ class PacedTracker:
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:
-        """Drop instants before `start`; all samples are needed while windows are cut."""
+        """Free the memory of instants before `start`; all samples stay needed while windows are shortened."""
         needed = self._inner.drop(start)
         return needed if self._most is None else 0

@@ -1,7 +1,8 @@
-"""Decomposition of a formula into columns that can grow sample by sample.
+"""Decomposition of a formula into columns (time series) that grow sample by sample.
 
-Predicates become columns of robustness values. An unbounded past operator becomes a column that is
-continued from its last value. The remaining formula over columns has bounded windows only.
+Each predicate becomes a column of robustness values. Each unbounded past operator becomes a column that is
+computed recursively from its previous value. What remains is a formula over these columns; its past windows
+are bounded.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
 
 class EndlessError(Exception):
-    """The formula needs unbounded memory: a past operator reads a value that only the end decides."""
+    """The formula needs unbounded memory: a past operator reads a value known only when the trace ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredicateColumn:
-    """Column that follows from the signals: the robustness of a predicate.
+    """Column (time series) of the robustness of a predicate, computed from the signals.
 
     Attributes:
-        name: of the column.
-        formula: a predicate, or a `freeze` around one.
+        name: name of the column.
+        formula: a predicate, or a `freeze` around one formula.
         back: lookback in samples.
         ahead: lookahead in samples.
     """
@@ -41,16 +42,17 @@ class PredicateColumn:
 
 @dataclass(frozen=True, slots=True)
 class RecursiveColumn:
-    """Column that continues from its last value: a past operator from the start of the trace on.
+    """Column (time series) of an unbounded past operator, computed recursively from its previous value.
 
-    `once`: max(body, last). `since`: min(left, max(right, last)); the others are their duals.
+    `once`: max(body, last). `since`: min(left, max(right, last)). `historically` and `trigger` are their
+    duals.
 
     Attributes:
-        name: of the column.
-        op: which operator.
-        parts: its operands, over other columns.
+        name: name of the column.
+        op: the past operator.
+        parts: operands of the operator, over other columns.
         back: lookback of the operands in rows.
-        ahead: their lookahead in rows.
+        ahead: lookahead of the operands in rows.
     """
 
     name: str
@@ -65,12 +67,12 @@ DerivedColumn: TypeAlias = PredicateColumn | RecursiveColumn
 
 @dataclass(frozen=True, slots=True)
 class ColumnPlan:
-    """A formula over columns, and the columns in order of dependency.
+    """Decomposition of a formula into columns (time series of predicates and of unbounded past operators).
 
     Attributes:
-        formula: over the columns.
-        streams: the columns.
-        lag: for how many samples the last rows of a column may still change.
+        formula: the formula, with columns in place of these subformulas.
+        streams: the columns; each one depends only on signals and on columns before it.
+        lag: number of last rows of a column whose values may still change.
     """
 
     formula: ir.Formula
@@ -99,7 +101,7 @@ def endless(formula: ir.Formula) -> bool:
 
 
 def column(name: str) -> ir.Predicate:
-    """Return a column as a formula."""
+    """Return the formula that reads one column."""
     return ir.Predicate(ir.Signal(name))
 
 
@@ -107,10 +109,10 @@ def column(name: str) -> ir.Predicate:
 
 
 def plan(formula: ir.Formula) -> ColumnPlan:
-    """Decompose a formula into columns.
+    """Split a formula into columns (time series of predicates and past operators) and a formula over them.
 
     Raises:
-        EndlessError: it needs the whole trace.
+        EndlessError: the formula cannot be evaluated without the whole trace.
     """
     planner = _Planner()
     over_columns = planner.over_columns(formula)
@@ -123,7 +125,7 @@ class _Planner:
     streams: dict[object, DerivedColumn] = field(default_factory=dict)
 
     def over_columns(self, formula: ir.Formula) -> ir.Formula:
-        """The formula with columns for predicates and for unbounded past operators."""
+        """Replace predicates and unbounded past operators by columns, which are added to `streams`."""
         match formula:
             case ir.Predicate():
                 return self._leaf(formula)
@@ -150,7 +152,11 @@ class _Planner:
         return self._leaf(formula)
 
     def _past(self, formula: ir.PastTemporal | ir.Since) -> ir.Formula:
-        """A past operator over columns; an unbounded one becomes a column, read where its window ends."""
+        """Rewrite a past operator over columns.
+
+        An unbounded operator becomes a column, which is read as many samples earlier as the window's lower
+        bound.
+        """
         if formula.window.hi is not None:
             return formula
         value, first = self._recursive(formula.op, operands(formula)), formula.window.lo
@@ -174,5 +180,5 @@ class _Planner:
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """Return the lookahead of the predicates: samples that may be missing at the end of the trace."""
+    """Return the number of samples that predicates read ahead; at the end of the trace these are missing."""
     return max((farthest(num).future for num in numbers(formula)), default=0)

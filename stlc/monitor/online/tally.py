@@ -1,4 +1,4 @@
-"""Running summary of evaluated instants: verdict, least robustness, and its instant."""
+"""Running summary of evaluated instants: verdict, least robustness, and the instant of the latter."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Flags = NDArray[np.bool_]
 
 
 class JudgedInstants(NamedTuple):
-    """Bounds and verdicts at consecutive instants, each (instants,).
+    """Bounds and verdicts at consecutive instants, (instants,) each.
 
     Attributes:
-        low: least robustness over all continuations.
-        high: greatest robustness.
-        holds: satisfied, whatever follows.
-        fails: violated, whatever follows.
+        low: least robustness over all continuations of the trace.
+        high: greatest robustness over all continuations.
+        holds: whether the requirement is satisfied, whatever samples follow.
+        fails: whether the requirement is violated, whatever samples follow.
     """
 
     low: Floats
@@ -36,14 +36,14 @@ class Tally:
     """Summary of a requirement at consecutive instants of one trace.
 
     Attributes:
-        instants: how many.
-        holds: at how many it is certainly satisfied.
-        fails: at how many it is certainly violated.
-        low: least robustness over all continuations, the least over the instants; +inf without any.
-        high: greatest robustness, the least over the instants.
+        instants: number of counted instants.
+        holds: number of instants at which the requirement is certainly satisfied.
+        fails: number of instants at which it is certainly violated.
+        low: minimum over the instants of the least robustness over all continuations; +inf without instants.
+        high: minimum over the instants of the greatest robustness over all continuations.
         low_at: instant of `low`.
         high_at: instant of `high`.
-        first: the first of them.
+        first: the first counted instant.
     """
 
     instants: int = 0
@@ -56,7 +56,7 @@ class Tally:
     first: int = 0
 
     def add(self, judged: JudgedInstants, count: int) -> None:
-        """Count the first `count` of the next instants."""
+        """Count the first `count` instants of `judged`, which follow the counted ones."""
         if count == 1:
             self._add_one(float(judged.low[0]), float(judged.high[0]))
             self.holds += bool(judged.holds[0])
@@ -80,7 +80,7 @@ class Tally:
         return self.first + self.instants
 
     def with_more(self, judged: JudgedInstants) -> Tally:
-        """A copy with more instants."""
+        """Return a copy to which the instants of `judged` are added."""
         more = replace(self)
         more.add(judged, len(judged.low))
         return more
@@ -94,19 +94,19 @@ class Tally:
 
     @property
     def robustness(self) -> float:
-        """The least robustness; where unknown, the bound from which the verdict follows, else NaN."""
+        """The least robustness; if not known exactly, the bound from which the verdict follows, else NaN."""
         if self.low == self.high or self.status == "satisfied":
             return self.low
         return self.high if self.status == "violated" else math.nan
 
     @property
     def worst(self) -> int:
-        """The instant of the least robustness; for a violated requirement, of its worst violation."""
+        """The instant of the least robustness; if the requirement is violated, of its worst violation."""
         return self.high_at if self.fails else self.low_at
 
     @property
     def share(self) -> float:
-        """Share of the instants at which it certainly holds."""
+        """Share of the counted instants at which the requirement certainly holds."""
         return self.holds / self.instants if self.instants else math.nan
 
 

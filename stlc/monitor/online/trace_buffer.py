@@ -1,4 +1,4 @@
-"""Trace buffer for explanations: the last samples of a stream, and causes that lie before them."""
+"""Trace buffer for explanations: the latest samples of a stream, and causes found in dropped samples."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _MOST = 1 << 21
 
 @dataclass(frozen=True, slots=True)
 class Worst:
-    """Start of the worst violation of a requirement.
+    """Worst violation of a requirement.
 
     Attributes:
-        start: its sample.
-        high: its greatest robustness over all continuations.
+        start: sample at which the requirement was evaluated.
+        high: greatest robustness at `start` over all continuations of the trace.
     """
 
     start: int
@@ -40,7 +40,7 @@ class Worst:
 
 @dataclass(slots=True)
 class TraceBuffer:
-    """The last samples, and the causes found before older samples were dropped.
+    """The latest samples, and the causes of violations found before older samples were dropped.
 
     Attributes:
         compiled: the specification.
@@ -54,7 +54,7 @@ class TraceBuffer:
     _width: int = 1
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Store samples."""
+        """Store `count` samples: arrays (count, 1) by signal name."""
         self._width = len(columns)
         self._history.take(columns, count)
 
@@ -64,17 +64,17 @@ class TraceBuffer:
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
     def forget(self) -> None:
-        """Drop the older half of the samples; first `remember` the causes that lie there."""
+        """Drop the older half of the samples; call `remember` before it for causes that lie in them."""
         self._history.forget(self._history.samples - _MOST // self._width)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Store the cause of a violation before its samples are dropped."""
+        """Find and store the cause of a violation, so that its samples can be dropped."""
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """Return the cause of a violation; None where its samples were dropped."""
+        """Return the cause of a violation; None if its samples were dropped before the cause was stored."""
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
             return known[1]
@@ -99,7 +99,10 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """The number of the first sample, the offset of the start from it, and columns (samples, 1)."""
+        """Samples around a violation: number of the first, offset of the start from it, arrays (samples, 1).
+
+        None if these samples were dropped.
+        """
         history = self._history
         formula, horizon = rule.lowered, self.compiled.grid.horizon
         reads = _around(rule, formula, horizon)
@@ -122,7 +125,7 @@ class TraceBuffer:
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """True if a requirement is `always` over an unbounded window, with a bounded body."""
+    """True if the requirement is an `always` over an unbounded window, with a body of bounded windows."""
     return (
         isinstance(formula, ir.Temporal)
         and formula.op == "always"
@@ -133,7 +136,7 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Numbers of samples before and after a start that explain its violation; None where unbounded."""
+    """Numbers of samples before and after a start that suffice to explain a violation; None if unbounded."""
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None

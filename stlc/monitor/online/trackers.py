@@ -1,4 +1,4 @@
-"""Trackers of one requirement on a growing trace, and the choice among them."""
+"""Incremental evaluators (trackers) of one requirement on a growing trace, and the choice among them."""
 
 from __future__ import annotations
 
@@ -38,16 +38,20 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """Return the formula whose value is a bound of `formula` wherever the trace ends.
+    """Return a formula whose value is a bound of `formula` wherever the trace ends.
 
-    With a `window` all instants up to its end exist, unless the end of the trace cuts windows.
+    If the requirement has a planning `window`, all instants up to the end of that window exist, unless
+    windows are clipped at the end of the trace.
     """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """Return the sides of the least and the greatest value; for cut windows also those of the cut formula."""
+    """Return the columns evaluated for the least and for the greatest value.
+
+    If windows are clipped at the end of the trace, two more follow: both bounds of the formula so clipped.
+    """
     sides = [
         Side(plans["lower"], "lower", beyond, options.truth),
         Side(plans["upper"], "upper", beyond, options.truth, least=False),
@@ -59,7 +63,7 @@ def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[
 
 
 def first_needed(planned: ColumnPlan, samples: int) -> int:
-    """Return the first sample whose signals a column still reads."""
+    """Return the number of the first sample that a predicate of the decomposition `planned` still reads."""
     predicates = [stream for stream in planned.streams if isinstance(stream, PredicateColumn)]
     return max(min((samples - each.ahead - each.back for each in predicates), default=samples), 0)
 
@@ -68,7 +72,10 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 
 
 class _CutTracker(ABC):
-    """Tracker of bounds at any instants, and of values at settled instants where windows are cut."""
+    """Base of evaluators that distinguish final values at settled instants from bounds at other instants.
+
+    The two differ if windows are clipped at the end of the trace.
+    """
 
     __slots__ = ()
 
@@ -80,20 +87,20 @@ class _CutTracker(ABC):
     @property
     @abstractmethod
     def cuts(self) -> bool:
-        """True if the end of the trace cuts windows."""
+        """True if windows are clipped at the end of the trace."""
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Return bounds at settled instants, with windows cut to the trace."""
+        """Return bounds at settled instants (whose value is final), with windows clipped to the trace."""
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Return bounds at any instants, with everything outside of the trace unknown."""
+        """Return bounds at any instants, all samples outside of the trace unknown."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Return bounds over all continuations.
+        """Return bounds over all continuations of the trace.
 
-        Where windows are cut, samples before the first one count as false, not as unknown.
+        If windows are clipped, predicates before the first sample count as false, not as unknown.
         """
         middle = min(max(self.settled, start), stop)
         if not self.cuts or middle <= start:
@@ -108,12 +115,14 @@ class _CutTracker(ABC):
 
 @dataclass(slots=True)
 class _ColumnTracker(_CutTracker):
-    """Tracker of a formula over columns: two sides, or four where the end of the trace cuts windows.
+    """Evaluator of a formula over columns (time series of its predicates and past operators).
+
+    The columns are evaluated for both bounds, and twice more if windows are clipped at the end of the trace.
 
     Attributes:
-        plans: the columns.
-        options: of the values.
-        samples: number of samples taken in.
+        plans: decomposition into columns of the lower bound, the upper bound, and the formula itself.
+        options: options of the evaluation.
+        samples: number of samples received.
     """
 
     plans: ColumnPlans
@@ -124,7 +133,7 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def planned(self) -> ColumnPlan:
-        """The plan of the requirement as written."""
+        """Decomposition into columns of the requirement's own formula, not of one of its bounds."""
         return self.plans["truncate"]
 
     @property
@@ -138,14 +147,14 @@ class _ColumnTracker(_CutTracker):
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Drop instants before `start`."""
+        """Free the memory of instants before `start`; returns the first sample that is still needed."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
 
     @abstractmethod
     def _values(self, which: int, start: int, stop: int) -> Floats:
-        """Values of one side."""
+        """Values of the formula for bound `which`: 0 lower, 1 upper, 2 and 3 these with clipped windows."""
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
@@ -175,7 +184,7 @@ class BoundedTracker(_ColumnTracker):
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples."""
+        """Add new samples."""
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
@@ -193,14 +202,14 @@ class BoundedTracker(_ColumnTracker):
 
 @dataclass(slots=True)
 class IntervalColumns:
-    """Formulas with bounded windows whose instants are settled at the same time, evaluated together.
+    """Formulas with bounded windows whose instants become settled at the same time, evaluated together.
 
-    Their columns are common, (rows, 2): the least and the greatest value over all continuations. One
-    evaluation gives both bounds of all formulas.
+    They share columns (time series of their predicates and past operators), (rows, 2): the least and the
+    greatest value over all continuations. One evaluation gives both bounds of all formulas.
 
     Attributes:
-        truth: predicates are true or false, +inf or -inf.
-        samples: number of samples taken in.
+        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
+        samples: number of samples received.
     """
 
     truth: bool
@@ -213,13 +222,13 @@ class IntervalColumns:
     _found: tuple[tuple[int, int], list[Floats]] | None = None
 
     def add(self, formula: ir.Formula) -> IntervalTracker:
-        """Add a formula; only before the first sample."""
+        """Add a formula and return its evaluator; allowed before the first sample only."""
         self._formulas.append(formula)
         self._starts.append(0)
         return IntervalTracker(self, len(self._starts) - 1, reach(formula).future)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples; the arguments are those of `Side.grow`."""
+        """Add new samples; the arguments are those of `Side.grow`."""
         if samples == self.samples:
             return
         if not self.samples:
@@ -233,24 +242,24 @@ class IntervalColumns:
         self.samples, self._found = samples, None
 
     def values(self, which: int, start: int, stop: int) -> Floats:
-        """Return both bounds of a formula at consecutive instants, (instants, 2)."""
+        """Return both bounds of formula number `which` at consecutive instants, (instants, 2)."""
         if self._found is None or self._found[0] != (start, stop):
             self._found = (start, stop), self.side.values(self._reader, start, stop - start)
         return self._found[1][which]
 
     def drop(self, which: int, start: int) -> None:
-        """Drop rows that a formula needs only for instants before `start`."""
+        """Drop the rows that only formula number `which` needs, for instants before `start`."""
         self._starts[which] = start
         self.side.drop(min(self._starts) - self._back)
 
 
 @dataclass(frozen=True, slots=True)
 class IntervalTracker:
-    """Tracker of one formula with bounded windows; shares columns with others.
+    """Evaluator of one formula with bounded windows, which shares columns (time series) with other formulas.
 
     Attributes:
-        shared: the columns.
-        which: number of the formula.
+        shared: the shared columns.
+        which: number of the formula among those that share the columns.
         ahead: lookahead in samples.
     """
 
@@ -260,7 +269,7 @@ class IntervalTracker:
 
     @property
     def samples(self) -> int:
-        """Number of samples taken in."""
+        """Number of samples received."""
         return self.shared.samples
 
     @property
@@ -269,11 +278,11 @@ class IntervalTracker:
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples."""
+        """Add new samples."""
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
+        """Bounds over all continuations of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         return Bounds(*self.shared.values(self.which, start, stop).T)
@@ -283,21 +292,23 @@ class IntervalTracker:
         return self.live(starts.start, starts.stop)
 
     def drop(self, start: int) -> int:
-        """Drop instants before `start`; no signals are stored."""
+        """Free the memory of instants before `start`; no earlier samples of the signals are needed."""
         self.shared.drop(self.which, start)
         return self.shared.samples
 
 
 @dataclass(slots=True)
 class PlanningWindowTracker(_ColumnTracker):
-    """Tracker of a formula with windows to the end of a planning window, at consecutive instants.
+    """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
 
-    Every instant reads the record up to the end of its planning window. Windows of the formula that extend
-    beyond that end may still read known values of past operators: their columns, continued with unknown
-    predicates. Samples are then taken in one by one, and each value is stored when its window is complete.
+    At every instant k the formula is evaluated on the samples up to k + `window`, the end of the planning
+    window of k. Intervals of the formula may extend beyond that end and read past operators there, whose
+    values are partly known; the past operators are then continued beyond the end with unknown predicates. In
+    that case samples are processed one by one, and the value at an instant is stored when its planning window
+    is complete.
 
     Attributes:
-        window: samples from an instant to the end of its window.
+        window: samples from an instant to the end of its planning window.
     """
 
     window: int = field(kw_only=True)
@@ -318,7 +329,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples."""
+        """Add new samples."""
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -354,7 +365,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Values of a formula that reads columns beyond the ends of its windows, many instants at once."""
+        """Values at many instants, if the formula reads past operators beyond the planning window."""
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
         ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
@@ -367,7 +378,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """True if a column has known values beyond the last sample."""
+    """True if a past operator or a lookback gives a column known values after the last sample."""
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -376,7 +387,7 @@ def _remembers(planned: ColumnPlan) -> bool:
 
 @dataclass(slots=True)
 class UnboundedTracker:
-    """Tracker of a formula with unbounded windows, at the first sample."""
+    """Evaluator, at one instant, of a formula with windows that extend to the end of the trace."""
 
     plans: ColumnPlans
     options: TrackingOptions
@@ -398,18 +409,18 @@ class UnboundedTracker:
 
     @property
     def settled(self) -> int:
-        """Never before the end of the trace."""
+        """Always 0: the value may change until the end of the trace."""
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take in new samples."""
+        """Add new samples."""
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
             front.advance(samples - self._lag)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
+        """Bounds over all continuations of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         low, high = self._fronts[:2]
@@ -423,7 +434,10 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Drop samples before the frontier, or those that are no longer read before it is reached."""
+        """Drop samples that are already folded into the running state or that nothing reads any more.
+
+        Returns the number of the first sample that is still needed.
+        """
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)
         return first_needed(self.plans["truncate"], self.samples)
@@ -431,7 +445,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """Tracker of a requirement that needs the whole trace: all samples are stored."""
+    """Evaluator of a requirement that needs the whole trace: it stores all samples."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -450,7 +464,7 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def window(self) -> int | None:
-        """Samples from an instant to its `end`; None: the end of the trace."""
+        """Samples from an instant to its `end`; None if `end` is the end of the trace."""
         return window_of(self.rule, self.horizon)
 
     @property
@@ -462,7 +476,7 @@ class RecomputeTracker(_CutTracker):
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Take in new samples."""
+        """Add new samples."""
         self._signals, self.samples = signals, samples
 
     @property
@@ -480,7 +494,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Return least and greatest values, wherever the traces end: (instants, traces) each."""
+        """Return the least and greatest values over all continuations of the traces, (instants, traces)."""
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
@@ -503,7 +517,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002
-        """Drop nothing."""
+        """Drop nothing: all samples stay needed."""
         return 0
 
 
@@ -512,7 +526,7 @@ class RecomputeTracker(_CutTracker):
 
 @dataclass(slots=True)
 class Trackers:
-    """Factory of trackers; requirements that are settled at the same time share columns.
+    """Factory of incremental evaluators (trackers); requirements settled at the same time share columns.
 
     Attributes:
         horizon: value of `T`, in steps.
@@ -522,15 +536,15 @@ class Trackers:
     _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
 
     def of(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """Return the tracker of a requirement that needs the least memory.
+        """Return the evaluator that needs the least memory for a requirement.
 
         Args:
             rule: the requirement.
-            options: of its values.
-            everywhere: it is evaluated at every instant, and not only at the first one.
+            options: options of the evaluation.
+            everywhere: whether the requirement is evaluated at every instant or only at the first one.
 
         Raises:
-            UsageError: E313, the work that instants do not share is too large.
+            UsageError: E313, too much work per instant that the instants cannot share.
         """
 
         def make(part: CompiledRequirement) -> Tracker:
@@ -547,7 +561,7 @@ class Trackers:
         return self.plain(rule, options, everywhere=everywhere)
 
     def plain(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """Return the tracker that evaluates a requirement after every sample."""
+        """Return the evaluator that evaluates the requirement after every sample."""
         formula, window = rule.formula, window_of(rule, self.horizon)
         if window is not None and (bounded := without_end(formula, window)) is not None:
             formula, window = bounded, None
@@ -574,10 +588,10 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with `end` at a fixed number of samples after its instant; None if there is none.
+    """Return the formula with `end` replaced by a fixed window of `window` samples; None if impossible.
 
-    There is none where `end` stands under another window, in segments that would extend beyond `end`
-    (`sweep`), or where bounded windows extend beyond it.
+    It is impossible if `end` occurs inside another window, in segments that would extend beyond `end`
+    (`sweep`), or if bounded windows extend beyond it.
     """
     moved = _ended(formula, window)
     return None if endless(moved) or uses_end(moved) or reach(moved).future > window else moved
@@ -594,7 +608,7 @@ def _ended(formula: ir.Formula, window: int) -> ir.Formula:
 
 
 def _too_much(rule: CompiledRequirement, found: PacedWork) -> Diagnostic:
-    """E313 for a formula whose instants are evaluated separately, on too many samples."""
+    """Finding E313 for a formula whose instants are evaluated separately, each on too many samples."""
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
     return Diagnostic(

@@ -1,8 +1,9 @@
-"""Windows to the end of the trace, evaluated at its first sample in bounded memory.
+"""Formulas with windows to the end of the trace, evaluated at one sample in bounded memory.
 
-The value is a monotone function of the values of the unbounded operators from a frontier on: a lattice
-polynomial. Its coefficients are its values where each operator is -inf or +inf, which are the formula on
-the samples up to the frontier, with each unbounded operator continued by that constant.
+The value of the formula is a monotone function (a lattice polynomial of min and max) of the values that its
+unbounded operators have from some sample, the frontier, on. The samples before the frontier enter only
+through its coefficients: the values of the formula on those samples if each unbounded operator is continued
+by -inf or by +inf.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _FOREVER = ir.Window(0, None)
 
 @dataclass(frozen=True, slots=True)
 class DelayedFormula:
-    """A formula without unbounded windows, read some samples after its instant."""
+    """A formula without unbounded windows, evaluated `steps` samples after an instant."""
 
     formula: ir.Formula
     steps: int
@@ -44,15 +45,16 @@ class DelayedFormula:
 
 @dataclass(slots=True)
 class UnboundedOperators:
-    """The unbounded operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
+    """The unbounded operators of a formula, rewritten over columns (time series) with lower bound 0.
 
-    The value of an operator after the last row, its rest, is a column of its own, `!0`, `!1`, ….
+    A subformula without unbounded windows is a column `$0`, `$1`, …. The value of an unbounded operator from
+    the last row on, called its rest, is a column `!0`, `!1`, ….
 
     Attributes:
-        root: the formula.
-        parts: column -> the formula that it stands for.
-        origins: rest -> its operator, before the lower bound was removed.
-        operators: rest -> its operator over columns, the rest among them.
+        root: the formula over columns.
+        parts: column `$k` -> the subformula that it stands for.
+        origins: column `!k` -> its operator, before the lower bound was removed.
+        operators: column `!k` -> its operator over columns, `!k` among them.
     """
 
     root: ir.Formula
@@ -62,25 +64,26 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Samples after an instant that have to be known before it enters a polynomial."""
+        """Number of samples after an instant needed to fold the instant into the polynomial."""
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
-        """Number of unknown samples after which one more makes no difference."""
+        """Number of unknown samples after the last one beyond which more do not change the bounds."""
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
 
     @property
     def back(self) -> int:
-        """Lookback of the parts in rows."""
+        """Lookback of the subformulas in rows."""
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
 def skeleton(formula: ir.Formula) -> UnboundedOperators:
-    """Decompose a formula over columns.
+    """Separate the unbounded operators of a formula from its other subformulas.
 
     Raises:
-        EndlessError: an unbounded operator stands under a bounded one, or there are too many.
+        EndlessError: an unbounded operator occurs inside a bounded one, or there are too many unbounded
+            operators.
     """
     found = UnboundedOperators(formula)
     found.root = _taken(formula, 0, found)
@@ -90,7 +93,7 @@ def skeleton(formula: ir.Formula) -> UnboundedOperators:
 
 
 def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """The formula `steps` samples later, over columns."""
+    """The formula `steps` samples later, its subformulas without unbounded windows replaced by columns."""
     if not endless(formula):
         return _part(formula, steps, found)
     match formula:
@@ -116,7 +119,7 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Column with the value of an operator from the last row on.
+    """Name of the column with the value of an unbounded operator from the last row on.
 
     Operators that read the same columns may still differ at the end of the trace: `next (always p)` and
     `always (next p)` are not equal there.
@@ -125,7 +128,7 @@ def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
 
 
 def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
-    """The name of the column of a formula, added where there is none."""
+    """Name of the column of a formula; the column is added if there is none."""
     for name, known in columns.items():
         if known == formula:
             return name
@@ -134,9 +137,9 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """`until` without a lower bound: met within the rows, or its left side holds there and it is met later.
+    """`until` without upper bound: satisfied within the rows, or left side true there and satisfied later.
 
-    For `release` the dual.
+    `release` is the dual.
     """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
@@ -155,22 +158,22 @@ def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Form
 
 
 def _neutral(origin: DelayedFormula) -> float:
-    """The value of the rest of an operator at the end of the trace: nothing more is met, nothing fails."""
+    """Value of an unbounded operator over no samples: +inf for `always` and `release`, else -inf."""
     assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
 @dataclass(slots=True)
 class UnboundedState:
-    """The value of a formula at its first sample: its least or its greatest.
+    """Bound on a formula with unbounded windows, computed incrementally: the least or the greatest value.
 
     Attributes:
-        bones: the formula.
-        side: the columns.
+        bones: the formula, decomposed into its unbounded operators and the other subformulas.
+        side: columns of the predicates and past operators, evaluated for the bound.
         begin: the sample at which the formula is evaluated.
-        at: number of the first sample that is not yet in the polynomial.
-        coefficients: (subsets of the operators, traces): the value where those operators are +inf from
-            `at` on and the others -inf; None before the first `advance`.
+        at: the frontier: the first sample that is not folded into the polynomial.
+        coefficients: (subsets of the operators, traces): value of the formula if the operators of the subset
+            are +inf from `at` on and the others -inf; None before the first `advance`.
     """
 
     bones: UnboundedOperators
@@ -195,7 +198,7 @@ class UnboundedState:
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
-        """Fold the samples before `settled` into the polynomial."""
+        """Fold the samples before `settled` into the coefficients of the polynomial."""
         count = settled - self.at
         if count <= 0:
             return
@@ -210,7 +213,7 @@ class UnboundedState:
         self.at = settled
 
     def value(self, samples: int) -> Floats:
-        """The value while the trace continues, followed by as many unknown samples as affect the formula."""
+        """The bound while the trace continues: the value with enough unknown samples appended."""
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
             env[name] = np.full(env[NOTHING].shape, _neutral(origin))
@@ -218,7 +221,7 @@ class UnboundedState:
         return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
-        """The value with the last sample as the end of the trace."""
+        """The value if the trace ends with the last sample."""
         if self.coefficients is None:
             return self._plain(formula, self.begin, samples)
         origins = self.bones.origins.values()
@@ -226,12 +229,15 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at the frontier, one row each: of the formula, or with a polynomial of the operators."""
+        """Values at the frontier (the first sample not yet folded in), one row each.
+
+        A row is the formula before the first `advance`, afterwards an unbounded operator.
+        """
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
-        """A formula over columns at one sample, unbounded windows clipped at the last sample."""
+        """Value of a formula at sample `at`, with unbounded windows clipped at the last sample."""
         parts: dict[str, DelayedFormula] = {}
         plain = _outlined(formula, parts)
         first = min(self.at, at)
@@ -242,21 +248,21 @@ class UnboundedState:
         return ColumnReader([plain], self.side.end)(env, at - first, 1)[0]
 
     def _columns(self, count: int) -> dict[str, Floats]:
-        """The parts at the next `count` samples."""
+        """Values of the subformulas without unbounded windows at the next `count` samples."""
         env = {NOTHING: np.zeros((count, self.side.rows[NOTHING].shape[1]))}
         for steps, (names, reader) in self._parts.items():
             env |= zip(names, self.side.values(reader, self.at + steps, count), strict=True)
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """The polynomial at the operators' values `rests` (operators, points, traces): a row per point."""
+        """Evaluate the polynomial at operator values `rests` (operators, points, traces): a row per point."""
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
 
 
 def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formula:
-    """The formula with columns for all parts without unbounded windows."""
+    """Replace all subformulas without unbounded windows by columns, which are added to `parts`."""
     if not endless(formula):
         return _part(formula, 0, UnboundedOperators(formula, parts))
     match formula:
