@@ -32,7 +32,10 @@ Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 
 
 def dump(compiled: Compiled, part: Part = "all") -> str:
-    """Return the text of `part`, a function of the specification and the time grid alone."""
+    """Return the text of one part of a compiled specification.
+
+    It is determined by the specification and the time grid.
+    """
     blocks = ["\n".join(_head(compiled))]
     if part == "all":
         blocks += list(_beside(compiled))
@@ -61,13 +64,13 @@ def _both(steps: int, grid: Grid) -> str:
 
 
 def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
-    """Yield each requirement and assumption, with its kind."""
+    """Yield (requirement, "") for each requirement, then (assumption, "assume") for each assumption."""
     yield from ((rule, "") for rule in compiled.requirements)
     yield from ((rule, "assume") for rule in compiled.assumptions)
 
 
 def _beside(compiled: Compiled) -> Iterator[str]:
-    """Yield the requirements in two columns: as written and as compiled."""
+    """Yield the text of each requirement in two columns: in the source, and compiled."""
     written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"
@@ -80,7 +83,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 
 
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
-    """Yield the compiled form of a requirement: formula, added states, intervals."""
+    """Yield the lines about a compiled requirement: its formula, its added states, its intervals."""
     yield show_formula(rule.formula)
     read = columns(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
@@ -92,14 +95,14 @@ def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
 
 
 def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
-    """Return the wrapped lines of a formula; comparisons and sums are not broken."""
+    """Return a formula wrapped to lines of `width`; comparisons and sums are not broken."""
     tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
     lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
 def _cut(lines: list[str]) -> list[str]:
-    """Return the lines of a formula, the first ones of a very long formula."""
+    """Return the lines of a formula; of a very long one the first lines and how many follow."""
     if len(lines) <= LONG:
         return lines
     return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
@@ -125,7 +128,7 @@ def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) 
 
 
 def _added(timer: Timer) -> str:
-    """Return the line of an added state: its kind, name and meaning."""
+    """Return the line about an added state: its kind, name and meaning."""
     return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
 
 
@@ -134,7 +137,7 @@ def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
 
 
 def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
-    """Yield the distinct intervals: operator, seconds, samples."""
+    """Yield a line for each distinct interval of a formula: operator, seconds, samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
         if isinstance(node, ir.Windowed):

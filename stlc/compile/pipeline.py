@@ -1,15 +1,15 @@
 """Compiler pipeline: the stages, in order. Read this module first.
 
-    resolve   ast.Spec      -> typed.Spec                 names, sorts, units; time in seconds
+    resolve   ast.Spec      -> typed.Spec                 names, types, units; time in seconds
     place     typed.Formula -> typed.Formula              delays in samples, from here on for one time grid
-    augment   typed.Formula -> typed.Formula, Timer…      absolute intervals and the past become states
+    augment   typed.Formula -> typed.Formula, Timer…      mission time and the past become added states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
     horizon   ir.Formula    -> int                        lookahead
 
-`resolve_for` is the first stage, `compile_resolved` runs the others, so that a monitor that learns the time
-grid later, or uses several grids, resolves once. `stlc.compile.backends.array.graph` evaluates the result.
-No stage needs torch.
+`resolve_for` runs the first stage, `compile_resolved` the others, so that a monitor that learns the time grid
+later, or uses several grids, resolves the specification only once. `stlc.compile.backends.array.graph`
+evaluates the result. No stage needs torch.
 """
 
 from __future__ import annotations
@@ -53,21 +53,23 @@ beyond the plan (E306).
 
 @dataclass(frozen=True, slots=True)
 class CompiledRequirement:
-    """Compiled requirement.
+    """Requirement (or assumption) with its compiled formula.
 
     Attributes:
         name: name of the requirement.
-        doc: its `##` comment.
-        tags: bare tag names.
+        doc: text of the `##` comment before it.
+        tags: names of its tags without arguments (`safety`, `liveness`).
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
-        formula: formula in negation normal form and steps.
+        formula: formula in negation normal form, with time in steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
-        windowed: it mentions `T`, and so applies to every planning window.
-        uses_end: it has a window to the end of the trace.
-        absolute: it has an interval on the mission clock.
-        alive: for training, state formula: the requirement can still be satisfied after the mission so far.
+        windowed: whether it mentions `T`, and so applies to every planning window.
+        uses_end: whether it has a window to the end of the trace.
+        absolute: whether it has an operator such as `always@[a, b]`, whose interval counts from the start of
+            the mission.
+        alive: for training, state formula that holds while the requirement can still be satisfied, given the
+            mission before.
         span: place of the declaration.
         typed: requirement before lowering.
     """
@@ -104,18 +106,19 @@ class Compiled:
     Attributes:
         name: name of the specification.
         spec: syntax tree.
-        signature: columns that requirements and assumptions read, then the timers.
+        signature: columns that requirements and assumptions read, then those of the added states.
         requirements: every `require`, in order.
-        assumptions: every `assume`, in order; not part of the overall robustness.
-        timers: states that the requirements add to those of the system.
+        assumptions: every `assume`, in order; they are not part of the overall robustness.
+        timers: states that the requirements add to those of the system (clock, statuses, latches, timers).
         parameters: for training, values drawn per trajectory that are not states of the system.
-        guidance_cost: for training, cost at one sample; None without goals beyond the horizon.
-        mission: last step of the mission that a requirement refers to; None without one.
-        recurring: for an unbounded mission, the steps that its timers count, about one period; None if all
-            missions are bounded.
+        guidance_cost: for training, cost at one sample that drives plans towards deadlines beyond the
+            horizon; None without such deadlines.
+        mission: last step of the mission to which a requirement refers; None if none does.
+        recurring: for a mission without end, the greatest number of steps that a timer counts, about one
+            period; None if the mission ends.
         grid: time step and horizon.
         warnings: findings that are not errors.
-        typed: the resolved specification.
+        typed: the specification after the first stage.
     """
 
     name: str
@@ -134,12 +137,12 @@ class Compiled:
 
     @property
     def safety(self) -> tuple[CompiledRequirement, ...]:
-        """phi_safe: the requirements tagged `@safety`."""
+        """Requirements tagged `@safety` (phi_safe), which even an emergency plan must satisfy."""
         return tuple(rule for rule in self.requirements if "safety" in rule.tags)
 
     @property
     def reach(self) -> int:
-        """Lookahead of all requirements, in steps."""
+        """Greatest lookahead of a requirement, in steps."""
         return max((rule.reach for rule in self.requirements), default=0)
 
 
@@ -151,17 +154,17 @@ def compile_spec(
     overrides: Mapping[str, str] | None = None,
     purpose: Purpose = "train",
 ) -> Compiled:
-    """Run all stages.
+    """Compile a specification: run all stages.
 
     Args:
-        spec: as parsed.
+        spec: syntax tree of the specification.
         grid: time step and horizon, as far as known.
-        interface: signals of a system; None leaves them as declared in the file.
-        overrides: constant -> its value, as text.
-        purpose: training or judging recorded traces.
+        interface: interface of the system; None: signals are as declared in the file.
+        overrides: value of each constant to be replaced, as text, by name.
+        purpose: "train", or "check" for judging recorded traces.
 
     Raises:
-        SpecError: all errors of a stage.
+        SpecError: all errors of the first stage that fails.
     """
     return compile_resolved(resolve_for(spec, interface, overrides, purpose), grid, purpose)
 
@@ -169,7 +172,10 @@ def compile_spec(
 def resolve_for(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
 ) -> typed.Spec:
-    """Run the first stage, which is independent of the time grid. Arguments as of `compile_spec`."""
+    """Run the first stage, which is independent of the time grid.
+
+    Arguments are those of `compile_spec`.
+    """
     overrides = overrides or {}
     if interface is not None and purpose == "check":
         given = {item.name for item in spec.items if isinstance(item, ast.Param)} & overrides.keys()
@@ -181,7 +187,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
     """Run all stages but the first, for one time grid.
 
     Raises:
-        SpecError: all errors of a stage.
+        SpecError: all errors that the stages find.
     """
     sink = list(spec.warnings)
     if purpose == "check":
@@ -219,7 +225,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
 @final
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """Compiler of resolved requirements that collects their timers, goals and findings."""
+    """Compiler of typed requirements that collects their added states, goals and findings."""
 
     grid: Grid
     purpose: Purpose
@@ -229,7 +235,7 @@ class _Stage:
     goals: list[Goal] = field(default_factory=list)
 
     def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
-        """Compile one requirement."""
+        """Compile one requirement or assumption."""
         written = in_samples(requirement.formula, self.grid, self.sink)
         requirement = replace(requirement, formula=written)
         if self.purpose == "train":
@@ -257,7 +263,10 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Rewrite intervals on the mission clock, and for training past operators."""
+        """Return a requirement with `always@[a, b]` and its like, and for training past operators, rewritten.
+
+        For recorded traces it is a formula that is evaluated at the first sample.
+        """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)
         written = requirement.formula
@@ -266,25 +275,25 @@ class _Stage:
 
 
 def _remembered(timers: Iterable[Timer]) -> int:
-    """Return the greatest count of a timer in steps; 0 without timers."""
+    """Return the greatest number of steps that a timer counts; 0 without timers."""
     return max((int(timer.high) for timer in timers if timer.kind == "timer"), default=0)
 
 
 def _without(interface: Interface, names: Iterable[str]) -> Interface:
-    """Return the interface without states that become parameters of the specification."""
+    """Return the interface without the states in `names`, which become parameters of the specification."""
     kept = [column for column in interface.signature.columns if column.name.partition("[")[0] not in names]
     return replace(interface, signature=Signature(tuple(kept)))
 
 
 def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
-    """Return the columns that requirements read, then the timers."""
+    """Return the columns that requirements read, then those of the added states."""
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
 
 
 def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
-    """True if a requirement is undefined at the first sample of a plan, as it needs samples outside."""
+    """True if a requirement is undefined at the first sample of a plan, since it reads samples outside."""
     if grid.horizon is None:
         return False
     from stlc.compile.ir.defined import defined

@@ -28,11 +28,11 @@ class Ambiguity:
     """Part of a formula that should be in parentheses.
 
     Attributes:
-        span: the part.
-        kind: "scope", a temporal operator whose operand extends further in other tools; "mixed", `and` with
-            `or`; "chain", consecutive implications; "until" with another connective; "implication", `and` or
-            `or` with `->`, which most tools parse as here.
-        outer: the adjacent connective.
+        span: its place in the source.
+        kind: "scope": a temporal operator whose operand extends further in other tools; "mixed": `and` next
+            to `or`; "chain": consecutive implications; "until": `until` next to another connective;
+            "implication": `and` or `or` next to `->`, which most tools parse as this one does.
+        outer: connective next to the part.
     """
 
     span: Span
@@ -41,11 +41,11 @@ class Ambiguity:
 
 
 def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
-    """Yield all parts that other tools parse differently, in source order.
+    """Yield the parts of formulas that other tools parse differently, in source order.
 
     Args:
-        spec: as parsed.
-        implications: include kind "implication".
+        spec: syntax tree of the specification.
+        implications: whether to include the kind "implication".
     """
     words = _Words(spec)
     pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
@@ -58,7 +58,7 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """Lexemes of the text, and spans already marked for parentheses."""
+    """Words and signs of the source text, and the source locations that will get parentheses."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.items: list[Lexeme] = list(lexemes(spec.source.text))
@@ -66,7 +66,7 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """True if an operand is in parentheses; `left` if it is a left operand."""
+        """True if an operand is, or will be, in parentheses; `left`: it is the left operand."""
         if (node.span.start, node.span.end) in self.parenthesised:
             return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)
@@ -76,7 +76,7 @@ class _Words:
 
 
 def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield operands that are connectives without parentheses."""
+    """Yield the operands that are connectives without parentheses and parsed differently elsewhere."""
     for operand, left in ((node.left, True), (node.right, False)):
         if words.closed(operand, left=left):
             continue
@@ -99,7 +99,10 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield a temporal operator that ends a left operand: in other tools it extends beyond the connective."""
+    """Yield a temporal operator that ends the left operand of a connective.
+
+    In other tools its operand extends beyond the connective.
+    """
     part: ast.Node = node.left
     governed: ast.Node | None = None
     while not words.closed(part, left=True):

@@ -1,6 +1,7 @@
-"""Abstract syntax as written, with one class of expressions; `stlc.compile.frontend.resolve` adds types.
+"""Abstract syntax tree, with one class per kind of expression, before types are known.
 
-Every node has a span, which equality ignores.
+`stlc.compile.frontend.resolve` determines the types. Every node has a source location (`span`), which
+comparisons of nodes ignore.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from stlc.source import Source, Span
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Base of all nodes."""
+    """Base of all nodes of the syntax tree; `span` is the place in the source."""
 
     span: Span = field(compare=False, repr=False)
 
@@ -25,7 +26,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Quantity(Node):
-    """Number with its unit ("" for a bare number; "steps" is a unit)."""
+    """Number with its unit: "" for a number without one; "steps" is a unit of time."""
 
     value: Fraction
     unit: str = ""
@@ -47,12 +48,12 @@ class Bool(Node):
 
 @dataclass(frozen=True, slots=True)
 class Inf(Node):
-    """`inf`."""
+    """The word `inf`: an infinite bound, or the end of the trace."""
 
 
 @dataclass(frozen=True, slots=True)
 class Name(Node):
-    """Name without its backticks, which are recorded."""
+    """Name without backticks; `quoted` tells whether it had them."""
 
     name: str
     quoted: bool = field(default=False, compare=False)
@@ -60,14 +61,14 @@ class Name(Node):
 
 @dataclass(frozen=True, slots=True)
 class Vector(Node):
-    """`[a, b, c]`."""
+    """Vector `[a, b, c]`."""
 
     items: tuple[Expr, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Index(Node):
-    """`base[index]`."""
+    """Component of a vector: `base[index]`."""
 
     base: Expr
     index: Expr
@@ -75,7 +76,7 @@ class Index(Node):
 
 @dataclass(frozen=True, slots=True)
 class Attr(Node):
-    """`base.name`, for imported modules."""
+    """Name in an imported file: `base.name`."""
 
     base: Expr
     name: str
@@ -83,7 +84,7 @@ class Attr(Node):
 
 @dataclass(frozen=True, slots=True)
 class Arg(Node):
-    """An argument of a call; `name` is None for a positional one."""
+    """Argument of a call; `name` is None for an argument without a name."""
 
     name: str | None
     value: Expr
@@ -91,7 +92,7 @@ class Arg(Node):
 
 @dataclass(frozen=True, slots=True)
 class Call(Node):
-    """`func(args)`; `func` is a Name, or an Attr of an imported module."""
+    """Call `func(args)`; `func` is a `Name`, or an `Attr` for an imported file."""
 
     func: Expr
     args: tuple[Arg, ...]
@@ -99,14 +100,14 @@ class Call(Node):
 
 @dataclass(frozen=True, slots=True)
 class Neg(Node):
-    """`-operand`."""
+    """Negative of a number: `-operand`."""
 
     operand: Expr
 
 
 @dataclass(frozen=True, slots=True)
 class Binary(Node):
-    """Arithmetic: `+ - * / % ^`."""
+    """Arithmetic operation with two operands: `+ - * / % ^`."""
 
     op: Literal["+", "-", "*", "/", "%", "^"]
     left: Expr
@@ -115,7 +116,7 @@ class Binary(Node):
 
 @dataclass(frozen=True, slots=True)
 class Compare(Node):
-    """Comparison chain: `a <= b < c` has three operands and two operators."""
+    """Chain of comparisons: `a <= b < c` has three operands and two operators."""
 
     operands: tuple[Expr, ...]
     ops: tuple[Literal["<", "<=", ">", ">=", "==", "!="], ...]
@@ -123,7 +124,10 @@ class Compare(Node):
 
 @dataclass(frozen=True, slots=True)
 class Member(Node):
-    """`item in region`; the right side is an expression, a range `[lo, hi]` or a set `{1, 2}`."""
+    """Membership `item in region`, or `item not in region` if `negated`.
+
+    The right side is an expression, a range `[lo, hi]` or a set `{1, 2}`.
+    """
 
     item: Expr
     region: Expr | SetLiteral
@@ -132,21 +136,21 @@ class Member(Node):
 
 @dataclass(frozen=True, slots=True)
 class SetLiteral(Node):
-    """`{1, 2}` on the right of `in`."""
+    """Set `{1, 2}` on the right of `in`."""
 
     items: tuple[Expr, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Not(Node):
-    """Negation."""
+    """Negation `not operand`."""
 
     operand: Expr
 
 
 @dataclass(frozen=True, slots=True)
 class Logic(Node):
-    """`and or xor -> <->`, binary, as written."""
+    """Logical connective with two operands: `and`, `or`, `xor`, `->` or `<->`."""
 
     op: Literal["and", "or", "xor", "->", "<->"]
     left: Expr
@@ -155,14 +159,15 @@ class Logic(Node):
 
 @dataclass(frozen=True, slots=True)
 class Interval(Node):
-    """Bounds of a temporal operator.
+    """Interval of a temporal operator.
 
     Attributes:
-        lo: lower bound, an expression of sort time.
+        lo: lower bound, an expression for a time.
         hi: upper bound; `Inf` and the name `end` mean "to the end of the trace".
-        lo_open: the lower bound is excluded, `(lo, …`.
-        hi_open: the upper bound is excluded, `…, hi)`.
-        clock: "now" is relative to the time of evaluation; "start" is the mission clock (`@`).
+        lo_open: whether the lower bound is excluded, `(lo, …`.
+        hi_open: whether the upper bound is excluded, `…, hi)`.
+        clock: "now": bounds are relative to the present sample; "start": they count from the start of the
+            mission, as in `always@[a, b]`.
     """
 
     lo: Expr
@@ -174,7 +179,11 @@ class Interval(Node):
 
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
-    """`op[interval] body`; without an interval, to the end of the trace."""
+    """Temporal operator with one operand: `op[interval] body`.
+
+    Without an interval the window extends to the end of the trace. `alias` is the other spelling used in the
+    source, if any (`G`).
+    """
 
     op: str
     interval: Interval | None
@@ -184,7 +193,11 @@ class Temporal(Node):
 
 @dataclass(frozen=True, slots=True)
 class Until(Node):
-    """`left op[interval] right`."""
+    """Temporal operator with two operands: `left op[interval] right`.
+
+    Without an interval the window extends to the end of the trace. `alias` is the other spelling used in the
+    source, if any (`U`).
+    """
 
     op: str
     interval: Interval | None
@@ -195,7 +208,7 @@ class Until(Node):
 
 @dataclass(frozen=True, slots=True)
 class Quantifier(Node):
-    """`forall i in 0..6: body`; `domain` is a (low, high) pair or a set."""
+    """Quantifier `forall i in 0..6: body`; `domain` is a pair (low, high) or a set."""
 
     kind: Literal["forall", "exists"]
     var: str
@@ -205,7 +218,7 @@ class Quantifier(Node):
 
 @dataclass(frozen=True, slots=True)
 class Freeze(Node):
-    """`freeze p0 = p, … in body`."""
+    """Formula `freeze p0 = p, … in body`, in which p0 keeps the value that p has now."""
 
     bindings: tuple[tuple[str, Expr], ...]
     body: Expr
@@ -213,7 +226,7 @@ class Freeze(Node):
 
 @dataclass(frozen=True, slots=True)
 class IfThenElse(Node):
-    """`if cond then yes else no`, for formulas and for numbers."""
+    """Choice `if cond then yes else no` between formulas or between numbers."""
 
     cond: Expr
     yes: Expr
@@ -248,7 +261,7 @@ Expr: TypeAlias = (
 
 @dataclass(frozen=True, slots=True)
 class Tag(Node):
-    """`@safety`, `@weight(2)`, `@id("R1")`."""
+    """Tag of a requirement: `@safety`, `@weight(2)`, `@id("R1")`."""
 
     name: str
     args: tuple[Arg, ...] = ()
@@ -256,7 +269,7 @@ class Tag(Node):
 
 @dataclass(frozen=True, slots=True)
 class TypeRef(Node):
-    """`real`, `int`, `bool`, the name of an enum, or `real[7]`."""
+    """Type in a declaration: `real`, `int`, `bool`, the name of an enum, or `real[7]`."""
 
     name: str
     size: int | None = None
@@ -264,7 +277,14 @@ class TypeRef(Node):
 
 @dataclass(frozen=True, slots=True)
 class Declaration(Node):
-    """Base of declarations: name, its span, tags and `##` comment."""
+    """Base of declarations.
+
+    Attributes:
+        name: the declared name.
+        name_span: place of the name in the source.
+        tags: tags before the declaration.
+        doc: text of the `##` comment before it.
+    """
 
     name: str
     name_span: Span = field(compare=False, repr=False)
@@ -274,7 +294,7 @@ class Declaration(Node):
 
 @dataclass(frozen=True, slots=True)
 class Signal(Declaration):
-    """`env signal x : Sort [unit] in [lo, hi] from "column"` (one node per name)."""
+    """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`; one node per name."""
 
     role: Literal["input", "output", "state", "env"] | None
     type: TypeRef | None
@@ -285,7 +305,7 @@ class Signal(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Const(Declaration):
-    """`const c [unit] = expr`."""
+    """Declaration `const c [unit] = expr`."""
 
     type: TypeRef | None
     unit: str
@@ -294,7 +314,7 @@ class Const(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Param(Declaration):
-    """`param r [unit] in [lo, hi]`, or `~ distribution` (a call)."""
+    """Declaration `param r [unit] in [lo, hi]`, or `param r [unit] ~ distribution` with a call."""
 
     type: TypeRef | None
     unit: str
@@ -303,21 +323,21 @@ class Param(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Enum(Declaration):
-    """`enum Sign { stop = 0, light = 1 }`."""
+    """Declaration `enum Sign { stop = 0, light = 1 }`."""
 
     members: tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Region(Declaration):
-    """`region pond = circle(…)`."""
+    """Declaration `region pond = circle(…)`."""
 
     value: Expr
 
 
 @dataclass(frozen=True, slots=True)
 class Formal(Node):
-    """A formal argument of a `def` or an `extern fn`."""
+    """Formal argument of a `def` or an `extern fn`."""
 
     name: str
     type: TypeRef | None
@@ -325,7 +345,7 @@ class Formal(Node):
 
 @dataclass(frozen=True, slots=True)
 class Def(Declaration):
-    """`def name(args) = expr`; a macro."""
+    """Declaration `def name(args) = expr`, a macro."""
 
     formals: tuple[Formal, ...]
     type: TypeRef | None
@@ -334,7 +354,7 @@ class Def(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Extern(Declaration):
-    """`extern fn ee(q: real[7]) -> real[3] [m]`."""
+    """Declaration `extern fn ee(q: real[7]) -> real[3] [m]`."""
 
     formals: tuple[Formal, ...]
     type: TypeRef
@@ -343,21 +363,21 @@ class Extern(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Require(Declaration):
-    """`require name: formula`."""
+    """Declaration `require name: formula`."""
 
     formula: Expr
 
 
 @dataclass(frozen=True, slots=True)
 class Assume(Declaration):
-    """`assume name: formula`."""
+    """Declaration `assume name: formula`."""
 
     formula: Expr
 
 
 @dataclass(frozen=True, slots=True)
 class Import(Node):
-    """`import "file" as m`, or `import std`."""
+    """Import `import "file" as m`, or `import std`."""
 
     target: str
     is_file: bool
@@ -369,17 +389,17 @@ Item: TypeAlias = Signal | Const | Param | Enum | Region | Def | Extern | Requir
 
 @dataclass(frozen=True, slots=True)
 class Spec(Node):
-    """A whole file.
+    """Syntax tree of a whole file.
 
     Attributes:
-        name: of the `spec` pragma; "" when there is none.
-        system: path of the `system` pragma, as written.
-        system_span: of that path.
-        time_unit: unit of bare numbers in intervals; "" when there is no `time` pragma.
-        imports: in order.
-        items: declarations in order.
-        source: the text.
-        library: texts of imports, by key (`stlc.compile.frontend.modules`); None to read the files.
+        name: name given by `spec NAME`; "" without it.
+        system: path given by `system "…"`, or None.
+        system_span: place of this path in the source, or None.
+        time_unit: unit of numbers without one in intervals, given by `time UNIT`; "" without it.
+        imports: imports, in order.
+        items: declarations, in order.
+        source: the source text.
+        library: texts of imported files, by key (`stlc.compile.frontend.modules`); None: the files are read.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Coarse scanner of a text: lexemes and starts of declarations.
+"""Coarse scanner of a text: its lexemes (words, numbers, strings, signs) and where declarations start.
 
-The parser reads one declaration at a time, so that errors are independent. Declaration keywords are reserved,
-hence a split before one never falls inside a valid declaration.
+The parser reads one declaration at a time, so that errors in different ones are found independently.
+Declaration keywords are reserved words, so a text can be split before each of them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,10 @@ class Lexeme:
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """Opening bracket with its closing one, if any."""
+    """Opening bracket with its closing one, or None if it is not closed.
+
+    `interval` tells whether it may open the interval of a temporal operator.
+    """
 
     opening: Lexeme
     interval: bool
@@ -52,7 +55,10 @@ class Bracket:
 
 
 def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """Yield the lexemes of a part of a text, without blanks and comments. Never fails."""
+    """Yield the lexemes (words, numbers, strings, signs) of a part of a text; every text has some split.
+
+    Blanks and comments are left out.
+    """
     for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
         kind = match.lastgroup
         if kind is not None:
@@ -60,7 +66,10 @@ def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexem
 
 
 def declaration_starts(text: str) -> list[int]:
-    """Return the offsets of the declarations of a text, including tags and roles; the first is always 0."""
+    """Return the offset at which each declaration of a text starts, with its tags and role.
+
+    The first offset is always 0.
+    """
     starts = [0]
     tag: int | None = None
     before: Lexeme | None = None
@@ -80,7 +89,10 @@ def declaration_starts(text: str) -> list[int]:
 
 
 def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
-    """True if `spec name`, `system "path"` or `time unit` begins a line; no expression has such a pair."""
+    """True if `word` and the lexeme after it begin a pragma: `spec name`, `system "path"` or `time unit`.
+
+    A pragma stands at the start of a line; no expression contains such a pair of words.
+    """
     if word.text not in PRAGMAS or (word.start and text[word.start - 1] != "\n"):
         return False
     named = behind.kind in ("word", "quoted", "string") and behind.text not in _NO_PRAGMA
@@ -88,7 +100,7 @@ def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
 
 
 def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
-    """Return all brackets opened in `items`, in order.
+    """Return all brackets that open in `items`, in order, each with the bracket that closes it.
 
     An interval is closed by either `)` or `]`, any other bracket by its own kind.
     """
@@ -107,10 +119,10 @@ def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
 
 
 def opens_interval(before: Lexeme) -> bool:
-    """True if a bracket after this lexeme may be an interval."""
+    """True if a bracket after the lexeme `before` may open the interval of a temporal operator."""
     return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in _TEMPORAL)
 
 
 def closes(bracket: Bracket, text: str) -> bool:
-    """True if `text` closes an open bracket."""
+    """True if the sign `text` closes an open bracket."""
     return text == CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

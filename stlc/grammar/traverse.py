@@ -15,7 +15,7 @@ def children(node: ast.Node) -> Iterator[ast.Node]:
 
 
 def descendants(node: ast.Node) -> Iterator[ast.Node]:
-    """Yield a node and all its descendants, in source order."""
+    """Yield a node and all nodes below it, in source order."""
     stack = [node]
     while stack:
         top = stack.pop()

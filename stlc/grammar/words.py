@@ -1,4 +1,4 @@
-"""Vocabulary of the language: temporal operators, reserved words, names of units, patterns of the grammar."""
+"""Vocabulary of the language: temporal operators, reserved words, unit names, grammar patterns."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from stlc.units import SYMBOLS
 
 @dataclass(frozen=True, slots=True)
 class TemporalOperator:
-    """Temporal operator: everything that the parser, printers, messages and editor know about it.
+    """Facts about a temporal operator that the parser, printers, messages and editor use.
 
     Attributes:
         name: preferred spelling.
-        meaning: one sentence, for hover and completion.
+        meaning: one sentence about it, for the editor.
         english: phrase with the operands `{p}` and `{q}` and the window `{when}`; `{q}` makes it binary.
         aliases: other spellings.
-        past: the window lies in the past.
-        mirror: operator of the other direction in time, for help.
-        expansion: equivalent formula of `p` and `q` without windows: each of its operators takes the window.
+        past: whether the window lies in the past.
+        mirror: the past operator that corresponds to a future one, for help texts; "" without one.
+        expansion: equivalent formula of `p` and `q` by which the operator is replaced, each of its operators
+            with the same window; "" if it is not replaced.
     """
 
     name: str

@@ -66,14 +66,14 @@ def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope)
 
 
 class _Sweep:
-    """Distance computations along one segment."""
+    """Signed distances of the segment between a point and its position at the next sample."""
 
     def __init__(self, point: VectorValue, span: Span, scope: Scope) -> None:
         self.ends = (point, _later(point))
         self.span, self.scope = span, scope
 
     def extreme(self, region: Region, which: Literal["min", "max"]) -> Number:
-        """Least or greatest signed distance along the segment.
+        """Return the least or greatest (`which`) signed distance to a region along the segment.
 
         The signed distance to a convex region is concave along the segment, so it is least at an end.
         """
@@ -125,15 +125,20 @@ class _Sweep:
         return self._over(faces, (*self.at_ends(box), *outside))
 
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
-        """Greatest depth of the segment between the faces, or its least distance where it stays outside."""
+        """Return the greatest depth of the segment inside the faces of a convex region.
+
+        Where the segment stays outside, return the greatest of `outside`, its signed distances to the region.
+        """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
         return self._choose(ir.Predicate(depth.num), depth, close)
 
     def _depth(self, faces: Sequence[Pair]) -> Number:
-        """Max along the segment of the min distance to a face; negative if the segment stays outside.
+        """Return the maximum along the segment of the least distance to a face, positive inside.
 
-        By LP duality the min of: each face at its better end; two faces of opposite slope where they meet.
+        It is negative if the segment stays outside. By duality of linear programs it is the least of two
+        kinds of values: the distance to each face at the end where it is greater, and that to two faces of
+        opposite slope at the point where both are equal.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]
@@ -152,10 +157,10 @@ class _Sweep:
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
-        """Minus the distance to a box at each candidate for the closest point.
+        """Return minus the distance to a box at each point of the segment that may be closest to it.
 
         The squared distance is convex and piecewise quadratic along the segment. Its minimum is that of one
-        of the pieces, which start at the segment's start or where it crosses a face.
+        of the pieces, which begin at the start of the segment and where it crosses a face.
         """
         slopes = [self.apply("sub", after, before) for before, after in faces]
         starts = [literal(0, self.span), *(self._passing(face) for face in faces)]
@@ -178,7 +183,10 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Segment parameter in [0, 1] at which it crosses a face; arbitrary if it does not."""
+        """Return the position in [0, 1] along the segment at which it crosses a face.
+
+        If it crosses none, the position is arbitrary.
+        """
         before, after = face
         slope = self.apply("sub", after, before)
         product_ = self.apply("mul", self.negative(before), slope)
@@ -190,7 +198,7 @@ class _Sweep:
     # ------------------------------------------------------------------------ polygons
 
     def _edges(self, corners: Sequence[VectorValue]) -> list[Pair]:
-        """Signed distances of both ends of the segment to every edge, positive on the left."""
+        """Return the signed distances of both ends of the segment to every edge, positive on its left."""
         found = []
         for start, stop in edges(corners):
             length = norm(minus(stop, start, self.span, self.scope), self.span, self.scope)
@@ -201,7 +209,7 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Distance of the segment to every edge; negative crossing depth where they cross."""
+        """Return the distance of the segment to every edge; where they cross, the negative crossing depth."""
         now, then = self.ends
         past = edges([self.past(corner) for corner in corners])
         turns = edges([side(corner, now, then, self.span, self.scope) for corner in corners])
@@ -221,7 +229,7 @@ class _Sweep:
     # ---------------------------------------------------------------------- arithmetic
 
     def at_ends(self, region: Region) -> Pair:
-        """Signed distance at both ends."""
+        """Return the signed distances to a region of both ends of the segment."""
         now, then = self.ends
         return (
             signed_distance(now, region, self.span, self.scope),
@@ -229,7 +237,7 @@ class _Sweep:
         )
 
     def past(self, place: VectorValue) -> Number:
-        """Least distance of the segment to a point that may move in a straight line."""
+        """Return the least distance of the segment to a point that may itself move in a straight line."""
         now, then = (
             minus(end, there, self.span, self.scope)
             for end, there in zip(self.ends, (place, _later(place)), strict=True)
@@ -244,7 +252,10 @@ class _Sweep:
         return norm(VectorValue(moved), self.span, self.scope)
 
     def _ratio(self, upper: Number, lower: Number) -> Number:
-        """Quotient of squares, kept finite for a segment of length 0, where its value does not matter."""
+        """Return a quotient of squares that stays finite for a segment of length 0.
+
+        Its value does not matter there.
+        """
         least = literal(_SHORT * _SHORT, self.span)
         return self.apply("div", upper, self.apply("max", lower, least))
 
@@ -255,7 +266,7 @@ class _Sweep:
         return Number(ir.Where(cond, yes.num, no.num), no.unit, no.flexible, span=self.span)
 
     def apply(self, name: str, *args: Number) -> Number:
-        """Apply a function of the table."""
+        """Apply a function in `stlc.compile.ir.functions.FUNCTIONS`."""
         return apply(name, args, self.span, self.scope)
 
     def negative(self, number: Number) -> Number:
@@ -264,7 +275,7 @@ class _Sweep:
 
 
 def _later(value: T) -> T:
-    """Return a number, vector or region at the next sample; at the last sample, the value there."""
+    """Return a number, vector or region at the next sample; at the last sample, as it is there."""
     match value:
         case Number():
             return replace(value, num=shifted(value.num, 1, clamped=True))

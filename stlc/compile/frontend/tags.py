@@ -33,7 +33,11 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of a predicate in `formula`. Raises Failed (E205) for a missing range."""
+    """Return the greatest magnitude of the predicates in a formula.
+
+    Raises:
+        Failed: the range of a signal is unknown, or no predicate varies (E205).
+    """
     known = dict(ranges)
     found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
     if not found:
@@ -42,7 +46,11 @@ def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, s
 
 
 def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of a number. Raises Failed (E205) for a missing range."""
+    """Return the greatest magnitude of a number.
+
+    Raises:
+        Failed: the range of a signal is unknown (E205).
+    """
     ends = bounds(num, ranges)
     if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
         return max(map(abs, ends))
@@ -57,7 +65,7 @@ def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope)
 
 
 def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
-    """Yield all predicates, adding the ranges of frozen values to `ranges`."""
+    """Yield the predicates of a formula; the ranges of values bound by `freeze` are added to `ranges`."""
     for node in nodes(formula):
         if isinstance(node, typed.Predicate):
             yield node
@@ -73,17 +81,17 @@ _KNOWN = (*MARKS, "weight", "id", "group", "scale", "product")
 
 @dataclass(frozen=True, slots=True)
 class Tags:
-    """Tags of one requirement, evaluated; see `typed.Requirement`.
+    """Evaluated tags of one requirement; see `typed.Requirement`.
 
     Attributes:
-        marks: bare tag names.
+        marks: names of tags without arguments (`safety`, `liveness`).
         weight: factor of the robustness.
-        scale: divisor of the robustness; a varying number stands for the greatest magnitude of its range,
-            None for that of the predicates (`@scale(auto)`).
-        scale_span: of the scale.
-        product: `x in [lo, hi]` is `(x - lo) (hi - x)`.
-        id: of `@id("…")`.
-        group: of `@group(name)`.
+        scale: divisor of the robustness. A number that varies stands for the greatest magnitude of its range;
+            None stands for the greatest magnitude of the predicates (`@scale(auto)`).
+        scale_span: source location of `@scale`.
+        product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)`.
+        id: text of `@id("…")`; "" without this tag.
+        group: name in `@group(name)`; "" without this tag.
     """
 
     marks: frozenset[str] = frozenset()
@@ -96,7 +104,10 @@ class Tags:
 
 
 def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
-    """Return the tags of a requirement. Findings (E501, E205) go to the scope; invalid tags are ignored."""
+    """Return the evaluated tags of a requirement.
+
+    Findings (E501, E205) go to `scope`; an invalid tag is left out.
+    """
     found = Tags()
     seen: set[str] = set()
     for tag in tags:
@@ -111,7 +122,7 @@ def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
 
 
 def refuse_tags(tags: Sequence[ast.Tag], what: str, scope: Scope) -> None:
-    """Report tags on a declaration that takes none (E501)."""
+    """Report E501 for tags on a declaration that takes none; `what` describes the declaration."""
     for tag in tags:
         message = f"`@{tag.name}` says nothing about {what}"
         scope.report(Diagnostic("E501", message, tag.span, help=("tags stand before `require`",)))
@@ -147,7 +158,7 @@ def _unknown(tag: ast.Tag) -> Diagnostic:
 
 
 def _only(tag: ast.Tag) -> ast.Expr | None:
-    """Return the argument of a tag if it has exactly one."""
+    """Return the argument of a tag that has exactly one, unnamed argument; else None."""
     return tag.args[0].value if len(tag.args) == 1 and tag.args[0].name is None else None
 
 
@@ -171,7 +182,11 @@ def _positive(tag: ast.Tag, scope: Scope) -> float:
 
 
 def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
-    """Return the number in a tag; a constant must be positive."""
+    """Return the number that is the argument of a tag.
+
+    Raises:
+        Failed: the tag has another argument (E501), or the number is constant and not positive (E205).
+    """
     expr = _only(tag)
     if expr is None:
         scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))

@@ -18,7 +18,7 @@ Labels: TypeAlias = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Declaration of a named value: its span, and its description ("line 5")."""
+    """Declaration of a named value: its source location, and its description ("line 5")."""
 
     span: Span | None
     text: str
@@ -26,22 +26,25 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """Scalar in SI units relative to the offset of its unit: 20 degC is 20, a point of that scale.
+    """Scalar in SI units, relative to the offset of its unit: 20 degC is 20, a point of that scale.
 
     Attributes:
         num: the number in the IR.
-        unit: physical unit, for checks and messages; `num` is in SI whatever the unit's scale. With an
-            offset the number is a point.
-        flexible: of unknown unit (none declared, or a factor is a bare number): agrees with any unit.
-        bare: made of bare numbers alone: takes the required unit, with its scale (`psi < 30`).
-        exact: exact value of a rational constant.
-        sense: `difference` of two points, not comparable with a point; `open`: a point minus a varying
-            number in kelvin (a difference if that is a temperature), or a multiple of a point.
-        kind: `bool` is 0 or 1 and also a formula; `enum` is one of `labels`.
+        unit: physical unit, for checks and messages; `num` is in SI whatever the scale of the unit. A number
+            whose unit has an offset (degC) is a point of that scale, a temperature.
+        flexible: whether it agrees with any unit, since its own is unknown: no unit was declared, or a factor
+            is a number without a unit.
+        bare: whether it consists only of numbers without a unit; it then takes the unit that is needed, with
+            its scale (`psi < 30`).
+        exact: exact value of a rational constant, else None.
+        sense: `difference`: between two points, so not comparable with a point; `open`: a point or a
+            difference, as the result of subtracting a varying number in kelvin from a point, or of scaling a
+            point; "" otherwise.
+        kind: kind of its values; a `bool` is 0 or 1 and is also a formula, an `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
-        formula: for a choice between bools, the choice between formulas, with their margins.
-        span: in the source.
-        origin: declaration of its name.
+        formula: for a choice between bools, the choice between formulas, with their margins; else None.
+        span: its place in the source.
+        origin: declaration of the name by which it was given.
     """
 
     num: ir.Num
@@ -58,13 +61,13 @@ class Number:
 
     @property
     def constant(self) -> float | None:
-        """Value in SI units relative to the offset of its unit, if constant."""
+        """Value of a constant, in SI units relative to the offset of its unit; None for a varying number."""
         return self.num.value if isinstance(self.num, ir.Const) else None
 
 
 @dataclass(frozen=True, slots=True)
 class VectorValue:
-    """Scalars in order."""
+    """Vector of numbers."""
 
     items: tuple[Number, ...]
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -72,7 +75,7 @@ class VectorValue:
 
 @dataclass(frozen=True, slots=True)
 class EnumMember:
-    """Member of one or several enums, resolved by the other operand of a comparison."""
+    """Member of one or several enums; the other operand of a comparison decides which one is meant."""
 
     name: str
     options: tuple[Labels, ...]
@@ -81,7 +84,7 @@ class EnumMember:
 
 @dataclass(frozen=True, slots=True)
 class TimeExpr:
-    """Time on the grid: `seconds + steps * dt + horizons * T`, or `end` (and `inf`)."""
+    """Time `seconds + steps * dt + horizons * T`, or `end` (also written `inf`), the end of the trace."""
 
     seconds: Fraction = Fraction(0)
     steps: Fraction = Fraction(0)
@@ -90,7 +93,7 @@ class TimeExpr:
     span: Span | None = field(default=None, compare=False, repr=False)
 
     def plus(self, other: TimeExpr, factor: int) -> TimeExpr:
-        """Return the sum with `factor` times another time; `end` and the span are dropped."""
+        """Return the sum of this time and `factor` times another; neither may be `end`."""
         return TimeExpr(
             self.seconds + factor * other.seconds,
             self.steps + factor * other.steps,
@@ -98,16 +101,16 @@ class TimeExpr:
         )
 
     def times(self, factor: Fraction) -> TimeExpr:
-        """Return the multiple; `end` and the span are dropped."""
+        """Return `factor` times this time, which must not be `end`."""
         return TimeExpr(self.seconds * factor, self.steps * factor, self.horizons * factor)
 
     def on(self, span: Span | None) -> typed.Time:
-        """Return the time as a bound written at `span`."""
+        """Return the time as an interval bound or a delay whose place in the source is `span`."""
         return typed.Time(self.seconds, self.steps, self.horizons, span)
 
 
 class Operand(NamedTuple):
-    """Operand as written, with its value."""
+    """Operand of an operator: its expression and its value."""
 
     expr: ast.Expr
     value: Value
@@ -115,7 +118,7 @@ class Operand(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """`sweep(p)`: segment from a point to its position at the next sample."""
+    """Value of `sweep(p)`: the straight segment from a point to its position at the next sample."""
 
     point: VectorValue
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -123,7 +126,7 @@ class Swept:
 
 @dataclass(frozen=True, slots=True)
 class NormBall:
-    """Points at most `radius` from `center`; a disc in 2D."""
+    """Region of the points at most `radius` from `center`; a disc in the plane."""
 
     center: VectorValue
     radius: Number
@@ -132,7 +135,7 @@ class NormBall:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Points between two corners, component by component."""
+    """Region between two corners, component by component."""
 
     lower: VectorValue
     upper: VectorValue
@@ -141,7 +144,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """Simple polygon in 2D with constant corners in counter-clockwise order."""
+    """Simple polygon in the plane with constant corners in counter-clockwise order."""
 
     corners: tuple[VectorValue, ...]
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -149,7 +152,7 @@ class Polygon:
 
 @dataclass(frozen=True, slots=True)
 class HalfSpace:
-    """Points with `normal . p <= offset`."""
+    """Region of the points p with `normal . p <= offset`."""
 
     normal: VectorValue
     offset: Number
@@ -158,7 +161,7 @@ class HalfSpace:
 
 @dataclass(frozen=True, slots=True)
 class Combined:
-    """Union or intersection of at least one region."""
+    """Union or intersection (`op`) of at least one region."""
 
     op: Literal["union", "intersect"]
     parts: tuple[Region, ...]
@@ -167,7 +170,7 @@ class Combined:
 
 @dataclass(frozen=True, slots=True)
 class Dilated:
-    """Region dilated by `margin` (eroded where it is negative)."""
+    """Region of the points within `margin` of another region; a negative margin shrinks it."""
 
     region: Region
     margin: Number
@@ -176,7 +179,7 @@ class Dilated:
 
 @dataclass(frozen=True, slots=True)
 class Complement:
-    """Complement of a region."""
+    """Region of the points outside of another region."""
 
     region: Region
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -188,29 +191,29 @@ Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region
 
 
 def is_formula(value: Value) -> bool:
-    """True if the value is a formula with margins (not a bool signal, whose margin is always 1/2)."""
+    """True if the value is a formula with its own margin; a bool signal, with margin 1/2, is not one."""
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 
 def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
-    """A bare number."""
+    """Return a number without a unit."""
     exact = Fraction(value) if isinstance(value, Fraction | int) else None
     kind: Kind = "int" if exact is not None and exact.denominator == 1 else "real"
     return Number(ir.Const(float(value)), flexible=True, bare=True, exact=exact, kind=kind, span=span)
 
 
 def at(value: Value, span: Span) -> Value:
-    """Return the value with another `span` (a formula keeps its own spans)."""
+    """Return a value with another place in the source; a formula keeps its own."""
     return value if isinstance(value, typed.Node) else replace(value, span=span)
 
 
 def unit_text(number: Number) -> str:
-    """`[m/s]`, or "" for a number without a unit."""
+    """Return the unit of a number in brackets, as in `[m/s]`; "" for a number without a unit."""
     return "" if number.unit.dimensionless and not number.unit.text else f"[{number.unit}]"
 
 
 def describe(value: Value) -> str:
-    """Return the sort for messages: `real [m]`, `vector of 3`, `formula`, `region`."""
+    """Return the type of a value for messages: `real [m]`, `vector of 3`, `formula`, `region`."""
     match value:
         case Number():
             return f"{value.kind} {unit_text(value)}".rstrip()
@@ -230,7 +233,7 @@ def describe(value: Value) -> str:
 
 
 def noun(value: Value) -> str:
-    """Return the sort with its article: `a number [m]`, `a formula`."""
+    """Return the type of a value with its article, for messages: `a number [m]`, `a formula`."""
     match value:
         case Number():
             return f"a number {unit_text(value)}".rstrip()

@@ -1,6 +1,7 @@
 """General syntax error E010: expected tokens in words, and the smallest repair.
 
-Terminals of the grammar are named by word or class; a repair is offered only if it parses.
+A message names the terminals of the grammar in words, one by one or as a class; a repair is offered only if
+the repaired text parses.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ _BEFORE_FORMULA = frozenset(
 
 
 def expected(failure: ParseFailure) -> Diagnostic:
-    """Return E010 for a failure that no recogniser matches."""
+    """Return E010 for a syntax error that no recogniser of a common mistake matches."""
     repair = _repair(failure)
     if repair is not None:
         return repair
@@ -65,7 +66,7 @@ def expected(failure: ParseFailure) -> Diagnostic:
 
 
 def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
-    """Return the span of a lexeme's first character."""
+    """Return the source location of the first character of a word or sign."""
     return failure.piece.source.span(lexeme.start, lexeme.start + 1)
 
 
@@ -110,7 +111,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
 
 
 def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise an unknown declaration keyword: `requre a: …`."""
+    """Recognise an unknown word where a declaration begins: `requre a: …`."""
     found = failure.found
     if found is None or found.kind != "word" or found.text in RESERVED or "_REQUIRE" not in failure.accepts:
         return None
@@ -176,7 +177,7 @@ def _begins_line(failure: ParseFailure, lexeme: Lexeme) -> bool:
 
 
 def _repair(failure: ParseFailure) -> Diagnostic | None:
-    """Return a finding for one missing or wrong sign, if its correction parses."""
+    """Return the finding for one missing or wrong sign whose correction parses, else None."""
     previous, found = failure.previous, failure.found
     if previous is None:
         return None
@@ -200,7 +201,7 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise `def name: …` in place of `=`; the parser read the rest as a type."""
+    """Recognise `def name: …` in place of `def name = …`, which the parser reads as a type."""
     declared = _declared(failure)
     sign = next((lexeme for lexeme in failure.before if lexeme.text == ":"), None)
     if declared is None or sign is None or declared[1] not in ("definition", "constant", "region"):
@@ -213,7 +214,11 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
 def _missing(
     failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
-    """Return the diagnostic for a missing sign; a repair is offered if `sure`."""
+    """Return the diagnostic for a missing sign.
+
+    The correction replaces the characters from `low` to `high` by `text`; it is offered as a repair if
+    `sure`.
+    """
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
         "E010",
@@ -294,7 +299,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """Return the declared name of the piece, and the kind of declaration."""
+    """Return the name that the declaration with the error declares, and the kind of declaration."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]
@@ -317,7 +322,7 @@ def _found(failure: ParseFailure) -> str:
 
 
 def _notes(failure: ParseFailure) -> tuple[str, ...]:
-    """Return the meaning of a letter such as `F` that the author may have used as a name."""
+    """Return a note about a letter such as `F` that is an operator but may be meant as a name."""
     near = (failure.found, failure.previous) if failure.wants_operand else ()
     name = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
     if name is None:

@@ -1,4 +1,4 @@
-"""Parse failures with the surrounding lexemes, as input of the recognisers."""
+"""Syntax errors with the words and signs around them, as input of the recognisers of mistakes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stlc.source import Source, Span
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of a text that is parsed separately: a declaration, or an expression.
+    """Part of a text that is parsed by itself: a declaration, or an expression.
 
     Attributes:
         source: the whole text.
-        start: offset of the first character.
-        end: offset after the last character.
-        rule: start rule of the grammar, `start` or `expr`.
+        start: offset of the first character of the part.
+        end: offset after its last character.
+        rule: start rule of the grammar, `start` for a declaration or `expr` for an expression.
     """
 
     source: Source
@@ -29,88 +29,94 @@ class Piece:
 
     @property
     def text(self) -> str:
-        """Text of the piece."""
+        """Text of this part."""
         return self.source.text[self.start : self.end]
 
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """True if the piece parses with the characters from `start` to `end` replaced."""
+        """True if this part parses with the characters from `start` to `end` replaced."""
         text = self.text[: start - self.start] + replacement + self.text[end - self.start :]
         return parses(text, self.rule)
 
 
 @dataclass(frozen=True)
 class ParseFailure:
-    """Position in a piece at which no grammar rule applies."""
+    """Place in a part of the text (`piece`) at which no rule of the grammar applies."""
 
     piece: Piece
     at: int
 
     @cached_property
     def lexemes(self) -> tuple[Lexeme, ...]:
-        """All lexemes of the piece."""
+        """All lexemes (words, numbers, strings and signs) of the part."""
         return tuple(lexemes(self.piece.source.text, self.piece.start, self.piece.end))
 
     @cached_property
     def before(self) -> tuple[Lexeme, ...]:
-        """Lexemes before the failure."""
+        """Lexemes (words, numbers, strings and signs) before the error."""
         return tuple(lexeme for lexeme in self.lexemes if lexeme.start < self.at)
 
     @cached_property
     def after(self) -> tuple[Lexeme, ...]:
-        """Lexemes from the failure on."""
+        """Lexemes (words, numbers, strings and signs) from the error on."""
         return self.lexemes[len(self.before) :]
 
     @property
     def previous(self) -> Lexeme | None:
-        """Last lexeme before the failure."""
+        """Last lexeme (word, number, string or sign) before the error, or None."""
         return self.before[-1] if self.before else None
 
     @property
     def found(self) -> Lexeme | None:
-        """Lexeme at the failure; None at the end of the piece."""
+        """Lexeme (word, number, string or sign) at the error; None at the end of the part."""
         return self.after[0] if self.after else None
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """First lexeme after the piece, which starts the next declaration."""
+        """First lexeme after the part, with which the next declaration begins.
+
+        It is None at the end of the text, or if the part is an expression.
+        """
         if self.piece.rule != "start":
             return None
         return next(lexemes(self.piece.source.text, self.piece.end), None)
 
     @cached_property
     def accepts(self) -> frozenset[str]:
-        """Terminals of the grammar that are accepted at the failure."""
+        """Terminals of the grammar that would be accepted at the error."""
         return acceptable(self.piece.text, self.piece.rule, even_broken=True) or frozenset()
 
     @property
     def wants_operand(self) -> bool:
-        """True if an operand is expected here."""
+        """True if an operand is expected at the error."""
         return "NUMBER" in self.accepts and "NAME" in self.accepts
 
     @property
     def wants_operator(self) -> bool:
-        """True if an operator is accepted here."""
+        """True if an operator would be accepted at the error."""
         return "AND" in self.accepts or "CMP" in self.accepts
 
     @cached_property
     def open_brackets(self) -> list[Bracket]:
-        """The brackets that are open here, outermost first."""
+        """Brackets that are open at the error, outermost first."""
         return [bracket for bracket in brackets(self.before) if bracket.closing is None]
 
     @property
     def span(self) -> Span:
-        """Span of the lexeme at the failure, or the position after the last lexeme before it."""
+        """Source location of the lexeme at the error; without one, the place after the lexeme before it."""
         if self.found is not None:
             return self.of(self.found)
         end = self.previous.end if self.previous is not None else self.piece.start
         return self.piece.source.span(end, end)
 
     def of(self, first: Lexeme, last: Lexeme | None = None) -> Span:
-        """Return the span of a lexeme, or from one lexeme to another."""
+        """Return the source location of a lexeme, or from the first to the last of several lexemes."""
         return self.piece.source.span(first.start, (last or first).end)
 
     def line_with(self, *edits: tuple[int, int, str]) -> str:
-        """Return the line of the first edit after all edits, without its comment."""
+        """Return the line of the first edit, with all edits applied and without its comment.
+
+        An edit is (offset of the first character, offset after the last one, replacement).
+        """
         source = self.piece.source
         number = source.position(edits[0][0])[0]
         start = source.line_starts[number - 1]
@@ -122,7 +128,7 @@ class ParseFailure:
         return line.strip()
 
     def operand_before(self, index: int) -> int:
-        """Return the index of the first lexeme of the operand that ends before lexeme `index`."""
+        """Return the index of the first lexeme of the operand that ends just before lexeme `index`."""
         depth = 0
         for i in range(index - 1, -1, -1):
             text = self.lexemes[i].text

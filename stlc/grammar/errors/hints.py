@@ -1,7 +1,7 @@
 """Diagnostics of syntax errors: a table of recognisers of common mistakes.
 
-Each recogniser maps a `ParseFailure` to a finding or None; the first match is used, and `expected.py` handles
-all other failures.
+Each recogniser maps a `ParseFailure` to a finding, or to None if it does not match; the first finding is
+used. `expected.py` handles the errors that no recogniser matches.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/"
 
 
 def diagnose(piece: Piece, at: int) -> Diagnostic:
-    """Return the diagnostics of a piece whose parse failed at offset `at`."""
+    """Return the diagnostic of a part of a text that does not parse at offset `at`."""
     failure = ParseFailure(piece, at)
     for recognise in RECOGNISERS:
         finding = recognise(failure)
@@ -40,7 +40,7 @@ def diagnose(piece: Piece, at: int) -> Diagnostic:
 
 
 def too_deep(span: Span, limit: int) -> Diagnostic:
-    """Return the diagnostic for a piece nested deeper than later passes support."""
+    """Return E005 for a part of a text that is nested more deeply than later passes support."""
     first_line = span.source.span(span.start, min(span.end, span.start + 40))
     return Diagnostic(
         "E005",
@@ -80,7 +80,7 @@ def _character(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _all_replacements(failure: ParseFailure, found: Lexeme) -> list[tuple[int, int, str]]:
-    """Return edits for all replaceable characters of this line."""
+    """Return the edits that replace all foreign characters, such as `≤`, in the line of `found`."""
     source = failure.piece.source
     line = source.position(found.start)[0]
     edits: list[tuple[int, int, str]] = []
@@ -179,7 +179,7 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
 
 
 def _behind_interval(failure: ParseFailure, index: int) -> int:
-    """Return the index after the operator at `index` and its interval."""
+    """Return the index of the first lexeme after the operator at `index` and its interval."""
     items = failure.lexemes
     last = len(items) - 1
     behind = min(index + 1, last)

@@ -12,7 +12,10 @@ from stlc.grammar.scan import Lexeme, lexemes
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """Advice about a character; `text` is its replacement, None if ambiguous."""
+    """Advice about a character that is not in the language.
+
+    `text` replaces the character; it is None if there is no unique replacement.
+    """
 
     help: str
     text: str | None = None
@@ -60,19 +63,19 @@ _OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
 
 
 def replacement(char: str) -> Replacement | None:
-    """Return advice about a character that is not in the language."""
+    """Return the advice about a character that is not in the language, or None."""
     return _ADVICE.get(char)
 
 
 def unexpected_character(lexeme: Lexeme) -> bool:
-    """True if no token begins with the first character of a lexeme."""
+    """True if the first character of a lexeme cannot begin a token of the language."""
     if lexeme.kind == "sign":
         return lexeme.text[0] not in _OF_THE_LANGUAGE
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"
 
 
 def apart(word: str, text: str, at: int) -> str:
-    """Return a replacement of the character at an offset, with blanks where it would join other words."""
+    """Return `word`, which replaces the character at offset `at`, with blanks where it would join others."""
     before = " " if word[0].isalpha() and at and text[at - 1].isalnum() else ""
     behind = " " if word[-1].isalpha() and text[at + 1 : at + 2].isalnum() else ""
     return f"{before}{word}{behind}"

@@ -51,7 +51,7 @@ _PREFIX = frozenset({*_UNARY, "_NOT", "QUANTIFIER", "_FREEZE", "_IF"})
 
 
 def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the tokens from `start` to `end` as an expression document."""
+    """Return the layout of the expression that consists of the tokens from `start` to `end`."""
     for row in _ROWS:
         splits = _splits(text, start, end, row)
         if splits:
@@ -66,7 +66,7 @@ def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the tokens from `start` to `end` on one line."""
+    """Return the layout of the tokens from `start` to `end` on one line."""
     parts: list[Doc] = []
     for index in range(start, end):
         if index > start and gap(text, index):
@@ -76,7 +76,10 @@ def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def hangs(text: Text, start: int, end: int) -> bool:
-    """True if the tokens are one bracket, with an optional name, that may stay on the line of `=`."""
+    """True if the tokens from `start` to `end` may begin on the line of the `=` and continue below it.
+
+    They are one bracket, with or without a name before it, as in `circle(…)`.
+    """
     last = end - 1
     opening = text.partner.get(last, last)
     return start <= opening < last and all(
@@ -90,7 +93,7 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Return indices of the operators of one row outside of brackets and of `if … else`."""
+    """Return the indices of the operators in `row`, outside of brackets and of `if … else`."""
     found: list[int] = []
     index, conditions = start, 0
     while index < end:
@@ -103,7 +106,7 @@ def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
 
 
 def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
-    """Return operands with a line break before each operator."""
+    """Return the layout of operands with a possible line break before each operator (`splits`)."""
     parts = [*expression(text, start, splits[0])]
     for at, following in zip(splits, [*splits[1:], end], strict=True):
         operand = at + 1
@@ -116,7 +119,7 @@ def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
 
 
 def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return a prefix operator with its operand."""
+    """Return the layout of a prefix operator and its operand."""
     kind = text.tokens[start].kind
     if kind == "_IF":
         return (_condition(text, start, end),)
@@ -127,7 +130,7 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _condition(text: Text, start: int, end: int) -> Group:
-    """Return `if … then … else …`, with the branches on their own lines if it does not fit."""
+    """Return the layout of `if … then … else …`; if it does not fit, the branches get their own lines."""
     marks: list[int] = []
     index, depth = start, 0
     while index < end and depth >= 0:
@@ -149,7 +152,7 @@ def _condition(text: Text, start: int, end: int) -> Group:
 
 
 def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return consecutive tokens, with line breaks allowed inside brackets."""
+    """Return the layout of consecutive tokens, with line breaks only inside brackets."""
     parts: list[Doc] = []
     index = start
     while index < end:
@@ -165,7 +168,7 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _bracket(text: Text, opening: int) -> Group:
-    """Return the entries between two brackets, one per line if they do not fit."""
+    """Return the layout of a bracket; if it does not fit, each entry gets its own line."""
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
     inside: list[Doc] = [edge]
@@ -190,7 +193,7 @@ def _comma(text: Text, start: int, end: int) -> int:
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return a bracket entry: an expression, a named argument or a formal argument."""
+    """Return the layout of one entry of a bracket: an expression, or an argument with its name or type."""
     if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
         return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
     return expression(text, start, end)
@@ -203,7 +206,7 @@ _REQUIRED = frozenset({"require_decl", "assume_decl"})
 
 @dataclass(slots=True)
 class _Page:
-    """Lines of the text, each with the widths by which it is aligned."""
+    """Lines of the formatted text, each with the width by which it is aligned with its neighbours."""
 
     columns: list[AlignedColumn] = field(default_factory=list)
 
@@ -213,7 +216,7 @@ class _Page:
 
 
 def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) -> str:
-    """Return the text of a layout; `unclear` parts get parentheses."""
+    """Return the formatted text of all items; the `unclear` parts get parentheses."""
     page = _Page()
     spans = sorted((part.span.start, part.span.end) for part in unclear)
     for item in layout.items:
@@ -231,7 +234,7 @@ def _comments(comments: Sequence[Comment], page: _Page) -> None:
 
 
 def _item(item: Item, page: _Page, width: int) -> None:
-    """Add the lines of an item to the page: comments, tags, declaration."""
+    """Add the lines of an item (comments, tags, declaration) to `page`."""
     for tag in _tags(item.tokens):
         _comments(tag[0].before, page)
         _declaration(prepare(_bare(tag)), "tag", page, width)
@@ -241,12 +244,12 @@ def _item(item: Item, page: _Page, width: int) -> None:
 
 
 def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:
-    """Return the tokens without the comments above the first one, which have their own lines."""
+    """Return tokens without the comments above the first one, which are printed on their own lines."""
     return (replace(tokens[0], before=()), *tokens[1:])
 
 
 def _tags(tokens: Sequence[Token]) -> list[Sequence[Token]]:
-    """Return the tags before a declaration, each `@name` or `@name(…)`."""
+    """Return the tokens of each tag, `@name` or `@name(…)`, before a declaration."""
     found: list[Sequence[Token]] = []
     start = 0
     while tokens[start].text == "@":
@@ -277,7 +280,7 @@ def _declaration(text: Text, rule: str, page: _Page, width: int) -> None:
 
 
 def _document(text: Text, rule: str) -> tuple[Doc, ...]:
-    """Return a declaration: its head, and after `=` or `:` a body that may break."""
+    """Return the layout of a declaration: the part up to `=` or `:`, then a body that may be broken."""
     count = len(text.tokens)
     start = _body(text, rule)
     if start >= count:
@@ -300,7 +303,10 @@ def _body(text: Text, rule: str) -> int:
 
 
 def _head(text: Text, rule: str) -> int:
-    """Return the width of the part of a declaration that is aligned with its neighbours; 0 without one."""
+    """Return the width of the first part of a declaration, which is aligned with its neighbours.
+
+    It is 0 for a declaration without such a part.
+    """
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
     elif rule in _OWN_COLUMN:
@@ -316,7 +322,7 @@ def _head(text: Text, rule: str) -> int:
 
 
 def _with_parentheses(item: Item, spans: Sequence[tuple[int, int]]) -> Item:
-    """Return the item with parentheses around the parts at these spans."""
+    """Return an item with parentheses around its parts at `spans`, (start, end) offsets in the text."""
     tokens = list(item.tokens)
     for start, end in spans:
         first = next(i for i, token in enumerate(tokens) if token.start >= start)
@@ -333,7 +339,7 @@ WIDTH = 100
 
 
 def format_text(source: Source) -> str:
-    """Return the formatted text, ending with a line break.
+    """Return the formatted text of a specification, ending with a line break.
 
     Symbols such as `□`, `≤`, `∧` are replaced by their spelling in the language.
 
@@ -349,7 +355,13 @@ def format_text(source: Source) -> str:
 
 
 def _read(source: Source) -> tuple[Source, ast.Spec]:
-    """Return a parsable text and its tree; findings refer to the given text."""
+    """Return a source text that parses, and its syntax tree.
+
+    If the given text does not parse, symbols such as `≤` are replaced first; errors refer to the given text.
+
+    Raises:
+        SpecError: neither text parses.
+    """
     try:
         return source, parse(source)
     except SpecError as error:

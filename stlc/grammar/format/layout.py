@@ -1,4 +1,7 @@
-"""Layout of documents in lines of limited width, and alignment of columns."""
+"""Breaking of formatted text into lines of limited width, and alignment of columns.
+
+A document is a sequence of layout elements: `Word`, `Blank`, `Line`, `Nest` and `Group`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ INDENT = 4
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Text without line breaks, with the comments on the lines before it and the one after it."""
+    """Text without line breaks, with the comments above it (`before`) and after it on its line (`after`)."""
 
     text: str
     before: tuple[Comment, ...] = ()
@@ -22,26 +25,26 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Blank:
-    """One blank, never at either end of a line."""
+    """Blank between two words; it is dropped at the start and the end of a line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Line break in a group that does not fit on one line; the text `flat` in one that does."""
+    """Possible line break: taken in a group that does not fit on one line, else replaced by `flat`."""
 
     flat: str = " "
 
 
 @dataclass(frozen=True, slots=True)
 class Nest:
-    """Parts whose new lines are indented by one more level."""
+    """Layout elements whose new lines are indented by one more level."""
 
     parts: tuple[Doc, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Parts that stand on one line if they fit."""
+    """Layout elements that stand on one line if they fit."""
 
     parts: tuple[Doc, ...]
 
@@ -56,7 +59,7 @@ _Entry: TypeAlias = tuple[int, bool, Doc]
 
 
 def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
-    """Return the lines of a document; only unbreakable parts exceed `width`."""
+    """Return the lines of a sequence of layout elements; only unbreakable parts exceed `width`."""
     page = _Page(indent)
     stack: list[_Entry] = [(indent, False, part) for part in reversed(parts)]
     while stack:
@@ -82,7 +85,7 @@ def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
 
 
 def is_plain(parts: Sequence[Doc]) -> bool:
-    """True if a document holds no comment."""
+    """True if no layout element has a comment."""
     stack = list(parts)
     while stack:
         doc = stack.pop()
@@ -94,7 +97,7 @@ def is_plain(parts: Sequence[Doc]) -> bool:
 
 
 def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
-    """True if a group, and what follows it up to the next line break, fits into `room` columns."""
+    """True if a group, and what follows it up to the next line break, fits into `room` characters."""
     inside: list[_Entry] = [(0, True, group)]
     behind = len(rest)
     while inside or behind:
@@ -116,7 +119,7 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """Return the width of a layout element on one line, in columns."""
+    """Return the width of a layout element on one line, in characters."""
     match doc:
         case Word(text, before, _):
             return 0 if before else len(text)
@@ -127,14 +130,14 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True if a line break must stand before or after this layout element."""
+    """True if a line break must stand before or after a layout element, as with a comment."""
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat
 
 
 class _Page:
-    """Lines under construction."""
+    """Lines of text under construction."""
 
     def __init__(self, indent: int) -> None:
         self.lines: list[str] = []
@@ -145,11 +148,11 @@ class _Page:
 
     @property
     def column(self) -> int:
-        """Column at which the current line ends."""
+        """Width of the current line, with the blank that follows it, in characters."""
         return (self.indent if not self.line else len(self.line)) + self.blank
 
     def write(self, word: Word, level: int) -> None:
-        """Append a word, on a new line after a comment."""
+        """Append a word; one with comments above it, or after a comment, begins a new line."""
         if word.before or self.commented:
             self.end_line(level)
         for comment in word.before:
@@ -163,7 +166,7 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """Begin a new line unless the current one is empty."""
+        """End the current line unless it is empty; the next one is indented by `level`."""
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -180,14 +183,14 @@ _COMMENT_SPREAD = 40
 
 @dataclass(frozen=True, slots=True)
 class AlignedColumn:
-    """Line with alignable columns.
+    """Line of formatted text, with the width by which it is aligned with its neighbours.
 
     Attributes:
-        text: without its comment.
-        kind: the rule of its declaration; "tag", "comment", or "part" of several lines.
-        head: width of its first part, shared among lines of one kind; 0 for none.
-        comment: at the end of the line.
-        apart: an empty line precedes it.
+        text: the line without its comment.
+        kind: grammar rule of its declaration; "tag"; "comment"; or "part" of a declaration of several lines.
+        head: width of its first part, made equal among adjacent lines of one kind; 0 without such a part.
+        comment: comment at the end of the line.
+        apart: whether an empty line precedes it.
     """
 
     text: str
@@ -198,7 +201,7 @@ class AlignedColumn:
 
 
 def align(lines: Sequence[AlignedColumn]) -> Iterator[str]:
-    """Yield the aligned lines as text, including empty lines."""
+    """Yield the text of each line, aligned with its neighbours, and the empty lines between them."""
     padded = _pad_heads(lines)
     for line, text in zip(padded, _with_comments(padded), strict=True):
         if line.apart:
@@ -207,7 +210,7 @@ def align(lines: Sequence[AlignedColumn]) -> Iterator[str]:
 
 
 def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
-    """Pad heads to equal width among adjacent declarations of one kind."""
+    """Return the lines with first parts of equal width among adjacent declarations of one kind."""
     result = list(lines)
     for group in _groups(lines, by_kind=True):
         heads = [i for i in group if lines[i].head]
@@ -220,7 +223,7 @@ def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
 
 
 def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
-    """Align the trailing comments of adjacent lines."""
+    """Return the text of each line, with the comments of adjacent lines in one column."""
     texts = [line.text for line in lines]
     for group in _groups(lines, by_kind=False):
         noted = [i for i in group if lines[i].comment]
@@ -232,7 +235,10 @@ def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
 
 
 def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[int]]:
-    """Yield groups of adjacent whole lines; tags belong to the declaration below them."""
+    """Yield the indices of adjacent lines that are aligned; a tag belongs to the declaration below it.
+
+    `by_kind`: a group has declarations of one kind only.
+    """
     group: list[int] = []
     kind = ""
     for index, line in enumerate(lines):
@@ -248,7 +254,7 @@ def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[i
 
 
 def _close(items: Iterable[int], widths: Sequence[int], spread: int) -> Iterator[list[int]]:
-    """Yield runs of items whose widths differ by at most `spread`."""
+    """Yield runs of consecutive items whose widths differ by at most `spread`."""
     part: list[int] = []
     within: list[int] = []
     for item, width in zip(items, widths, strict=True):

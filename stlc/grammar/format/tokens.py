@@ -1,6 +1,6 @@
-"""Tokens for the formatter: canonical spelling, matching brackets, blanks between them.
+"""Tokens for the formatter: canonical spelling, matching brackets, blanks between tokens.
 
-Unary plus and doubled parentheses are redundant and dropped, unless a comment is attached.
+A unary plus and doubled parentheses are redundant; they are dropped unless a comment is attached to them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _OPERAND = frozenset({"NAME", "NUMBER", "UNIT", "STRING", "TYPE_SIZE", "_TRUE", 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Tokens of an item in their printed form.
+    """Tokens of a declaration in their printed form.
 
     Attributes:
-        tokens: with canonical spelling.
-        partner: index of an opening bracket -> index of the closing one, and back.
-        roles: index of an opening bracket -> its role.
+        tokens: tokens with canonical spelling.
+        partner: index of the closing bracket by that of the opening one, and vice versa.
+        roles: role of each bracket, by the index of the opening one.
     """
 
     tokens: tuple[Token, ...]
@@ -40,19 +40,24 @@ class Text:
     roles: dict[int, Role]
 
     def ends_operand(self, index: int) -> bool:
-        """True if an operand ends with this token, so that a following `-` is binary and `(` a call."""
+        """True if an operand ends with the token at `index`.
+
+        A `-` after it is then a subtraction, and a `(` a call.
+        """
         token = self.tokens[index]
         if token.text in _CLOSING:
             return self.roles[self.partner[index]] != "interval"
         return token.kind in _OPERAND
 
     def is_sign(self, index: int) -> bool:
-        """True if this is a unary `-` or `+`."""
+        """True if the token at `index` is a unary `-` or `+`."""
         return self.tokens[index].kind in ("PLUS", "MINUS") and not (index and self.ends_operand(index - 1))
 
 
 def prepare(tokens: Sequence[Token]) -> Text:
-    """Normalise the tokens of an item without its tags: spelling, bracket pairs, no redundant tokens.
+    """Return the tokens of a declaration in their printed form; its tags are not included.
+
+    Spelling is normalised, brackets are paired, redundant tokens are dropped.
 
     Raises:
         SpecError: E005, brackets are nested too deeply.
@@ -66,7 +71,7 @@ def prepare(tokens: Sequence[Token]) -> Text:
 
 
 def spelling(kind: str, text: str) -> str:
-    """Return the canonical spelling of a token."""
+    """Return the canonical spelling of a token: `always` for `G`, `and` for `&&`."""
     if kind.startswith(("UNARY", "BINARY")):
         match = _WORD.match(text)
         assert match is not None
@@ -91,7 +96,7 @@ def gap(text: Text, index: int) -> str:
 
 
 def _hugs_right(text: Text, index: int) -> bool:
-    """True if no blank follows this token."""
+    """True if no blank follows the token at `index`."""
     token = text.tokens[index]
     if token.text in _OPENING:
         return text.roles[index] != "enum"
@@ -99,7 +104,7 @@ def _hugs_right(text: Text, index: int) -> bool:
 
 
 def _hugs_left(text: Text, index: int) -> bool:
-    """True if no blank precedes this token."""
+    """True if no blank precedes the token at `index`."""
     token = text.tokens[index]
     if token.text in _CLOSING:
         return text.roles[text.partner[index]] != "enum"
@@ -107,7 +112,7 @@ def _hugs_left(text: Text, index: int) -> bool:
 
 
 def _typed(text: Text, index: int) -> bool:
-    """True for the colon of a declared sort, `signal x : Sort`, which has a blank before it."""
+    """True if the colon at `index` precedes a type, as in `signal x : Type`; a blank precedes it."""
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
     return declared and not any(token.text == "=" for token in text.tokens[:index])
 
@@ -158,7 +163,10 @@ def _role(text: Text, index: int) -> Role:
 
 
 def _holds_interval(text: Text, opening: int) -> bool:
-    """True if the bracket is an interval: after a temporal operator, with a comma or closed by `]`."""
+    """True if the bracket at `opening` is an interval.
+
+    It follows a temporal operator, and contains a comma or is closed by `]`.
+    """
     closing = text.partner[opening]
     if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
         return False
@@ -166,7 +174,10 @@ def _holds_interval(text: Text, opening: int) -> bool:
 
 
 def level(text: Text, opening: int) -> list[int]:
-    """Return the indices of the tokens within a bracket, without those of inner brackets; see `behind`."""
+    """Return the indices of the tokens directly within a bracket, those of inner brackets left out.
+
+    As in `behind`, an inner bracket counts as one token, and so does a binder such as `forall i in …:`.
+    """
     found: list[int] = []
     index = opening + 1
     while index < text.partner[opening]:
@@ -176,7 +187,10 @@ def level(text: Text, opening: int) -> list[int]:
 
 
 def behind(text: Text, index: int) -> int:
-    """Return the index of the next token; a bracket, and a binder with its names, count as one."""
+    """Return the index of the next token after the one at `index`.
+
+    A bracket counts as one token, and so does a binder with its names, such as `forall i in …:`.
+    """
     if index in text.roles:
         return text.partner[index] + 1
     last = {"QUANTIFIER": "COLON", "_FREEZE": "_IN"}.get(text.tokens[index].kind, "")
@@ -187,7 +201,7 @@ def behind(text: Text, index: int) -> int:
 
 
 def _doubled(text: Text) -> set[int]:
-    """Return the indices of redundant parentheses: the outer of two directly nested pairs."""
+    """Return the indices of redundant parentheses: the outer pair of two directly nested ones."""
     found: set[int] = set()
     for opening, role in text.roles.items():
         inner = opening + 1
@@ -203,7 +217,7 @@ def _commented(token: Token) -> bool:
 
 
 def _without(text: Text, dropped: set[int]) -> Text:
-    """Return the text without dropped tokens; those with a comment are kept."""
+    """Return the tokens without those at `dropped`, except those with a comment."""
     kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
     return _paired(kept) if len(kept) < len(text.tokens) else text
 
@@ -217,7 +231,7 @@ def _check_depth(text: Text) -> None:
 
 
 def _with_commas(text: Text) -> Text:
-    """Return the text with intervals `[0:5]` written `[0, 5]`."""
+    """Return the tokens with intervals `[0:5]` written as `[0, 5]`."""
     tokens = list(text.tokens)
     for opening, role in text.roles.items():
         if role == "interval":

@@ -1,7 +1,8 @@
-"""Parse tree to AST, expressions: one function per rule of `stl.lark`.
+"""Conversion of parsed expressions to the syntax tree: one function per rule of `stl.lark`.
 
-A function takes the built children of its node: AST nodes, `TerminalToken`s, and None for an omitted optional
-part. Every rule needs a function. Errors in well-formed text, such as an unknown unit, are reported.
+A function takes the converted children of its parse-tree node: nodes of the syntax tree, `TerminalToken`s,
+and None for an omitted optional part. Every rule needs a function. Errors that the grammar does not exclude,
+such as an unknown unit, are reported.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _LETTERS = re.compile(r"[A-Za-z]+")
 
 @dataclass(frozen=True, slots=True)
 class TerminalToken:
-    """Token with its terminal, text and span."""
+    """Token of the text: the name of its terminal in the grammar, its text and its source location."""
 
     kind: str
     text: str
@@ -39,12 +40,12 @@ class TerminalToken:
 
 @dataclass(slots=True)
 class BuildContext:
-    """Context of a rule besides its children.
+    """Context in which the rules of one text are converted.
 
     Attributes:
         source: the whole text.
-        findings: errors in well-formed text (a number too large, an unknown unit).
-        documented: offset up to which `##` comments are already assigned.
+        findings: errors that the grammar does not exclude (a number too large, an unknown unit).
+        documented: offset up to which `##` comments are assigned to declarations.
     """
 
     source: Source
@@ -58,7 +59,10 @@ def name_of(leaf: TerminalToken) -> str:
 
 
 def own_name(context: BuildContext, leaf: TerminalToken) -> str:
-    """Return the declared name; `T`, `end` and `dt` need backticks."""
+    """Return the declared name in a NAME token.
+
+    E010 is reported for `T`, `end` and `dt`, which need backticks to be declared.
+    """
     if leaf.text in BUILT_IN:
         context.findings.append(
             Diagnostic(
@@ -73,7 +77,10 @@ def own_name(context: BuildContext, leaf: TerminalToken) -> str:
 
 
 def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
-    """Return the unit in a UNIT or UNIT_BRACKET token; "" without one."""
+    """Return the text of the unit in a UNIT or UNIT_BRACKET token; "" for None.
+
+    E101 is reported for an unknown unit.
+    """
     if leaf is None:
         return ""
     text = re.sub(r"\s+", "", leaf.text.strip("[]"))
@@ -102,14 +109,17 @@ def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
 
 
 def near_unit(word: str) -> str | None:
-    """Return the unit closest to an unknown unit `word`."""
+    """Return the unit with the spelling closest to an unknown unit `word`, or None."""
     if word in SYMBOLS or means_celsius(word):
         return None
     return UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
 
 
 def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:
-    """Return the exact value of a NUMBER token; 0 and E005 beyond double precision."""
+    """Return the exact value of a NUMBER token.
+
+    A number that exceeds the range of double precision is reported (E005), and its value is 0.
+    """
     match = _MANTISSA.fullmatch(leaf.text)
     assert match is not None
     digits, exponent = match[1].replace("_", ""), match[2] or "0"
@@ -132,12 +142,12 @@ BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
 def node(kind: Callable[..., Any]) -> BuildRule:
-    """Return the rule of a node whose fields are its children."""
+    """Return the conversion of a rule to a node of class `kind`, whose fields are its children."""
     return lambda _, span, children: kind(span, *children)
 
 
 def several(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the children."""
+    """Return the converted children as a tuple."""
     return tuple(children)
 
 
@@ -185,7 +195,7 @@ def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
 
 
 def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[str, ast.Interval | None, str]:
-    """Return the name of a temporal operator, its interval, and the alias by which it is written, if any."""
+    """Return the name of a temporal operator, its interval, and the alias used in the source, or ""."""
     match = _LETTERS.match(token.text)
     assert match is not None
     op = (UNARY_TEMPORAL | BINARY_TEMPORAL)[match[0]]

@@ -1,4 +1,7 @@
-"""Parse tree to AST, declarations and pragmas: one function per rule of `stl.lark`, as in `builder.py`."""
+"""Conversion of parsed declarations and pragmas to the syntax tree: one function per grammar rule.
+
+The rules are those of `stl.lark`; expressions are converted in `builder.py`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ _DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[^\S\n]*$", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True)
 class Pragma:
-    """`spec NAME`, `system "path"` or `time unit`."""
+    """Line about the whole file: `spec NAME`, `system "path"` or `time unit`."""
 
     kind: str
     value: str
@@ -83,16 +86,19 @@ def _formal(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.F
 def _heads(
     context: BuildContext, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
-    """Return the fields common to all declarations, for each name; `##` lines before the name document it."""
+    """Return the fields common to all declarations, for each declared name.
+
+    The `##` lines before the first name are its documentation.
+    """
     lines = _DOC.finditer(context.source.text, context.documented, names[0].span.start)
     shared = {"span": span, "tags": tags, "doc": "\n".join(match[1] for match in lines)}
     return [{**shared, "name": own_name(context, leaf), "name_span": leaf.span} for leaf in names]
 
 
 def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
-    """Return the rule of a declaration of one name, whose further children are the fields `parts`.
+    """Return the conversion of a declaration of one name, whose further children are the fields `parts`.
 
-    A child of the rule `sort` is the pair of fields `type` and `unit`.
+    A child of the grammar rule `sort` is the pair of the fields `type` and `unit`.
     """
 
     def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
@@ -190,7 +196,7 @@ DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
 
 
 def assemble(source: Source, items: Sequence[Item], findings: list[Diagnostic]) -> ast.Spec:
-    """Return the specification of these items; a repeated pragma is a finding."""
+    """Return the specification that consists of `items`; E102 is appended for a repeated pragma."""
     pragmas: dict[str, Pragma] = {}
     imports: list[ast.Import] = []
     declared: list[ast.Item] = []

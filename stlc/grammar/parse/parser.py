@@ -1,7 +1,7 @@
-"""Parser from text to AST. Only the modules of `stlc.grammar.parse` use Lark.
+"""Parser from text to syntax tree. Only the modules of `stlc.grammar.parse` use Lark.
 
 A text is split before each declaration and the pieces are parsed separately, so that one run reports all
-independent errors. Trees are folded bottom-up without recursion, so that no text exhausts the stack.
+independent errors. Parse trees are converted bottom-up without recursion, so that no text exhausts the stack.
 """
 
 from __future__ import annotations
@@ -63,7 +63,10 @@ def parse(source: Source) -> ast.Spec:
 def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
     """Return the syntax tree of the expression between two offsets of a text.
 
-    Spans point into the whole text. Raises SpecError.
+    Source locations refer to the whole text.
+
+    Raises:
+        SpecError: all syntax errors.
     """
     end = len(source.text) if end is None else end
     _check_size(source, start, end)
@@ -79,14 +82,14 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
 
 
 class _PieceError(Exception):
-    """Syntax errors of one piece."""
+    """Syntax error in one declaration or expression."""
 
     def __init__(self, finding: Diagnostic) -> None:
         self.finding = finding
 
 
 def _check_size(source: Source, start: int, end: int) -> None:
-    """Reject texts above the length limit, which would take minutes to parse."""
+    """Raise SpecError (E005) for a text above the length limits, which would take minutes to parse."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
@@ -104,7 +107,7 @@ def _build(piece: Piece, context: BuildContext) -> Any:
 
 
 def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Offset in the whole text at which parsing failed."""
+    """Return the offset in the whole text at which parsing failed."""
     token = getattr(error, "token", None)
     if token is not None and token.type == "$END":
         return piece.end
@@ -112,7 +115,7 @@ def _offset(error: UnexpectedInput, piece: Piece) -> int:
 
 
 def _fold(tree: Tree[Token], context: BuildContext, base: int) -> Any:
-    """Return the value of a tree, bottom-up, without recursion."""
+    """Return the syntax tree of a parse tree, converted bottom-up without recursion."""
     values: dict[int, Any] = {}
     depths: dict[int, int] = {}
     for node in tree.iter_subtrees():

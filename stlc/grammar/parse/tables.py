@@ -1,8 +1,8 @@
-"""Lark parser of `stl.lark`, built once per process, with tables cached on disk.
+"""Parser of `stl.lark` (by Lark), built once per process, with tables cached on disk.
 
 Building the LALR tables takes a tenth of a second, reading them a fifth of that. They are stored as JSON
 (never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar and on the
-versions of Lark and Python. A missing, damaged or read-only cache only costs that time.
+versions of Lark and Python. If the cache is missing, damaged or read-only, the tables are built anew.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def load_parser() -> lark.Lark:
 
 
 def grammar_text() -> str:
-    """Return the grammar with the vocabulary of the language inserted."""
+    """Return the text of `stl.lark` with the words of the language inserted."""
     text = (files("stlc.grammar") / "stl.lark").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: PATTERNS[match[1]], text)
 
 
 def build_parser(grammar: str) -> lark.Lark:
-    """Build a parser without the cache."""
+    """Return a new parser of a grammar, without using the cache."""
     return lark.Lark(
         grammar,
         parser="lalr",
@@ -58,7 +58,7 @@ def build_parser(grammar: str) -> lark.Lark:
 
 
 def cache_name(grammar: str) -> str:
-    """Return the cache name of the tables of this grammar."""
+    """Return the name under which the tables of a grammar are cached."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
     return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
 
@@ -80,17 +80,17 @@ def _read(text: bytes | None) -> lark.Lark | None:
 
 
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
-    """Restore the integer keys of the tables, which JSON stores as strings."""
+    """Return an object read from JSON with the integer keys that JSON stores as strings."""
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
 
 
 def acceptable(text: str, rule: str = "start", *, even_broken: bool = False) -> frozenset[str] | None:
-    """Return the terminals that may follow `text`; None if `text` itself does not parse.
+    """Return the names of the terminals that may follow `text`; None if `text` itself has an error.
 
     Args:
         text: the beginning of a declaration, or of an expression.
         rule: start rule of the grammar, `start` or `expr`.
-        even_broken: for a text that does not parse, return the terminals accepted at its first error.
+        even_broken: whether to return the terminals accepted at the first error, if there is one.
     """
     interactive = load_parser().parse_interactive(text, start=rule)
     try:
@@ -104,7 +104,7 @@ def acceptable(text: str, rule: str = "start", *, even_broken: bool = False) -> 
 
 
 def parses(text: str, rule: str) -> bool:
-    """True if the whole text matches the start rule."""
+    """True if the whole text matches the start rule `rule` of the grammar."""
     try:
         load_parser().parse(text, start=rule)
     except UnexpectedInput:

@@ -1,6 +1,7 @@
-"""Tokens of a well-formed text with their comments, which the syntax tree omits, for the formatter.
+"""Tokens of a specification with their comments, for the formatter; the syntax tree has no comments.
 
-The text is split as in `parser.parse` and read with the same tables, so tokens are those of the tree.
+The text is split as in `parser.parse` and parsed with the same tables, so the tokens are those of the syntax
+tree.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ _WITH_BLANKS = frozenset({"UNARY_AT", "BINARY_AT", "_NOT_IN"})
 
 @dataclass(frozen=True, slots=True)
 class Comment:
-    """Comment as written, without trailing blanks.
+    """Comment in the source, without trailing blanks.
 
     Attributes:
-        text: with its `#` or `//`.
-        own_line: only blanks precede it on its line.
-        apart: an empty line precedes it.
+        text: text with its `#` or `//`.
+        own_line: whether only blanks precede it on its line.
+        apart: whether an empty line precedes it.
     """
 
     text: str
@@ -38,16 +39,16 @@ class Comment:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """Token of the grammar with its comments.
+    """Token of the grammar with the comments around it.
 
     Attributes:
         kind: name of its terminal.
-        text: as written.
+        text: its text in the source.
         start: offset of its first character.
         end: offset after its last character.
-        before: comments between the previous token (or its trailing comment) and this one.
-        after: trailing comment on its line.
-        apart: an empty line precedes it (after its comments).
+        before: comments between this token and the previous one, without the previous one's `after`.
+        after: comment after it on the same line.
+        apart: whether an empty line precedes it (and follows its comments).
     """
 
     kind: str
@@ -61,7 +62,7 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Pragma, import or declaration, with its rule and tokens."""
+    """Pragma, import or declaration: its grammar rule and its tokens."""
 
     rule: str
     tokens: tuple[Token, ...]
@@ -69,7 +70,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class TokenLayout:
-    """Whole text: items in order, and the comments after the last one."""
+    """Tokens of a whole text: the items in order, and the comments after the last one (`rest`)."""
 
     items: tuple[Item, ...]
     rest: tuple[Comment, ...]
@@ -96,7 +97,7 @@ def tokenize(source: Source) -> TokenLayout:
 def _read_piece(
     source: Source, start: int, end: int, tokens: list[Token], places: list[tuple[str, int, int]]
 ) -> None:
-    """Append the tokens of a piece, and (rule, start, end) of each item in it."""
+    """Append the tokens of one part of the text, and (rule, start, end) of each item in it."""
     interactive = load_parser().parse_interactive(source.text[start:end], start="start")
     last: LarkToken | None = None
     try:
@@ -119,7 +120,10 @@ def _at(token: LarkToken) -> int:
 
 
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
-    """Yield the items with their tokens; comments of tokens between items (`;`) move to the next item."""
+    """Yield the items with their tokens.
+
+    Comments at tokens between items, such as `;`, move to the next item.
+    """
     index = 0
     for rule, start, end in places:
         carried: tuple[Comment, ...] = ()
@@ -137,7 +141,10 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 
 
 def _own(token: Token) -> tuple[Comment, ...]:
-    """Return the comments of a dropped token; a trailing one must not become documentation."""
+    """Return the comments of a dropped token, each on its own line.
+
+    A `##` comment at its end of line becomes a `#` comment, so that it does not document the next item.
+    """
     if token.after is None:
         return token.before
     text = f"# {token.after.text}" if token.after.text.startswith("##") else token.after.text
@@ -148,7 +155,7 @@ def _own(token: Token) -> tuple[Comment, ...]:
 
 
 def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
-    """Attach every comment to a token, in place; return the comments after the last token."""
+    """Attach every comment of the text to a token in `tokens`; return the comments after the last token."""
     previous, offset = -1, 0
     for index, token in enumerate(tokens):
         found, apart = _comments(text, offset, token.start, first=previous < 0)
@@ -161,14 +168,20 @@ def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
 
 
 def _inside(token: Token) -> tuple[Comment, ...]:
-    """Return the comments inside a token such as `always # … @` or `not # … in`, which move before it."""
+    """Return the comments inside a token, which are moved before it.
+
+    The tokens `always@` and `not in` may contain some: `always # … @`, `not # … in`.
+    """
     if token.kind not in _WITH_BLANKS:
         return ()
     return tuple(Comment(match[0].rstrip(), own_line=True) for match in _COMMENT.finditer(token.text))
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
-    """Attach a trailing comment to the token on its line; after a `;`, to the token before it."""
+    """Attach the first comment to the token at `index` if it ends the same line; return the others.
+
+    After a `;` it is attached to the token before the `;`.
+    """
     if not found or found[0].own_line or index < 0:
         return found
     owner = index

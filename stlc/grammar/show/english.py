@@ -41,9 +41,9 @@ class Meanings:
         self._letters = 0
 
     def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
-        """Return the names that a requirement uses, directly or indirectly, each with its meaning.
+        """Return (name, meaning) for each definition that a requirement uses, directly or indirectly.
 
-        If the definitions of a specification exceed `REPEATED` characters, each is given only once.
+        Once the texts of a specification exceed `REPEATED` characters, those already given are left out.
         """
         found: dict[str, str] = {}
         queue = deque(self._used(item.formula))
@@ -85,7 +85,7 @@ def say(expr: ast.Expr) -> str:
 
 
 def _inner(expr: ast.Expr) -> str:
-    """Return an expression within a sentence, connectives in parentheses."""
+    """Return an expression in words for use within a sentence; connectives get parentheses."""
     return f"({say(expr)})" if isinstance(expr, ast.Logic | ast.Until) else say(expr)
 
 
@@ -142,7 +142,7 @@ def _logic(expr: ast.Logic) -> str:
 
 
 def _side(expr: ast.Expr, op: str) -> str:
-    """Return an operand; one with the same connective needs no parentheses."""
+    """Return an operand of `op` in words, in parentheses if it is another connective."""
     return say(expr) if isinstance(expr, ast.Logic) and expr.op == op else _inner(expr)
 
 

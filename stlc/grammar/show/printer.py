@@ -1,7 +1,7 @@
-"""Printer from AST to canonical text with minimal parentheses. Invariant: `parse(show(a)) == a`.
+"""Printer from syntax tree to canonical text with minimal parentheses: `parse(show(a)) == a`.
 
-One blank around operators, none inside brackets; aliases (`G`, `&&`, `=>`) become the preferred spellings.
-User-defined names get backticks where they would be read as something else.
+There is one blank around operators and none inside brackets; aliases (`G`, `&&`, `=>`) become the preferred
+spellings. User-defined names get backticks where they would be read as something else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ _PLAIN_DIGITS = 16
 
 
 class Level(IntEnum):
-    """Precedence levels, loosest first; an operand needs at least the level of its place."""
+    """Precedence levels, loosest first.
+
+    An operand gets parentheses if its level is below the one that its place requires.
+    """
 
     IFF = 0
     IMPLIES = 1
@@ -54,7 +57,7 @@ def _level(expr: ast.Expr) -> Level:
 
 
 def show_at(expr: ast.Expr, least: Level) -> str:
-    """Return the expression, in parentheses if its precedence is below `least`."""
+    """Return the text of an expression, in parentheses if its precedence is below `least`."""
     text = show_expr(expr)
     return text if _level(expr) >= least else f"({text})"
 
@@ -70,7 +73,10 @@ def _quantity(expr: ast.Quantity) -> str:
 
 
 def _base(expr: ast.Expr) -> str:
-    """Return the operand before an index, a dot or an argument list; a number needs parentheses."""
+    """Return the text of what stands before an index, a dot or an argument list.
+
+    A number gets parentheses.
+    """
     return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
 
 
@@ -101,7 +107,11 @@ def _logic(expr: ast.Logic) -> str:
 
 
 def _temporal(expr: ast.Temporal | ast.Until) -> str:
-    """Return a temporal operator; a vector behind it gets parentheses, as `[a, b]` is an interval."""
+    """Return the text of a temporal operator with its operands.
+
+    Without an interval, an operand that begins with a vector gets parentheses, since `[a, b]` would be read
+    as the interval.
+    """
     interval = "" if expr.interval is None else show_interval(expr.interval)
     left = f"{show_at(expr.left, Level.PREFIX)} " if isinstance(expr, ast.Until) else ""
     body = show_at(expr.right if isinstance(expr, ast.Until) else expr.body, Level.PREFIX)
@@ -109,7 +119,7 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def show_interval(interval: ast.Interval) -> str:
-    """Return the text of an interval, with its `@`."""
+    """Return the text of an interval, with `@` if it counts from the start of the mission."""
     clock = "@" if interval.clock == "start" else ""
     opening, closing = "(" if interval.lo_open else "[", ")" if interval.hi_open else "]"
     return f"{clock}{opening}{show_expr(interval.lo)}, {show_expr(interval.hi)}{closing}"
@@ -134,18 +144,18 @@ def _if(expr: ast.IfThenElse) -> str:
 
 
 def show_args(args: tuple[ast.Arg, ...]) -> str:
-    """Return the arguments of a call, without parentheses."""
+    """Return the text of the arguments of a call, without the parentheses around them."""
     named = (f"{show_name(arg.name)} = " if arg.name is not None else "" for arg in args)
     return ", ".join(prefix + show_expr(arg.value) for prefix, arg in zip(named, args, strict=True))
 
 
 def show_set(literal: ast.SetLiteral) -> str:
-    """Return a set in braces."""
+    """Return the text of a set, in braces."""
     return f"{{{show_list(literal.items)}}}"
 
 
 def show_list(items: tuple[ast.Expr, ...]) -> str:
-    """Return expressions separated by commas."""
+    """Return the text of expressions, separated by commas."""
     return ", ".join(map(show_expr, items))
 
 
@@ -190,17 +200,20 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 
 def show_name(name: str) -> str:
-    """Return a name in an expression, where bare `T`, `end` and `dt` are built in."""
+    """Return a name as an expression uses it, in backticks if needed.
+
+    `T`, `end` and `dt` have none, as they refer to the built-in names.
+    """
     return f"`{name}`" if name in RESERVED or not _IDENTIFIER.fullmatch(name) else name
 
 
 def own_name(name: str) -> str:
-    """Return a name as its declaration writes it, quoted if it has to be."""
+    """Return a name as a declaration writes it, in backticks if needed; `T`, `end` and `dt` need them."""
     return f"`{name}`" if name in BUILT_IN else show_name(name)
 
 
 def _number(value: Fraction) -> str:
-    """Return the shortest decimal; a fraction without one is a quotient in parentheses."""
+    """Return the shortest decimal of a number, or `(numerator / denominator)` if there is no finite one."""
     twos, fives, rest = 0, 0, value.denominator
     while rest % 2 == 0:
         twos, rest = twos + 1, rest // 2
@@ -255,7 +268,7 @@ def _def(item: ast.Def) -> str:
 
 
 def _typed(item: ast.Signal | ast.Const | ast.Param) -> str:
-    """Return name, sort and unit of a declaration."""
+    """Return the text of the name, type and unit of a declaration."""
     sort = "" if item.type is None else f" : {_type(item.type)}"
     return f"{own_name(item.name)}{sort}" + (f" [{item.unit}]" if item.unit else "")
 
