@@ -1,9 +1,10 @@
-"""Bounds for a stream that may end with any sample, with the effect of an early end written into the formula.
+"""Bounds for a stream that may end with any sample: the effect of an early end is written into the formula.
 
-A window to the end of the trace has no end yet. `eventually` has its least value if the trace ends now,
-`always` if it continues; for the greatest values it is the other way round. `prefix_bound` adds to the
-formula a predicate that is true at every sample and unknown afterwards, so that values beyond the last sample
-do not count. The least and the greatest value are thus two formulas.
+A window to the end of the trace has no end yet while the trace grows. The least value of `eventually` is that
+of a trace that ends now, the least value of `always` that of a trace that continues; for the greatest values
+it is the other way round. `prefix_bound` adds to the formula a predicate that is true at every existing
+sample and unknown afterwards, so that values beyond the last sample do not count. The least and the greatest
+value therefore need two formulas.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ _UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
-    """The formula whose least (or greatest) value holds wherever the trace ends from the last sample on.
+    """The formula whose value is the lower or upper bound of `formula` wherever the trace ends.
 
     Args:
-        formula: to bound.
+        formula: the formula to bound.
         end: which bound.
-        cut: the end of the trace cuts bounded windows, too.
+        cut: whether the end of the trace clips bounded windows, too.
     """
     return _PrefixBound(end == "lower", cut).of(formula)
 
@@ -48,7 +49,7 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return the formula whose windows leave out instants that an early end of the trace removes."""
+        """Return the formula whose windows leave out the instants that an early end of the trace removes."""
         match formula:
             case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
@@ -67,7 +68,7 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """The body of a window, restricted to samples where an early end is its worst case."""
+        """The body of a window, restricted to existing samples if that is the worst case for the bound."""
         inner = self.of(body)
         return self._seen(inner, 0) if cut and some is self.least else inner
 
@@ -78,14 +79,14 @@ class _PrefixBound:
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """The formula where a sample `later` steps later exists; for the greatest value the dual."""
+        """The formula, false if the sample `later` steps later does not exist; for the upper bound, true."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
-    """Return the columns (samples, traces), with the column that marks existing samples."""
+    """Return the signals (samples, traces), with a column that is 1 at every existing sample."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 
@@ -95,7 +96,7 @@ def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
 def own_span(node: ir.Formula) -> Reach:
     """Return lookback and lookahead of an operator or predicate itself, without those of its operands.
 
-    Of an unbounded window only the lower bound counts.
+    An unbounded window counts with its lower bound only.
     """
     reads = [Reach(0, 0), *(farthest(num) for num in children(node) if not isinstance(num, ir.Formula))]
     past, future = (max(ends) for ends in zip(*reads, strict=True))
@@ -107,7 +108,7 @@ def own_span(node: ir.Formula) -> Reach:
 
 
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return the formula with windows to the end of the trace lengthened beyond all known values."""
+    """Return the formula with unbounded future windows replaced by windows longer than all known values."""
     length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
 
     def longer(node: ir.Formula) -> ir.Formula:

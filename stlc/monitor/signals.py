@@ -1,6 +1,6 @@
-"""Signals that requirements read: options for reading them from a file, and their columns for the evaluator.
+"""Signals that requirements read: options for reading them from a file, and their arrays for evaluation.
 
-A column is an array `(time, batch)`.
+The evaluator reads each signal as a column, an array `(time, batch)`.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class Need:
     """Signal that requirements read.
 
     Attributes:
-        column: as the specification declares it.
-        by: names of the requirements.
-        span: of its declaration.
-        parameter: it is a `param`, for which a value may be given instead.
+        column: name, unit and kind of the signal, as the specification declares them.
+        by: names of the requirements that read the signal.
+        span: source location of its declaration.
+        parameter: whether the signal is a `param`, for which a constant value may be given instead.
     """
 
     column: Column
@@ -63,10 +63,10 @@ class Need:
 
 
 def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[Need, ...]:
-    """Return the signals that `rules` read, in the order of the specification.
+    """Return the signals that the requirements `rules` read, in the order of the specification.
 
     Raises:
-        UsageError: E107, they call functions that are not loaded.
+        UsageError: E107, the requirements call functions that are not loaded.
     """
     _require_functions(compiled, rules)
     read = [(rule.name, columns_of(rule.formula)) for rule in rules]
@@ -96,17 +96,18 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
 
 
 def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
-    """Return the options for reading a file of the signals that `spec` declares.
+    """Return the options for reading a trace file of the signals that `spec` declares.
 
     Args:
-        spec: the specification; gives the kinds of the signals and the values of their words.
-        requested: names in the file, of signals or of their columns (`from "…"`), and the grid.
+        spec: the specification, which gives the kinds of the signals and the values of enum members.
+        requested: options of the user: names in the file, keyed by the name of a signal or of its column (the
+            text behind `from`), and the time grid.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}
 
     def column(name: str) -> str:
-        """The column of a signal, or of a component of one: `p[0]` of `p from "q"` is `q[0]`."""
+        """The column name of a signal or of one of its components: with `p from "q"`, `p[0]` is `q[0]`."""
         base, bracket, index = name.partition("[")
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
@@ -128,15 +129,15 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Columns laid out for the evaluator.
+    """Signals as arrays for the evaluator.
 
     Attributes:
-        env: name -> (time, batch).
-        shape: leading axes before the time axis: () for a single trace.
+        env: signal name -> array (time, batch).
+        shape: axes of the signals before the time axis: () for a single trace.
         samples: length of the time axis.
-        ops: the library of the arrays.
-        name: of the trace, for messages.
-        dt: time step in seconds, where the signals come with one.
+        ops: the array library.
+        name: name of the trace, for messages.
+        dt: time step in seconds; None if the signals come without one.
         t0: time of the first sample in seconds.
     """
 
@@ -155,31 +156,31 @@ class Signals:
 
     @property
     def gaps(self) -> dict[str, Gap]:
-        """Gaps of the columns with unknown samples; for NumPy arrays only."""
+        """Unknown samples (NaN) of each signal that has some, by name; empty for arrays not of NumPy."""
         if self.ops is not NUMPY:
             return {}
         found = {name: Gap().with_more(np.isnan(values)) for name, values in self.env.items()}
         return {name: gap for name, gap in found.items() if gap.samples}
 
     def like_given(self, values: Array) -> Array:
-        """Reshape (time, batch) to (…, time)."""
+        """Reshape values (time, batch) to the shape of the given signals, (…, time)."""
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
-        """Reshape (1, batch) to (…)."""
+        """Reshape values (1, batch) at one sample to the leading shape of the given signals, (…)."""
         flat = values.reshape(self.shape)
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
 
 def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False) -> Signals:
-    """Lay out the signals that are needed.
+    """Convert the signals that requirements need to arrays (time, batch).
 
-    NaN is an unknown value. NumPy arrays and lists become float64; torch tensors keep dtype, device
-    and gradients, or with `plain` become NumPy arrays too.
+    NaN is an unknown value. NumPy arrays and lists become float64; torch tensors keep dtype, device and
+    gradients, or with `plain` become NumPy arrays too.
 
     Raises:
-        TraceError: E601, a signal is missing; E604, one holds infinity (NumPy only);
-            E605, arrays or units do not fit together.
+        TraceError: E601, a signal is missing; E604, a signal contains infinity (NumPy only); E605, the shapes
+            of arrays or the units do not fit together.
     """
     trace = given if isinstance(given, Trace) else None
     name = UNNAMED if trace is None else trace.name
@@ -213,7 +214,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
 
 
 def _find(data: Given, name: str) -> Any:
-    """The array of a signal, or of a component `q[0]` of a vector `q`; None where there is none."""
+    """The array of a signal, or of a component `q[0]` of a vector `q`; None if there is none."""
     index = None
     if name not in data:
         match = _COMPONENT.fullmatch(name)
@@ -247,7 +248,7 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
 
 
 def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...], int]:
-    """Leading shape and number of samples; a single number stands for a constant signal."""
+    """Leading shape and number of samples of several arrays; a single number is a constant signal."""
     lengths = {key: int(values.shape[-1]) for key, values in arrays.items() if values.ndim}
     if not lengths:
         raise TraceError(Diagnostic("E605", f"{name}: no signal has a time axis"))
@@ -290,7 +291,7 @@ def _torch_columns(
 
 
 def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Numbers in the units that the specification declares, where both units are known."""
+    """Convert signals to the units that the specification declares; unchanged if either unit is unknown."""
     converted = dict(columns)
     findings: list[Diagnostic] = []
     for need in needs:
@@ -317,16 +318,16 @@ class Conversion:
     shift: float
 
     def __call__(self, values: Any) -> Any:
-        """The same values in the other unit."""
+        """Return `values` converted."""
         scaled = values if self.factor == 1.0 else values * self.factor
         return scaled + self.shift if self.shift else scaled
 
 
 def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
-    """Conversion of recorded numbers to the unit of a column; None where equal, or one unit is unknown.
+    """Conversion of recorded numbers to a signal's unit; None if the units are equal or one is unknown.
 
     Raises:
-        TraceError: E605, the quantities differ.
+        TraceError: E605, the units measure different quantities.
     """
     wanted = column.unit
     if not wanted.text or not recorded.text:
@@ -359,7 +360,7 @@ def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:
 
 
 def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
-    """E604 for an infinite value."""
+    """Finding E604: an infinite value."""
     return Diagnostic(
         "E604",
         f"{signal} is {value} at {where}",
@@ -373,9 +374,9 @@ class Gap:
     """Unknown samples of a signal.
 
     Attributes:
-        samples: how many, over all traces.
-        first: the first of them.
-        last: the last one.
+        samples: number of unknown samples, over all traces.
+        first: number of the first unknown sample.
+        last: number of the last unknown sample.
     """
 
     samples: int = 0
@@ -383,7 +384,10 @@ class Gap:
     last: int = 0
 
     def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
-        """The gap extended by unknown samples, (samples,) or (samples, traces), from sample `offset` on."""
+        """Return the gap with the True samples of `unknown`, (samples,) or (samples, traces), added.
+
+        `offset` is the sample number of the first row of `unknown`.
+        """
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):
             return self

@@ -1,4 +1,4 @@
-"""Values of one requirement on a record, at the instants at which it is evaluated."""
+"""Robustness of a formula on a trace, at the instants at which a requirement is evaluated."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Columns `(samples, batch)` and their array library.
+    """Signals of traces, `(samples, batch)`, and their array library.
 
     Attributes:
-        env: name -> values, none of them NaN.
+        env: signal name -> values, none of them NaN.
         ops: the array library.
-        semantics: of min and max.
-        holes: signals with unknown values (`stlc.monitor.holes`).
+        semantics: definition of minimum and maximum.
+        holes: names of the signals with unknown values (`stlc.monitor.holes`).
     """
 
     env: Mapping[str, Array]
@@ -44,28 +44,28 @@ class Record:
 
     @staticmethod
     def of(env: Mapping[str, Array], ops: Ops) -> Record:
-        """A record of columns in which NaN is an unknown value; for NumPy arrays only."""
+        """Return a record of signals in which NaN is an unknown value; for NumPy arrays only."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
         return Record(without_holes(env, holes) if holes else env, ops, holes=holes)
 
     @property
     def sure(self) -> Record:
-        """The record without `holes`, for formulas that treat unknown values themselves."""
+        """The record without `holes`, for formulas in which unknown values are already accounted for."""
         return replace(self, holes=frozenset()) if self.holes else self
 
     @property
     def samples(self) -> int:
-        """Length of the record."""
+        """Number of samples."""
         return len(next(iter(self.env.values())))
 
     def cut(self, stop: int) -> Record:
-        """The first `stop` samples."""
+        """Return the record cut off after the first `stop` samples."""
         return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
 
     def values(
         self, formulas: Sequence[ir.Formula], instants: range, end: Boundary, stop: int | None = None
     ) -> list[Array]:
-        """Values `(instants, batch)` of each formula at consecutive instants; `stop` as in `evaluate`."""
+        """Values `(instants, batch)` of each formula at consecutive instants; for `stop` see `evaluate`."""
         return evaluate(
             formulas,
             self.env,
@@ -83,8 +83,8 @@ def bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values at consecutive instants, each `(count, batch)`.
 
-    Where nothing is unknown, both are one and the same array. `stop` is the final number of samples,
-    where it exceeds the known ones.
+    If nothing is unknown, both are one and the same array. `stop` is the number of samples that the trace
+    will have in the end, if that is more than the known ones.
     """
     if record.holes:
         least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
@@ -108,11 +108,11 @@ def bounds(
 def window_bounds(
     formula: ir.Formula, record: Record, starts: range, window: int, ends: Ends
 ) -> tuple[Array, Array]:
-    """`bounds` where `end` is `window` samples after each instant: `(count, batch)`.
+    """Least and greatest values if `end` is `window` samples after each instant, each `(count, batch)`.
 
-    Every instant has its own record, from the lookback of the past operators to its own end. Many records are
-    evaluated at once, as columns. Where a record ends before its window, the rest is unknown; where
-    windows are cut, its last sample is the end.
+    Every instant is evaluated on its own piece of the trace, from the lookback of the past operators to its
+    own `end`; many pieces are evaluated at once, as the batch. If the trace ends before the `end` of an
+    instant, the missing samples are unknown, or with `ends` "truncate" the last sample is the end.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
@@ -129,7 +129,7 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Yield records and their numbers of instants; each column holds the samples around one instant."""
+    """Yield records whose batch holds the samples around several instants, and the number of instants."""
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]
@@ -147,9 +147,9 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
 
 
 def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
-    """The formula with predicates that read other columns assumed true: its upper bound.
+    """An upper bound of the formula: predicates that read signals not in `names` are assumed true.
 
-    Names that `freeze` binds to missing columns count as missing, too.
+    Names that `freeze` binds to missing signals count as missing, too.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -163,7 +163,7 @@ def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formu
 
 
 def _read(num: ir.Num) -> set[str]:
-    """The columns that a number reads, and the names that are frozen in it."""
+    """Names of the signals and of the frozen variables that an expression reads."""
     return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
@@ -171,7 +171,7 @@ def _read(num: ir.Num) -> set[str]:
 
 
 def by_truth(formula: ir.Formula) -> ir.Formula:
-    """The formula with the truth values of its predicates: +inf (true) and -inf (false).
+    """The formula with each predicate's margin replaced by its truth value: +inf (true) or -inf (false).
 
     `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
     """

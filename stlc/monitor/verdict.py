@@ -49,21 +49,22 @@ _SUFFIXES = (".stl", ".stlc")
 
 
 class Monitor:
-    """Exact monitor of recorded signals, per requirement; uses torch only for torch tensors.
+    """Exact monitor of recorded signals; evaluates each requirement. Torch is used only for torch tensors.
 
     Args:
         spec: a specification, its text, or the path of its file.
-        dt: time step of the signals in seconds; by default that of the trace, or of the system.
-        horizon: value of `T`, in seconds; by default that of the trace, or of the system.
-        system: path or name of a system file; the specification is then checked against it. By default
-            the system that the specification names gives a missing `dt` or `T`.
-        overrides: constant -> its value, as text.
+        dt: time step of the signals in seconds; default: that of the trace, or of the system.
+        horizon: value of `T` in seconds; default: that of the trace, or of the system.
+        system: path or name of a system file; the specification is then checked against it. Without it, the
+            system that the specification names supplies a missing `dt` or `T`.
+        overrides: name of a constant -> its value, as text.
 
-    Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is (…, time, k) or one
-    signal per component, `q[0]`. Results are float64 for NumPy; for torch, dtype, device and gradients stay.
+    Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is one array (…, time,
+    k) or one signal per component, `q[0]`. Results for NumPy are float64; for torch, dtype, device and
+    gradients are kept.
 
     Raises:
-        SpecError: the specification is invalid; E311 where `dt` or `T` is needed and unknown.
+        SpecError: the specification is invalid; E311, `dt` or `T` is needed and unknown.
     """
 
     def __init__(
@@ -114,21 +115,23 @@ class Monitor:
         require: Sequence[str] = (),
         semantics: str | Semantics = "exact",
     ) -> Verdict:
-        """Evaluate every requirement at its instants (`stlc.monitor.instants`).
+        """Evaluate every requirement at the instants that it prescribes (`stlc.monitor.instants`).
 
         Args:
-            signals: by name, or a trace, or the path of one.
-            at: a sample index, or "all" for every possible start; None takes each requirement's own instants.
-            end: where a trace is too short: "open" takes bounds over all its continuations and may be
-                inconclusive, "strict" refuses, "truncate" cuts windows.
-            tolerance: a robustness of at least minus this is satisfied; 0 tells `<` from `<=`.
-            require: names of the requirements to evaluate; none means all.
-            semantics: of the reported robustness, or its name; verdicts and reasons are always exact.
+            signals: signals by name, or a trace, or the path of a trace file.
+            at: a sample number, or "all" for every sample with a complete window; None: each requirement's
+                own instants.
+            end: treatment of a trace that is too short: "open" takes bounds over all its continuations and
+                may be inconclusive, "strict" raises an error, "truncate" clips the windows.
+            tolerance: robustness values down to minus this count as satisfied; 0 distinguishes `<` from `<=`.
+            require: names of the requirements to evaluate; empty: all.
+            semantics: semantics of the reported robustness, or its name; verdicts and causes are always
+                exact.
 
         Raises:
-            TraceError: signals are missing (E601), not finite (E604), or do not fit (E605); with `end`
-                "strict" the trace is too short (E306).
-            UsageError: U101, an unknown requirement or semantics, or no such sample.
+            TraceError: signals are missing (E601), infinite (E604), or do not fit together (E605); with `end`
+                "strict", the trace is too short (E306).
+            UsageError: U101, an unknown requirement or semantics, or a sample number beyond the trace.
         """
         reported = semantics_of(semantics)
         ready = self._prepare(signals, require, plain=True)
@@ -157,17 +160,17 @@ class Monitor:
         smoothing: float | None = None,
         semantics: str | Semantics = "exact",
     ) -> Array:
-        """Robustness of the specification: the least `weight * robustness / scale` over the requirements.
+        """Robustness of the specification: the least `weight * robustness / scale` of all requirements.
 
         Args:
             signals: as in `check`; (time,) or (…, time).
-            end: "strict" leaves NaN where a window is incomplete, "truncate" cuts windows.
-            at: at this sample only.
-            smoothing: scale k of log-sum-exp; selects that semantics by itself.
-            semantics: of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
+            end: "strict" gives NaN where a window is incomplete, "truncate" clips windows.
+            at: sample at which to evaluate; None: at every sample.
+            smoothing: scale k of log-sum-exp; giving it selects the log-sum-exp semantics.
+            semantics: definition of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
         Returns:
-            The shape of the signals, or with `at` that shape without the time axis.
+            An array of the shape of the signals; with `at`, of that shape without the time axis.
         """
         return _least(self._prepare(signals, ()).under(semantics_of(semantics, smoothing)), end, at)
 
@@ -179,7 +182,7 @@ class Monitor:
         at: int | None = None,
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
-        """Robustness of each requirement, before weight and scale; arguments as in `robustness`."""
+        """Robustness of each requirement by name, without weight and scale; arguments as in `robustness`."""
         ready = self._prepare(signals, ()).under(semantics_of(semantics))
         shaped = ready.signals.like_given if at is None else ready.signals.at_one
         rows = _rows(ready, end, at)
@@ -201,16 +204,16 @@ class Monitor:
         like: Trace | None = None,
         dt: Seconds | None = None,
     ) -> Online:
-        """Return a monitor for samples one by one: verdicts as soon as they are decided, bounds before.
+        """Return a monitor that takes samples one by one and gives bounds at once, verdicts once decided.
 
         Args:
-            how: instants, treatment of the end of the stream, and tolerance.
-            require: names of the requirements to evaluate; none means all.
+            how: where to evaluate, treatment of the end of the stream, and tolerance.
+            require: names of the requirements to evaluate; empty: all.
             like: a trace, or the first piece of one, that gives `dt` and `T`.
-            dt: time step in seconds, where neither a trace nor this monitor gives it.
+            dt: time step in seconds, if neither `like` nor this monitor gives it.
 
         Raises:
-            UsageError: U101, an unknown requirement, or none at all.
+            UsageError: U101, an unknown requirement, or a specification without requirements.
         """
         from stlc.monitor.online.online import Online
 
@@ -237,7 +240,11 @@ class Monitor:
         return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
-        """Compile for the times of the arguments, the trace, the given system, or else the named one."""
+        """Compile for the time step and horizon of the arguments, the trace, or the system, in that order.
+
+        The horizon of the trace comes last. If one is still unknown, the system that the specification names
+        gives it.
+        """
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)
         known = Times(step.dt, whole.horizon, step.trace)
@@ -252,12 +259,12 @@ class Monitor:
             raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
 
     def _lacks(self, times: Times) -> bool:
-        """True if the specification needs a time step or horizon that is unknown."""
+        """True if the specification needs a time step or horizon that is unknown in `times`."""
         grid, spec = times.grid(), self._resolved
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """E311, noting that the file of the system that the specification names does not exist."""
+        """The finding; an E311 gets a note that the system file named by the specification does not exist."""
         if finding.code != "E311" or self.spec.system is None:
             return finding
         return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
@@ -270,7 +277,7 @@ class Monitor:
 
 
 def _source(spec: str | Path) -> Source:
-    """The source at a path, or the text itself where it does not look like a path."""
+    """The source file at a path, or the text itself if `spec` does not look like a path."""
     if isinstance(spec, Path) or (spec.endswith(_SUFFIXES) and "\n" not in spec):
         return read_source(spec)
     return Source("<text>", spec)
@@ -285,7 +292,7 @@ def _chosen(rules: Sequence[CompiledRequirement], names: Sequence[str]) -> tuple
 
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
-    """Values of every requirement, (samples, batch), or (1, batch) at one sample."""
+    """Robustness of every requirement, (samples, batch), or (1, batch) at the one sample `at`."""
     if at is None:
         return [rule_signal(rule, ready.record, ready.horizon, end) for rule in ready.rules]
     return rules_at(ready.rules, ready.record, at, ready.horizon, end)
@@ -326,7 +333,8 @@ def _judge(
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
     """The judgement with its robustness in the semantics of `ready`.
 
-    Where something is unknown, a semantics whose extrema are means keeps only the sign of the exact bounds.
+    If a value is only bounded and the semantics averages (its extrema are means), only the sign of the exact
+    bounds is kept.
     """
     starts = range(judgement.start, judgement.start + judgement.instants)
     ends: Ends = "truncate" if end == "truncate" else "open"

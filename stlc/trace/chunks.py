@@ -22,7 +22,7 @@ LARGE = 1_500_000_000
 
 
 def size_of(path: Path) -> int:
-    """Return the approximate bytes of a file's numbers in memory; 0 for a format that is not read in chunks.
+    """Return the approximate size in memory of a file's numbers in bytes; 0 if it cannot be read in chunks.
 
     Raises:
         StlcError: the file cannot be opened, or is damaged.
@@ -33,7 +33,7 @@ def size_of(path: Path) -> int:
 
 
 def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
-    """Yield the trace of a file in chunks of `samples` samples, with continuing times.
+    """Yield the trace of a file in chunks of `samples` samples, whose times continue from chunk to chunk.
 
     Raises:
         TraceError: as `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its format
@@ -66,7 +66,7 @@ def _single(trace: Trace) -> Trace:
 
 
 def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
-    """The first date of a clock that is written as dates; None for other clocks."""
+    """The first date of a time column that holds dates; None if it holds numbers or there is none."""
     clock = reading.names.get(CLOCK)
     (group,) = (recording if clock is None else recording.clocked_by(clock)).groups
     if group.clock is None or group.clock.dtype.kind != "U":
@@ -76,14 +76,14 @@ def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
 
 
 class _Clock:
-    """The clock of consecutive chunks."""
+    """Time grid shared by consecutive chunks of a trace."""
 
     def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
         self.begin = begin
 
     def next(self, recording: Recording, reading: Reading) -> Trace:
-        """The next chunk, on the grid of those before it."""
+        """Return the next chunk as a trace whose times continue those of the previous chunks."""
         names = dict(reading.names)
         renamed = names.pop(CLOCK, None)
         recording = recording if renamed is None else recording.clocked_by(renamed)
@@ -98,7 +98,7 @@ class _Clock:
         return replace(trace, t0=start)
 
     def _seconds(self, group: ClockGroup) -> NDArray[np.float64]:
-        """The times of a chunk in seconds; dates are relative to the first of the file."""
+        """The times of a chunk in seconds; dates are relative to the first one of the file."""
         assert group.clock is not None
         if group.clock.dtype.kind not in "Uc":
             return group.clock.astype(np.float64)
@@ -107,7 +107,7 @@ class _Clock:
         return np.asarray((instants - begin) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
     def _check(self, times: NDArray[np.float64]) -> None:
-        """Check that every sample is on the grid; small rounding errors may accumulate."""
+        """Check that every time is on the grid, up to rounding. Raises TraceError (E602)."""
         wanted = self.t0 + self.dt * (self.samples + np.arange(len(times)))
         off = np.abs(times - wanted)
         bad = ~(off <= TOLERANCE * self.dt + 1e-9 * np.abs(wanted))

@@ -1,6 +1,6 @@
 """Conversion of words in a trace to numbers: members of enums, and truth values.
 
-Words and complex numbers that cannot be converted are set aside, and refused where a signal needs them.
+Words and complex numbers that cannot be converted are kept as extras, and refused if a signal needs them.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ TRUTH: Words = {
 
 
 def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
-    """Return the recording with words converted to numbers.
+    """Return the content of a trace file with words converted to numbers.
 
     Args:
-        recording: its arrays may be texts.
-        words: name in the file -> number of each word; empty for a signal of numbers. Signals of words that
-            are not in this mapping are moved to the extras.
+        recording: content of the trace file; its arrays may be texts.
+        words: signal name in the file -> number of each word; empty for a numeric signal. Signals of words
+            that are not in this mapping are moved to the extras (arrays that are never evaluated).
 
     Raises:
-        TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does
-            not have.
+        TraceError: E603, words or complex numbers where numbers are needed, or a word that is not a value of
+            the signal.
     """
     groups: list[ClockGroup] = []
     extras = dict(recording.extras)
@@ -53,11 +53,7 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
 
 def wordless(recording: Recording) -> Recording:
-    """Return the recording with signals of words moved to the extras.
-
-    Raises:
-        TraceError: E603, all signals are words.
-    """
+    """Return the content of a trace file with signals of words moved to the extras, arrays not evaluated."""
     signals = [values for group in recording.groups for values in group.arrays.values()]
     none_left = all(map(_is_odd, signals))
     return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})
@@ -75,7 +71,7 @@ def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
 
 
 def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
-    """The dates and times (ISO 8601) of a clock. Raises TraceError (E603) for other words."""
+    """Dates and times (ISO 8601) of a time column, parsed. Raises TraceError (E603) for other words."""
     assert group.clock is not None
     _refuse_complex(trace, group.named, group.clock)
     written = np.char.rstrip(group.clock, "Zz")
@@ -89,7 +85,7 @@ def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
 
 
 def instant_of_word(word: str) -> np.datetime64 | None:
-    """A date and time (ISO 8601); None for another word."""
+    """Parse a date and time (ISO 8601); None if the word is not one."""
     try:
         return np.datetime64(word.rstrip("Zz"), "ns")
     except ValueError:
@@ -97,7 +93,7 @@ def instant_of_word(word: str) -> np.datetime64 | None:
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
-    """The number of a word. Raises TraceError (E603) for an unknown word."""
+    """The number of a word of a signal. Raises TraceError (E603) for a word that the signal does not have."""
     worth = _worth(word, words)
     if worth is None:
         raise TraceError(_unknown(trace, name, word, words))
@@ -105,7 +101,7 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
 
 
 def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Dates and times as seconds since the first."""
+    """Dates and times of a time column, in seconds since the first one."""
     instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
@@ -122,7 +118,7 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """The number of a member, also where its case differs and no other member matches; NaN for no word."""
+    """Number of a word, matched without case if that is unambiguous; NaN if empty, None if unmatched."""
     if word in words:
         return words[word]
     if not word and words:

@@ -1,6 +1,6 @@
-"""Samples that arrive line by line, as a table with a header or as JSON, on one time grid.
+"""Samples that arrive line by line, as a table with a header or as JSON, converted to one time grid.
 
-Lines are interpreted as in a file (`stlc.trace.formats.csv`): names, units, words, clocks.
+Lines are interpreted as in a file (`stlc.trace.formats.csv`): names, units, words, times.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class TimedSample:
-    """A sample with its time in seconds; None where the stream gives no times."""
+    """A sample with its time in seconds; the time is None if the stream contains no times."""
 
     time: float | None
     sample: Sample
@@ -56,9 +56,9 @@ class SampleStream:
     """A stream of lines, parsed into samples.
 
     Attributes:
-        name: of the stream, for messages.
-        reading: names of the signals in the stream, values of their words, and the clock.
-        units: signal -> unit in the header, "" where it has none; known with the first sample.
+        name: name of the stream, for messages.
+        reading: names of the signals and of the time in the stream, and numbers of the words of signals.
+        units: signal -> unit in the header, "" if there is none; known from the first sample on.
     """
 
     name: str
@@ -72,11 +72,11 @@ class SampleStream:
     _signals: dict[str, str] = field(default_factory=dict)
 
     def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
-        """Yield the samples of the lines; empty lines are skipped.
+        """Yield one sample per line; empty lines are skipped.
 
         Raises:
-            TraceError: E601, a signal or clock that was named is missing; E603, a line that is not a sample,
-                or a word without a value; E605, a header or line that does not fit.
+            TraceError: E601, a requested signal or time column is missing; E603, a line is not a sample, or a
+                word is not a value of its signal; E605, an invalid header or a wrong number of cells.
         """
         is_json: bool | None = None
         for number, raw in enumerate(lines, 1):
@@ -106,7 +106,7 @@ class SampleStream:
     # ------------------------------------------------------------------------ names
 
     def _named(self, there: Iterable[str]) -> None:
-        """Determine the clock and the signals from the names in the stream."""
+        """Determine which name in the stream is the time, and which names are signals."""
         known = list(there)
         names = dict(self.reading.names)
         self._clock = names.pop(CLOCK, None) or clock_among(known)
@@ -185,7 +185,7 @@ class SampleStream:
         raise self._bad(number, f"has {shown}")
 
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """The number of a cell; None for words of a signal that is not needed."""
+        """Number of a value in a line; None for a word of a signal that is not needed."""
         if value is None:
             return math.nan
         found = _plain(value)
@@ -200,13 +200,13 @@ class SampleStream:
 
 
 def _with_point(cell: str) -> str:
-    """A number with a decimal comma, rewritten with a point."""
+    """A cell with its decimal comma replaced by a point, if that makes it a number."""
     changed = cell.replace(",", ".")
     return changed if value_of(cell) is None and value_of(changed) is not None else cell
 
 
 def _plain(value: object) -> float | None:
-    """The number of a JSON value or of the text of a cell; None where it is not a number."""
+    """Number of a JSON value or of the text of a cell; None if it is not a number."""
     if isinstance(value, str):
         return value_of(value)
     if isinstance(value, int):
@@ -219,12 +219,12 @@ def _plain(value: object) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """Samples on one grid.
+    """Samples on a uniform time grid.
 
     Attributes:
-        t0: time of the first one, in seconds.
-        dt: time between two of them; None where unknown.
-        samples: iterator over them; it raises TraceError for input that does not fit.
+        t0: time of the first sample in seconds.
+        dt: time step in seconds; None if unknown.
+        samples: iterator over the samples; it raises TraceError for invalid input.
     """
 
     t0: float
@@ -233,14 +233,14 @@ class Uniform:
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
-    """Return samples on the grid that `stlc.trace.trace.trace_of` would use, each as soon as it is known.
+    """Return samples on the grid that `stlc.trace.trace.trace_of` would use, each one as soon as it is known.
 
-    Without a new grid the times have to be uniform. On a new grid (`reading.resample` or `reading.max_gap`) a
-    sample is known when every signal has a later value, or had none for the longest gap.
+    Without resampling the times must be uniform. With resampling (`reading.resample` or `reading.max_gap`) a
+    sample is known once every signal has a later value, or has had none for the longest gap allowed.
 
     Raises:
-        TraceError: E601, the times of the samples are unknown; E602, times that are not uniform, or that
-            decrease; E605, there are no samples.
+        TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;
+            E605, there are no samples.
     """
     first = next(moments, None)
     if first is None:
@@ -302,7 +302,7 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
 
 @dataclass(slots=True)
 class _Track:
-    """The samples of a signal that later interpolation may need."""
+    """Samples of one signal that later interpolation may still need."""
 
     held: bool
     times: list[float] = field(default_factory=list)
@@ -314,31 +314,31 @@ class _Track:
             self.values.append(value)
 
     def forget(self, before: float) -> None:
-        """Drop the samples that precede the last sample before an instant."""
+        """Drop samples that interpolation at time `before` or later does not need."""
         there = int(np.searchsorted(self.times, before, side="right")) - 1
         if there > 0:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """The values on a grid; no sample follows the last one until `end`."""
+        """Values on a time grid; the last sample is known to have no successor before time `end`."""
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
-        """The instant before which values are final."""
+        """Time before which interpolated values can no longer change."""
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
 
 
 @dataclass(slots=True)
 class Gridded:
-    """Samples of any times, resampled to a grid as they arrive.
+    """Samples at arbitrary times, resampled to a uniform grid as they arrive.
 
     Attributes:
-        name: of the stream, for messages.
-        reading: the grid, and which signals are discrete.
-        t0: of the first sample, in seconds.
-        dt: of the grid, known with its first sample.
+        name: name of the stream, for messages.
+        reading: the requested grid, and the kinds of the signals.
+        t0: time of the first sample in seconds.
+        dt: time step of the grid in seconds; known from the first sample of the grid on.
     """
 
     name: str
@@ -352,7 +352,7 @@ class Gridded:
     _last: float = -math.inf
 
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
-        """The samples on the grid, one by one; the first one comes when the step is known."""
+        """Yield the samples on the grid one by one; the first one follows once the time step is known."""
         waiting: list[float] = []
         for moment in chain([first], rest):
             now = self._take(moment)
@@ -368,7 +368,7 @@ class Gridded:
 
     @property
     def _has_to_wait(self) -> bool:
-        """True if the first samples are needed to estimate the usual step."""
+        """True if the usual time step must be estimated from the first samples."""
         return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
 
     def _take(self, moment: TimedSample) -> float:
@@ -400,7 +400,7 @@ class Gridded:
         self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
 
     def _ready(self, now: float) -> Iterator[Sample]:
-        """The samples of the grid that a new sample completes."""
+        """Yield the samples of the grid that become known with a sample at time `now`."""
         assert self._spacing is not None
         until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
         stop = min(until, default=now)
@@ -409,7 +409,7 @@ class Gridded:
         yield from self._upto(lambda grid: grid + self._slack < stop, (stop - self.t0) / self.dt + 1, now)
 
     def _rest(self) -> Iterator[Sample]:
-        """The samples of the grid that are left at the end of the stream."""
+        """Yield the remaining samples of the grid at the end of the stream."""
         count = math.floor((self._last - self.t0) / self.dt + self._slack / self.dt) + 1
         yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
 
@@ -420,7 +420,7 @@ class Gridded:
     def _upto(
         self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
     ) -> Iterator[Sample]:
-        """The instants of the grid before number `most`, as long as they are known."""
+        """Yield the next samples of the grid, up to number `most`, while `known` is True for their times."""
         assert self._spacing is not None
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"

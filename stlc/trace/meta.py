@@ -31,9 +31,9 @@ class Carried:
     """A specification that is stored in a trace.
 
     Attributes:
-        name: its name, where known.
-        path: its path.
-        text: its whole text; "" where the trace has none.
+        name: name of the specification; "" if unknown.
+        path: path of its file.
+        text: its whole text; "" if the trace does not contain it.
         library: texts of the files that it imports, by key.
         overrides: constants that were overridden, with their values as texts.
     """
@@ -47,28 +47,29 @@ class Carried:
 
 @dataclass(frozen=True, slots=True)
 class TraceMeta:
-    """Metadata of a recording; every field may be unknown ("" or None).
+    """Metadata of a trace; every field may be unknown ("" or None).
 
     Attributes:
         spec_name: name of the specification.
-        spec_path: its path as the user gave it.
-        spec_text: its whole text, so that `stlc check` needs no other file.
+        spec_path: path of the specification as the user gave it.
+        spec_text: whole text of the specification, so that `stlc check` needs no other file.
         spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
         spec_set: constants that were overridden, with their values as texts.
-        spec_hash: SHA-256 of those texts, hexadecimal.
-        judge_path: path of the specification that closed-loop runs are evaluated by; likewise `judge_text`,
-            `judge_library` and `judge_set`. Without a text the recording is evaluated by `spec_text`.
+        spec_hash: SHA-256 of these texts, hexadecimal.
+        judge_path: path of the specification that evaluates closed-loop runs, if it differs from that of the
+            plans; likewise `judge_text`, `judge_library` and `judge_set`. Without a text, `spec_text`
+            evaluates the trace.
         system_name: name of the system.
-        system_path: its path as the user gave it.
-        system_text: the text of its file.
+        system_path: path of the system file as the user gave it.
+        system_text: text of the system file.
         system_hash: SHA-256 of the system.
-        run: name of the run that recorded.
-        seed: of the recording.
+        run: name of the training run that recorded the trace.
+        seed: seed of the random numbers.
         horizon: planning horizon T in steps.
         dt: time step in seconds.
-        origin: time 0 in ns since 1970, for logs with the time of day.
-        created: ISO 8601 time.
-        stlc_version: of the recorder.
+        origin: absolute time of time 0 in ns since 1970, for logs that contain the time of day.
+        created: time of recording, ISO 8601.
+        stlc_version: version of stlc that recorded the trace.
     """
 
     spec_name: str = ""
@@ -95,22 +96,22 @@ class TraceMeta:
 
     @property
     def planned(self) -> Carried:
-        """The specification that the plans were made for."""
+        """The specification that the control sequences (plans) were made for."""
         return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
 
     @property
     def carried(self) -> Carried:
-        """The specification for evaluating the trace: that of closed-loop runs, else `planned`."""
+        """The specification that evaluates the trace: that of closed-loop runs if given, else `planned`."""
         if not self.judge_text:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
 
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
-    """Return the metadata in the array `meta` of a trace, and the columns that it describes.
+    """Return the metadata in the array `meta` of a trace, and the signals (columns) that it describes.
 
     Raises:
-        TraceError: E603, it is not a JSON text of the expected form.
+        TraceError: E603, the array is not a JSON text of the expected form.
     """
     if array is None:
         return TraceMeta(), {}
@@ -124,7 +125,7 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
 
 
 def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
-    """Return metadata and columns as a 0-d array that holds a JSON text, the inverse of `read_meta`."""
+    """Return metadata and signal descriptions as a 0-d array of a JSON text, the inverse of `read_meta`."""
     signals = {column.name: _written(column) for column in signature.columns}
     return np.array(json.dumps(asdict(meta) | {"signals": signals}))
 

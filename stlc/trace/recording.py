@@ -1,4 +1,4 @@
-"""The content of a trace file before resampling: arrays by name, and their clocks."""
+"""The content of a trace file before resampling: arrays by name, and their times."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ EXTRA = "extra."
 
 @dataclass(frozen=True, slots=True)
 class ClockGroup:
-    """Signals that share a clock.
+    """Signals that share their sampling times.
 
     Attributes:
         arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
-        clock: times in seconds, (samples,); None where the file has none.
-        named: name of the clock in the file.
+        clock: times in seconds, (samples,); None if the file contains none.
+        named: name of the time column in the file.
     """
 
     arrays: Mapping[str, Array]
@@ -48,10 +48,10 @@ class Recording:
 
     Attributes:
         name: the path as the user gave it, for messages.
-        groups: the signals; files with one clock have one.
-        columns: signal -> unit, kind and range, where the file gives them.
-        meta: origin of the recording.
-        extras: all other recorded arrays.
+        groups: groups of signals with common times; one group if the file has one time column.
+        columns: signal -> unit, kind and range, if the file gives them.
+        meta: origin of the trace.
+        extras: all other arrays in the file.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Recording:
         return tuple(name for group in self.groups for name in group.arrays)
 
     def clocked_by(self, signal: str) -> Recording:
-        """The recording with `signal` as the clock of its group.
+        """Return the recording with `signal` as the time of the group that contains it.
 
         Raises:
             TraceError: E601, there is no such signal.
@@ -85,7 +85,7 @@ class Recording:
 
 
 def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
-    """E601: the trace has no such signal."""
+    """Finding E601: the trace has no such signal."""
     names = list(known)
     near = closest(signal, names)
     return Diagnostic(
@@ -97,14 +97,14 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
 
 
 def clock_among(names: Iterable[str]) -> str | None:
-    """Name of the clock column: `t`, else the usual name of a clock if exactly one occurs."""
+    """Name of the time column: `t`, else a usual name for time (`time`, …) if exactly one of them occurs."""
     known = list(names)
     found = [name for name in known if name.strip().lower() in CLOCKS]
     return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
 
 
 def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """A recording with one clock from arrays; those called `extra.…` are set aside."""
+    """Recording from arrays with common times; arrays called `extra.…` are not signals."""
     named = clock_among(arrays)
     extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
     signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}
@@ -113,7 +113,7 @@ def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = 
 
 
 def unit_of(path: Path, name: str, text: str) -> Unit:
-    """The unit that a file gives for a column. Raises TraceError (E605) for an invalid unit."""
+    """Parse the unit that a file gives for a column. Raises TraceError (E605) for an invalid unit."""
     try:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:
@@ -122,10 +122,10 @@ def unit_of(path: Path, name: str, text: str) -> Unit:
 
 
 def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:
-    """Signals as (traces, samples); a further axis holds the components of a vector: `q[0]`, `q[1]`.
+    """Return signals as (traces, samples); a vector is split into its components `q[0]`, `q[1]`, ….
 
     Raises:
-        TraceError: E601, there is no signal; E605, arrays do not fit together.
+        TraceError: E601, there are no signals; E605, shapes of arrays do not fit together.
     """
     findings: list[Diagnostic] = []
     data: dict[str, Array] = {}

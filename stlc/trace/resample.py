@@ -1,6 +1,6 @@
-"""Resampling of signals with any clocks to one grid: discrete ones are held, real ones interpolated.
+"""Resampling of signals to one grid: discrete signals are held, real ones interpolated linearly.
 
-In gaps that are too long for that, a signal is unknown: NaN.
+Within gaps between samples that are too long a signal is unknown: NaN.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SAME = 1 + 1e-9
 
 
 def usual_step(times: Floats) -> float:
-    """The usual time between samples in seconds: the median of the first nine gaps; 0 where there is none."""
+    """Usual time between samples in seconds: median of the first nine steps; 0 without a positive step."""
     gaps = np.diff(times[: _GAPS + 1])
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
@@ -47,11 +47,11 @@ FIRST = _GAPS + 1
 
 @dataclass(frozen=True, slots=True)
 class Spacing:
-    """A grid, and the longest gap between samples that is bridged.
+    """A time grid, and the longest gap between samples across which values are held or interpolated.
 
     Attributes:
-        dt: seconds between the instants of the grid.
-        limit: the longest gap in seconds in which values are known.
+        dt: time step of the grid in seconds.
+        limit: the longest gap, in seconds, within which values are known.
     """
 
     dt: float
@@ -59,9 +59,10 @@ class Spacing:
 
     @staticmethod
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
-        """Grid for samples at `times`; by default gaps up to three steps are bridged, all between events.
+        """Grid for samples at `times`; values are known within gaps of at most `max_gap` seconds.
 
-        A step is the longer of `dt` and the usual one.
+        By default the limit is three steps, the step being the longer of `dt` and the usual time between
+        samples; there is no limit if the samples are `events`, values that hold until the next one.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)
@@ -69,25 +70,25 @@ class Spacing:
 
     @property
     def slack(self) -> float:
-        """Tolerance for rounding of a clock, in seconds."""
+        """Tolerance in seconds for rounding errors of times."""
         return _ROUNDING * self.dt
 
 
 def values_on(
     grid: Floats, times: Floats, values: Array, spacing: Spacing, *, held: bool, end: float
 ) -> Floats:
-    """Return a signal on a grid (points,), NaN where it is unknown.
+    """Return a signal on a grid, (points,), NaN where it is unknown.
 
-    A signal is unknown within gaps that are too long, before its first sample, and, unless it is held, after
-    its last one. Samples that are NaN are ignored.
+    A signal is unknown within gaps that are too long, before its first sample, and, if it is interpolated,
+    after its last one. Samples that are NaN are ignored.
 
     Args:
-        grid: instants (points,) in seconds, which increase.
-        times: of the samples (samples,), which never decrease.
-        values: at those times.
-        spacing: of the grid.
-        held: zero-order hold between samples; else linear interpolation.
-        end: time until which no sample follows the last one.
+        grid: increasing times of the grid in seconds, (points,).
+        times: times of the samples, non-decreasing, (samples,).
+        values: values of the samples, (samples,).
+        spacing: time step of the grid and longest allowed gap.
+        held: True for zero-order hold, False for linear interpolation.
+        end: time before which the last sample is known to have no successor.
     """
     there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
     if not there.all():
@@ -110,7 +111,7 @@ def values_on(
 
 @dataclass(frozen=True, slots=True)
 class _Timed:
-    """Signals (traces, samples) with the times of their samples, which never decrease."""
+    """Signals (traces, samples) with their sampling times, which never decrease."""
 
     times: Floats
     signals: Mapping[str, Array]
@@ -127,18 +128,18 @@ class _Timed:
 
     @property
     def last(self) -> float:
-        """The last time at which all signals are known; held ones are known from their first sample on."""
+        """The last time at which all signals are known; +inf if all are held (they keep their last value)."""
         return math.inf if self.events else float(self.times[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class ResampleGrid:
-    """A requested grid.
+    """Grid requested for resampling.
 
     Attributes:
-        dt: seconds between instants; None takes the usual step of the samples.
-        max_gap: the longest gap in seconds that is bridged; None bridges three steps, and between
-            events (a group beside others, all of whose signals are discrete) any gap.
+        dt: time step in seconds; None: the usual time between samples.
+        max_gap: the longest gap, in seconds, within which values are known. None: three steps, or no limit
+            for a group of discrete signals beside other groups.
     """
 
     dt: float | None = None
@@ -147,12 +148,12 @@ class ResampleGrid:
 
 @dataclass(frozen=True, slots=True)
 class Resampled:
-    """Signals on a grid.
+    """Signals on a uniform grid.
 
     Attributes:
-        t0: of the first sample, in seconds.
-        dt: seconds between samples.
-        data: signal -> (traces, samples); NaN where a signal is not known.
+        t0: time of the first sample in seconds.
+        dt: time step in seconds.
+        data: signal -> (traces, samples); NaN where a signal is unknown.
     """
 
     t0: float
@@ -164,17 +165,17 @@ def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind
     """Return the signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
-    (zero-order hold), real ones are interpolated; in gaps that are too long both are unknown.
+    (zero-order hold), real ones are interpolated; within gaps that are too long both are unknown.
 
     Args:
-        recording: of one or more groups.
+        recording: content of a trace file, with one or more groups of common times.
         grid: the requested grid.
         kinds: signal -> kind of its numbers; overrides the file.
 
     Raises:
-        TraceError: E601, a group has no clock; E602, times decrease, or have no common interval, or `dt` is
-            not a time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
-            samples.
+        TraceError: E601, a group has no times; E602, times decrease, have no common interval, or `dt` is not
+            a valid time step; E604, a time is not finite; E605, arrays do not fit together, or there are too
+            many samples.
     """
     groups = [_timed(recording, group, kinds) for group in recording.groups if group.arrays]
     if not groups:

@@ -26,9 +26,9 @@ _SNAP = 1e-6
 
 
 def resample_advice(step: float) -> str:
-    """Advice for samples that are not on one grid, from their usual time step in seconds.
+    """Help text for samples that are not on one grid: `--resample` with a step derived from their usual step.
 
-    The proposed grid is at least twice as fine: one of their own step would skip samples.
+    The proposed step is at most half the usual one, since a grid of the usual step would skip samples.
     """
     if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
         return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
@@ -38,7 +38,7 @@ def resample_advice(step: float) -> str:
 
 
 def gap_advice(step: float) -> str:
-    """Advice for a grid with missing samples."""
+    """Help text for a grid with missing samples."""
     return (
         f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
         "in longer ones signals are unknown, and what needs them is inconclusive"
@@ -48,17 +48,17 @@ def gap_advice(step: float) -> str:
 def read_clock(
     name: str, clock: NDArray[Any] | None, dt: float | None, samples: int, *, others: Iterable[str] = ()
 ) -> tuple[float, float, int]:
-    """Return first time and time step in seconds, and the number of samples.
+    """Return the time of the first sample and the time step in seconds, and the number of samples.
 
     Args:
-        name: of the trace, for messages.
-        clock: the recorded times (samples,) in seconds, or None.
-        dt: the recorded time step, or None; needed where there are no times, or only one.
-        samples: number of samples, where there are no times.
+        name: name of the trace, for messages.
+        clock: recorded times in seconds, (samples,), or None.
+        dt: recorded time step in seconds, or None; needed if there are fewer than two times.
+        samples: number of samples, used if there are no times.
         others: names of the other arrays in the trace, for messages.
 
     Raises:
-        TraceError: E601, neither times nor a step; E602, times that are not uniform; E605, no samples.
+        TraceError: E601, neither times nor a time step; E602, times are not uniform; E605, no samples.
     """
     if dt is not None:
         require_step(name, dt)
@@ -86,14 +86,14 @@ def read_clock(
 
 
 def require_step(name: str, dt: float) -> None:
-    """Raise TraceError (E602) for a time step that is invalid or out of range."""
+    """Raise TraceError (E602) if a time step is invalid or out of range."""
     if not SHORTEST <= dt <= LONGEST:
         help_ = (f"time is in seconds, and a step at least {SHORTEST:g} s and at most {LONGEST:g} s",)
         raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
 
 
 def require_same_step(name: str, found: float, said: float) -> None:
-    """Raise TraceError (E602) where the clock of a trace has another step than the given one."""
+    """Raise TraceError (E602) if the measured time step of a trace differs from the given one."""
     if abs(found - said) > 1e-3 * said:
         message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
         help_ = ("leave out --dt: the file says what its step is",)
@@ -101,7 +101,7 @@ def require_same_step(name: str, found: float, said: float) -> None:
 
 
 def check_finite(name: str, times: Floats) -> None:
-    """Raise TraceError where there are no times (E605), or one is not finite (E604)."""
+    """Raise TraceError if there are no times (E605), or if one is not finite (E604)."""
     if not len(times):
         raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
     bad = np.flatnonzero(~np.isfinite(times))
@@ -127,7 +127,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
 
 
 def _require_even(name: str, times: Floats) -> None:
-    """Check that times increase by about the usual step."""
+    """Check that times increase by about the usual step. Raises TraceError (E602)."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     backwards = np.flatnonzero(gaps <= 0)
@@ -144,7 +144,7 @@ def _require_even(name: str, times: Floats) -> None:
 
 
 def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
-    """E602: samples are missing, or they are not on a grid."""
+    """Finding E602: samples are missing, or the times are not on a grid."""
     i = int(np.argmax(np.abs(gaps - usual) > TOLERANCE * usual))
     steps = np.rint(gaps / usual)
     if (np.abs(gaps - steps * usual) <= TOLERANCE * usual).all() and (steps >= 1).all():
@@ -168,7 +168,7 @@ def snapped(step: float) -> float:
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """The given step if it agrees with the mean; else the mean, or a simple fraction that is near."""
+    """The given time step if it agrees with the mean; else the mean, rounded to a nearby simple fraction."""
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt
     near = float(Fraction(mean).limit_denominator(100_000))

@@ -1,7 +1,7 @@
-"""Traces: a signature, a time step and arrays, read and written without pickles.
+"""Traces: signal descriptions, a time step and arrays, read and written without pickles.
 
-An `.npz` trace holds `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal, arrays
-`extra.NAME` of any shape, and `meta`, a JSON text on the origin of the recording and its specification.
+An `.npz` trace contains `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal,
+arrays `extra.NAME` of any shape, and `meta`, a JSON text on the origin of the trace and its specification.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class Trace:
     """Signals of one or several agents on one uniform time grid.
 
     Attributes:
-        signature: one column per signal, in the order of the file.
+        signature: name, unit and kind of every signal, in the order of the file.
         dt: time step in seconds.
         data: signal -> (traces, samples), float64, in the units of the signature.
         t0: time of the first sample in seconds.
-        extras: all other recorded arrays, any shape; never evaluated.
-        meta: origin of the recording.
+        extras: all other arrays in the file, of any shape; never evaluated.
+        meta: origin of the trace.
         name: the path as the user gave it, for messages.
     """
 
@@ -79,10 +79,10 @@ class Trace:
         return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
 
     def renamed(self, names: Mapping[str, str]) -> Trace:
-        """Return the trace with signal `names[new]` renamed to `new`.
+        """Return the trace with signals renamed: `names` maps each new name to the present one.
 
         Raises:
-            TraceError: E601, a signal that is not in the trace.
+            TraceError: E601, a signal is not in the trace.
         """
         if not names:
             return self
@@ -98,17 +98,17 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Options for reading a file.
+    """Options for reading a trace file.
 
     Attributes:
-        names: signal -> its name in the file; `t` names the clock.
-        resample: time step of a new grid in seconds; None takes the file's own, which is uniform.
-        dt: seconds between samples, where the file does not give them; it must not contradict the file.
-        max_gap: resample, with signals unknown (NaN) within longer gaps in seconds; without `resample`
-            the grid has the usual step of the file.
+        names: signal -> its name in the file; the key `t` gives the name of the time column.
+        resample: time step in seconds of a new grid; None keeps the grid of the file, which must be uniform.
+        dt: time step in seconds, if the file does not give it; must not contradict the file.
+        max_gap: longest gap in seconds within which values are known; setting it resamples the file, by
+            default at its usual time step.
         kinds: signal -> kind of its numbers, which determines how it is resampled.
-        words: signal -> values of its words, for all needed signals; others, and with None all, are set
-            aside among the extras.
+        words: signal -> number of each of its words, for all needed signals; other signals of words (with
+            None, all) become extras.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -126,12 +126,12 @@ AS_IT_IS = Reading()
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a file of any format.
+    """Read a trace file of any format.
 
     Raises:
-        UsageError: U102, no such file.
+        UsageError: U102, there is no such file.
         MissingError: R301, the format needs a package that is not installed.
-        TraceError: the file cannot be read (E603) or does not fit together (E605).
+        TraceError: E603, the file cannot be read; E605, its arrays do not fit together.
     """
     if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
         why = f"its suffix is none of {' '.join(SUFFIXES)}"
@@ -141,23 +141,23 @@ def read_recording(path: Path) -> Recording:
 
 
 def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
-    """Read a trace; the format follows the suffix.
+    """Read a trace; the suffix of the file determines the format.
 
-    It is one of `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`, or the folder of a bag;
-    all others are read as `.npz`. Values may be NaN or infinite here: the monitor refuses them where a
-    requirement needs them.
+    Suffixes are `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`; a folder is a ROS 2 bag, and
+    any other file is read as `.npz`. Values may be NaN or infinite here; the monitor refuses infinite values
+    that a requirement needs.
 
     Raises:
-        UsageError: U102, no such file.
+        UsageError: U102, there is no such file.
         MissingError: R301, the format needs a package that is not installed.
-        TraceError: E601, no time, or no such signal; E602, time is not uniform; E603, the file cannot be read
-            safely; E605, its arrays do not fit together.
+        TraceError: E601, no times, or no such signal; E602, times are not uniform; E603, the file cannot be
+            read safely; E605, its arrays do not fit together.
     """
     return trace_of(read_recording(Path(path)), reading)
 
 
 def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
-    """The trace of a recording: renamed, and on one uniform grid.
+    """Convert the content of a trace file to a trace: signals renamed, and on one uniform grid.
 
     Raises:
         TraceError: as `load_trace`.
@@ -181,7 +181,7 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """The recording with clocks of step `dt` for signals that have none."""
+    """The recording with times of step `dt` added for signals that have none."""
     step = dt or recording.meta.dt
     if step is None:
         return recording
@@ -197,7 +197,7 @@ def _longest(group: ClockGroup) -> int:
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:
-    """The trace of a recording with one uniform clock."""
+    """The trace of a recording whose signals share one uniform time column."""
     name = recording.name
     groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
     if len(groups) > 1:
@@ -224,13 +224,15 @@ def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) 
 
 
 def save_trace(path: Path | str, trace: Trace) -> None:
-    """Write a trace; the format follows the suffix. A `.csv` holds the signals alone, an `.mcap` no extras.
+    """Write a trace; the suffix of the path determines the format.
+
+    A `.csv` file contains the signals only; an `.mcap` file contains no extras.
 
     Raises:
         UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.
-        MissingError: R301, an `.mcap` needs a package that is not installed.
+        MissingError: R301, an `.mcap` file needs a package that is not installed.
         TraceError: E605, a signal has a name that the format reserves.
-        MissingError: R201, no room or no permission; an old file stays as it was.
+        MissingError: R201, no space left or no permission; an existing file is not changed.
     """
     check_writable(path)
     taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
@@ -240,11 +242,11 @@ def save_trace(path: Path | str, trace: Trace) -> None:
 
 
 def check_writable(path: Path | str) -> None:
-    """Check that a trace can be written to a path.
+    """Check that the format of a path can be written.
 
     Raises:
         UsageError: U101, the suffix is not that of a writable format.
-        MissingError: R301, an `.mcap` needs a package that is not installed.
+        MissingError: R301, an `.mcap` file needs a package that is not installed.
     """
     suffix, found = Path(path).suffix.lower(), format_of(Path(path))
     if suffix in WRITTEN and found.packages:
@@ -257,6 +259,6 @@ def check_writable(path: Path | str) -> None:
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:
-    """Return a time step in seconds as the intended fraction: 0.1 is 1/10, 0.0333… is 1/30."""
+    """Return a time step in seconds as the exact fraction that was meant: 0.1 is 1/10, 0.0333… is 1/30."""
     near = Fraction(dt).limit_denominator(1_000_000)
     return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)

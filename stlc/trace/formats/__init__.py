@@ -1,1 +1,1 @@
-"""Formats of trace files, a module each."""
+"""Formats of trace files, one module per format."""

@@ -1,8 +1,8 @@
-"""Bags of ROS 1 (`.bag`) and ROS 2 (folders, `.db3`), read without a ROS installation.
+"""Bag files of ROS 1 (`.bag`) and ROS 2 (folders, `.db3`), read without a ROS installation.
 
-A bag of ROS 1 is a file of records, some of them in compressed chunks (http://wiki.ros.org/Bags/Format/2.0).
-One of ROS 2 is a folder with a database of SQLite, or with `.mcap` files. Bags of ROS 2 before Iron lack
-message definitions: for the usual messages those of `rosbags` (extra `bag`) are used.
+A ROS 1 bag is a file of records, some of them in compressed chunks (http://wiki.ros.org/Bags/Format/2.0). A
+ROS 2 bag is a folder with an SQLite database or `.mcap` files. Bags from before ROS 2 Iron contain no message
+definitions: for the standard messages the definitions of `rosbags` (extra `bag`) are used.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ _LONGEST = 256_000_000
 
 
 def read(path: Path) -> Recording:
-    """The numbers in all messages of a bag: a `.bag`, a `.db3`, or a folder.
+    """Read all numbers in the messages of a bag: a `.bag` file, a `.db3` file, or a folder.
 
     Raises:
         UsageError: U102, there is no such file, or no bag in the folder.
         MissingError: R301, a package is not installed.
-        TraceError: E603, another format, damaged, or without numbers.
+        TraceError: E603, the file is of another format, damaged, or without numbers.
     """
     return _read_ros1(path) if path.suffix.lower() == ".bag" and not path.is_dir() else _read_ros2(path)
 
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A topic, and the decoder of its messages; None where they cannot be decoded."""
+    """A topic, and the decoder of its messages; None if the messages cannot be decoded."""
 
     name: str
     decode: Decode | None
 
     @staticmethod
     def of(log: Log, name: str, definition: str, form: Form) -> _Topic:
-        """Return the topic of messages with a definition; the log notes why they cannot be decoded."""
+        """Return the topic for messages of a definition; if undecodable, record the reason in `log`."""
         try:
             return _Topic(name, decoder(definition, form))
         except DamageError as error:
@@ -67,7 +67,7 @@ class _Topic:
 
 
 def _read_ros1(path: Path) -> Recording:
-    """The numbers in all messages of a bag of ROS 1."""
+    """Read all numbers in the messages of a ROS 1 bag."""
     log = Log(path)
     with mapped(path) as data, damage(path):
         if data[: len(_MAGIC)] != _MAGIC:
@@ -89,7 +89,7 @@ Bytes: TypeAlias = bytes | mmap
 
 
 def _records(data: Bytes, at: int) -> Iterator[tuple[int, dict[bytes, bytes], bytes]]:
-    """The records of a file: kind, header fields and data."""
+    """Yield the records of a file: record type, header fields and data."""
     while at < len(data):
         head, at = _sized(data, at)
         content, at = _sized(data, at)
@@ -118,7 +118,7 @@ def _word(field: bytes) -> int:
 
 
 def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, bytes], content: bytes) -> None:
-    """Process a record inside or outside of a chunk; `topics` are those of the connections so far."""
+    """Process one record; `topics` maps the number of each connection read up to now to its topic."""
     if kind == _CONNECTION:
         number = _word(fields[b"conn"])
         if number not in topics:
@@ -137,7 +137,7 @@ def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, by
 
 
 def _read_ros2(path: Path) -> Recording:
-    """The numbers in all messages of a bag of ROS 2: its folder, or one `.db3` of it."""
+    """Read all numbers in the messages of a ROS 2 bag: its folder, or one `.db3` file of it."""
     log = Log(path)
     if path.is_dir():
         stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
@@ -153,14 +153,14 @@ def _read_ros2(path: Path) -> Recording:
 
 
 def _order(path: Path) -> tuple[object, ...]:
-    """Files in the order of the numbers in their names."""
+    """Sort key of a file: the numbers in its name are compared as numbers."""
     return tuple(
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", path.name)
     )
 
 
 def _add_stored(log: Log, path: Path) -> None:
-    """Add the messages of one file; a packed file is unpacked to a temporary one."""
+    """Add the messages of one file; a compressed file is first unpacked to a temporary file."""
     if path.name.lower().endswith(_PACKED):
         with mapped(path) as data:
             content = Room(path, len(data)).of_unknown_size(data[:])
@@ -198,7 +198,7 @@ def _add_database(log: Log, path: Path) -> None:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """A database, opened read-only and without functions or pragmas of its own."""
+    """Open a database read-only, and forbid every operation in it other than reading tables."""
     where = path.resolve().as_uri()
     database = sqlite3.connect(f"{where}?mode=ro&immutable=1", uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(_LONGEST, MAX_BYTES))
@@ -216,7 +216,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Topic]:
-    """The topics of a database, by number."""
+    """Read the topics of a database: topic number -> topic."""
     texts = _definitions(database)
     topics: dict[int, _Topic] = {}
     query = "SELECT id, name, type, serialization_format FROM topics"
@@ -233,7 +233,7 @@ def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Topic]:
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, str]:
-    """Definitions by the name of a message, where the database has them."""
+    """Message definitions in the database: message type -> definition; empty if the database has none."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
         rows = database.execute(query).fetchall()
@@ -243,7 +243,7 @@ def _definitions(database: sqlite3.Connection) -> dict[str, str]:
 
 
 def _usual(kind: str) -> str | None:
-    """The definition of a message that comes with ROS 2; None where there is none."""
+    """Definition of a standard ROS 2 message type; None if it is not a standard type."""
     store = _usual_ones()
     try:
         return str(store.generate_msgdef(kind, ros_version=2)[0])

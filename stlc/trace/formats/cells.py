@@ -1,7 +1,7 @@
-"""Numbers from the cells of tables: one at a time, or all of a large file in little extra memory.
+"""Numbers from the cells of a table, one at a time or, for large files, all at once in little extra memory.
 
-`cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is
-installed, else NumPy's reader, in blocks. Each leaves unusual cells to slower readers, and all give the same
+Large texts are read by `cells.c` if there is a C compiler (`stlc.native`), else by Arrow if it is installed,
+else by NumPy, in blocks. Each of these leaves unusual cells to a slower reader, and all give the same
 numbers.
 """
 
@@ -39,7 +39,7 @@ _TOO_MANY = -2
 
 @dataclass(frozen=True, slots=True)
 class TableText:
-    """The text of a table: the bytes from `start` on, its width and delimiter."""
+    """The text of a table without its header: it begins at byte `start` and has `width` columns."""
 
     data: bytes
     start: int
@@ -48,24 +48,21 @@ class TableText:
 
 
 def bare(raw: str) -> str:
-    """The text of a cell without blanks and quotes."""
+    """Return the text of a cell without surrounding blanks and quotes."""
     text = raw.strip()
     quoted = len(text) >= 2 and text[0] == text[-1] == '"'
     return text[1:-1].strip() if quoted else text
 
 
 def value_of(text: str) -> float | None:
-    """The number of a cell's text: NaN where it is empty, None where it is not a number."""
+    """Return the number in a cell's text: NaN if it is empty, None if it is not a number."""
     if NUMBER.fullmatch(text):
         return float(text)
     return _WORDS.get(text.lower()) if text else math.nan
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers of these columns, (lines, columns); None without lines, or for other cells.
-
-    Empty cells are NaN, truth values 0 and 1; quotes around a number are removed.
-    """
+    """Return the numbers in the selected columns, (lines, columns); None without lines or for other cells."""
     if not _ANY.search(body):
         return None
     values = _loaded(body, delimiter, columns)
@@ -88,7 +85,7 @@ def _loaded(body: str, delimiter: str, columns: Sequence[int] | None) -> Array |
 
 @dataclass(frozen=True, slots=True)
 class _Repair:
-    """Patterns that repair cells which NumPy's reader refuses."""
+    """Patterns of cells that NumPy's reader refuses and that `_mended` rewrites."""
 
     empty: re.Pattern[str]
     quoted: re.Pattern[str]
@@ -109,7 +106,7 @@ def _repair(delimiter: str) -> _Repair:
 
 
 def _mended(body: str, delimiter: str) -> str:
-    """The lines that are not empty, with numbers for empty cells, truth values and quoted cells."""
+    """Text without empty lines, and with numbers in place of empty cells, truth values and quoted cells."""
     repair = _repair(delimiter)
     body = repair.empty.sub("", body)
     if '"' in body:
@@ -125,9 +122,9 @@ def _mended(body: str, delimiter: str) -> str:
 
 
 def read_lines(lines: TableText) -> list[Array] | None:
-    """The columns of a table of numbers; None where a line or a cell does not fit.
+    """Return the columns of a table of numbers; None if a line or cell is not of the expected form.
 
-    Any line ending is allowed. Lines of empty cells are left out; an empty cell beside others is NaN.
+    Any line ending is allowed. Lines with empty cells only are left out; other empty cells are NaN.
     """
     library = _library()
     if library is not None:
@@ -141,7 +138,7 @@ def read_lines(lines: TableText) -> list[Array] | None:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    """The built `cells.c`; None where there is no compiler for it."""
+    """The compiled library of `cells.c`; None if there is no C compiler."""
     from stlc.native import load
 
     library = load(_SOURCE.read_text(encoding="utf-8"))
@@ -187,7 +184,7 @@ def _doubted(cell: bytes) -> float | None:
 
 @cache
 def _arrow() -> Any:
-    """Arrow's reader of tables; None where it is not installed."""
+    """Arrow's module for reading tables; None if Arrow is not installed."""
     try:
         return import_module("pyarrow.csv")
     except ImportError:
@@ -195,7 +192,7 @@ def _arrow() -> Any:
 
 
 def _by_arrow(lines: TableText) -> list[Array] | None:
-    """All lines with Arrow's reader, whose numbers are correctly rounded, too; None where one is unusual."""
+    """Read all lines with Arrow, which also rounds numbers correctly; None if a line is unusual."""
     csv = _arrow()
     if csv is None or lines.data[lines.start :].translate(None, _PLAIN):
         return None
@@ -220,7 +217,7 @@ def _by_arrow(lines: TableText) -> list[Array] | None:
 
 
 def _by_numpy(lines: TableText) -> list[Array] | None:
-    """The columns, read with NumPy in blocks of lines to bound memory."""
+    """Read the columns with NumPy, in blocks of lines to bound memory."""
     parts: list[list[Array]] = [[] for _ in range(lines.width)]
     for stretch in _stretches(lines):
         try:

@@ -1,8 +1,8 @@
-"""Traces as `.csv` files; every cell is a number, a word, empty or a diagnostic.
+"""Traces as `.csv` files; a cell is a number, a word or empty, anything else an error.
 
-The first line names the columns, with optional units in brackets: `t, x [m], v (km/h)`. A column `trace` or
-`agent` gives the trace of each line, if there are several. A column whose first
-cell is a word holds words; in the others an empty cell is NaN, an unknown value.
+The first line names the columns, with optional units in brackets: `t, x [m], v (km/h)`. If the file holds
+several traces, a column `trace` or `agent` identifies the trace of each line. A column whose first cell is a
+word holds words; in other columns an empty cell is NaN, an unknown value.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 @dataclass(frozen=True, slots=True)
 class _Sheet:
-    """The text of a file, cut into its header and the lines below."""
+    """The text of a file, divided into its header and the lines that follow."""
 
     source: Source
     delimiter: str
@@ -60,12 +60,12 @@ class _Sheet:
 
 
 def read(path: Path) -> Recording:
-    """Return the trace of a file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
+    """Return the content of a trace file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
     return of_table(path, read_csv(path))
 
 
 def size(path: Path) -> int:
-    """Bytes of the file, an estimate for its numbers in memory."""
+    """Size of the file in bytes, an estimate of the memory for its numbers."""
     return path.stat().st_size
 
 
@@ -81,17 +81,18 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 def read_csv(path: Path) -> Table:
     """Return the columns of a `.csv` file (comma, semicolon or tab; UTF-8); columns of words are texts.
 
-    Between semicolons or tabs numbers may have decimal commas.
+    If semicolons or tabs separate the columns, numbers may have decimal commas.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        TraceError: E603, not text, or a cell that is no number; E605, a header or line that does not fit.
+        TraceError: E603, the file is not text, or a cell is not a number; E605, the header is invalid, or a
+            line has another number of cells.
     """
     return table_of_text(path, _read(path))
 
 
 def table_of_text(path: Path, data: bytes) -> Table:
-    """Return the columns of the text of a file; `path` is for messages. Raises TraceError as `read_csv`."""
+    """Return the columns of file content `data`; `path` is for messages. Raises TraceError as `read_csv`."""
     if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
         return table
     sheet = _sheet(path, data)
@@ -109,7 +110,7 @@ def _read(path: Path) -> bytes:
 
 
 def _read_large(path: Path, data: bytes) -> Table | None:
-    """The columns of a large file of numbers; None if anything is unusual."""
+    """Read the columns of a large file of numbers at once; None if the file needs the slower reader."""
     try:
         sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
         names, units = _read_header(sheet)
@@ -175,12 +176,12 @@ def delimiter_of(header: str) -> str:
 
 
 def head_cells(header: str, delimiter: str) -> list[str]:
-    """The cells of a header, without quotes and protection against spreadsheets."""
+    """Split a header into its cells, without quotes and without the apostrophe before a formula."""
     return [_head(raw) for raw in _raw_heads(header, delimiter)]
 
 
 def _raw_heads(header: str, delimiter: str) -> list[str]:
-    """The cells of a header as written; delimiters within quotes do not count."""
+    """Split a header into its unprocessed cells; a delimiter within quotes does not separate."""
     hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
     edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
     return [header[left + 1 : right] for left, right in pairwise(edges)]
@@ -192,7 +193,7 @@ def _head(raw: str) -> str:
 
 
 def split_head(text: str) -> tuple[str, str]:
-    """Name and unit of a header cell, `v [km/h]` or `v (km/h)`; other forms are a name as a whole."""
+    """Split a header cell, `v [km/h]` or `v (km/h)`, into name and unit; any other text is just a name."""
     match = _HEAD.fullmatch(text.strip())
     if match is None:
         return text.strip(), ""
@@ -203,7 +204,7 @@ def split_head(text: str) -> tuple[str, str]:
 
 
 def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[str, Span]]:
-    """The cells of a line as written, with their places; `start` is the place of the line."""
+    """The cells of a line with their source locations; `start` is the offset of the line in the file."""
     for raw in cells:
         at = start + (len(raw) - len(raw.lstrip()))
         yield raw, source.span(at, max(at + len(raw.strip()), at + 1))
@@ -211,7 +212,7 @@ def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[
 
 
 def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
-    """The columns whose first cell that is not empty is a word."""
+    """Indices of the columns whose first non-empty cell is a word."""
     words: set[int] = set()
     open_ = set(range(width))
     for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
@@ -226,7 +227,7 @@ def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
 
 
 def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
-    """The columns, read in blocks; unusual blocks are read cell by cell."""
+    """Read the columns in blocks; a block with unusual cells is read cell by cell."""
     findings: list[Diagnostic] = []
     parts: list[list[Array]] = [[] for _ in range(width)]
     text, begin = sheet.source.text, sheet.body_at
@@ -246,7 +247,7 @@ def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
 
 
 def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
-    """Whole lines at once with NumPy's reader; None if any of them is unusual."""
+    """Read whole lines at once with NumPy's reader; None if a cell is unusual."""
     if len(texts) == width or (texts and '"' in body):
         return None
     numbers = [i for i in range(width) if i not in texts]
@@ -260,14 +261,14 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
 
 
 def _filled(line: str, sheet: _Sheet) -> bool:
-    """True if any cell of a line is filled."""
+    """True if any cell of a line is not empty."""
     return bool(line.strip(f" \t{sheet.delimiter}"))
 
 
 def _read_strict(
     sheet: _Sheet, start: int, end: int, width: int, texts: frozenset[int], findings: list[Diagnostic]
 ) -> list[Array]:
-    """The lines of a block cell by cell, with the place of every error."""
+    """Read the lines of a block cell by cell, and append the location of every error to `findings`."""
     rows: list[list[float | str]] = []
     for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
         if _filled(line, sheet):
@@ -313,11 +314,11 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write the signals of a trace, a line per sample; a column `trace` numbers several traces.
+    """Write the signals of a trace, one line per sample; if there are several traces, a column numbers them.
 
     Raises:
-        TraceError: E605, a signal has a name that the format reserves, or as `write_csv`.
-        MissingError: R201, no room or no permission.
+        TraceError: E605, a signal is called `trace` or `agent`, or as `write_csv`.
+        MissingError: R201, no space left or no permission.
     """
     if grouped := [name for name in trace.data if name in GROUPS]:
         message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
@@ -332,12 +333,12 @@ def write(path: Path | str, trace: Trace) -> None:
 def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
     """Write columns of equal length so that reading them back gives the same numbers.
 
-    The first line names the columns; a name that a spreadsheet would run as a formula, such as `=1+1`, has an
-    apostrophe before it, which reading takes off.
+    The first line names the columns. A name that a spreadsheet program would run as a formula, such as
+    `=1+1`, is preceded by an apostrophe, which the reader removes.
 
     Raises:
-        TraceError: E605, a name that would be read as something else, such as one with a unit in brackets.
-        MissingError: R201, no room or no permission; an old file stays as it was.
+        TraceError: E605, a name would be read back differently, such as a name with a unit in brackets.
+        MissingError: R201, no space left or no permission; an existing file is not changed.
     """
     head = _row(f"{name} [{units[name]}]" if units.get(name) else name for name in columns)
     _require_names(Path(path), head, list(columns))
@@ -350,7 +351,7 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
 
 
 def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
-    """Check that a header is read back as these names. Raises TraceError (E605)."""
+    """Check that the reader finds these names in a header. Raises TraceError (E605)."""
     if _names_in(path, header) == list(names):
         return
     odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])
@@ -359,7 +360,7 @@ def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
 
 
 def _names_in(path: Path, header: str) -> list[str]:
-    """The names of a header; [] if it is invalid."""
+    """Names that the reader finds in a header; [] if the header is invalid."""
     try:
         return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
     except TraceError:
@@ -367,7 +368,7 @@ def _names_in(path: Path, header: str) -> list[str]:
 
 
 def _row(heads: Iterable[str]) -> str:
-    """The text of a header with these cells."""
+    """Text of a header line with the given cells."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
     return text.getvalue()

@@ -1,8 +1,8 @@
-"""Variables in a MATLAB `.mat` file: version 5 is read here, version 7.3 is HDF5 (extra `mat`).
+"""Variables in a MATLAB `.mat` file; files of version 7.3 are HDF5 and need the extra `mat`.
 
-Numeric and logical arrays are signals, with `t` as the clock; the fields of a structure `s` are called `s.x`.
-A column of a matrix (samples, k) is a component of a vector. Texts, cells and objects are left out. Complex
-numbers are not signals: requesting one is an error.
+Numeric and logical arrays are signals; `t` is the time. The fields of a structure `s` are called `s.x`, and
+the columns of a matrix (samples, k) are the components of a vector. Texts, cell arrays and objects are left
+out. Complex numbers are not signals: requesting one is an error.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _RATIO = 1100
 
 
 def read(path: Path) -> Recording:
-    """Return the numeric variables of a file.
+    """Return the numeric variables of a `.mat` file.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
         MissingError: R301, version 7.3 needs `h5py`.
-        TraceError: E603, another format, damaged, or larger than it may be.
+        TraceError: E603, the file is of another format, damaged, or larger than the limit.
     """
     with opened(path), path.open("rb") as file:
         head = file.read(520)
@@ -52,7 +52,7 @@ def read(path: Path) -> Recording:
 
 
 def _as_signal(values: Array) -> Array:
-    """The array; a matrix of one row or column becomes (samples,)."""
+    """The array; a matrix with a single row or column is flattened to (samples,)."""
     if values.ndim == 2 and 1 in values.shape:
         return values.reshape(-1)
     return values
@@ -76,7 +76,7 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
 
 
 def _real(values: Array) -> Array:
-    """Pairs of real and imaginary parts as complex numbers; real numbers where all imaginary parts are 0."""
+    """Combine real and imaginary parts to complex numbers, or to real ones if all imaginary parts are 0."""
     if values.dtype.names is None:
         return values
     real, turned = (values[part] for part in _COMPLEX)
@@ -84,7 +84,7 @@ def _real(values: Array) -> Array:
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """Numeric datasets below a group; links out of the file and cycles are not followed."""
+    """Yield the numeric datasets below a group by name, without following links."""
     h5py = needed("h5py")
     if depth > 8 or len(group) > MAX_ARRAYS:
         raise unreadable(path, "it is nested too deeply, or holds too many arrays")

@@ -1,7 +1,7 @@
 """MATLAB's file format of version 5 ("MAT-File Level 5"), restricted to numbers; no content is executed.
 
-Elements are a tag (type, number of bytes) and data, padded to 8 bytes; a compressed element is one element
-deflated. Sizes are checked against the available bytes before memory is allocated.
+A file consists of elements: a tag (type, number of bytes) and data padded to 8 bytes; a compressed element
+contains one deflated element. Sizes are checked against the available bytes before memory is allocated.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DEEPEST = 16
 
 
 class _DamageError(Exception):
-    """Bytes that do not follow the format."""
+    """The bytes violate the file format."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class _Element:
 
 
 def read_mat5(path: Path) -> dict[str, Array]:
-    """Return numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are `s.field`.
+    """Return numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are called `s.field`.
 
-    An array is complex where an imaginary part is not 0.
+    An array is complex only if an imaginary part is not 0.
 
     Raises:
-        TraceError: E603, damaged, or larger than it may be.
+        TraceError: E603, the file is damaged, or larger than the limit.
     """
     try:
         raw = path.read_bytes()
@@ -70,7 +70,7 @@ def read_mat5(path: Path) -> dict[str, Array]:
 
 
 def _inflated(data: memoryview, room: int) -> bytes:
-    """The decompressed element, limited to the available room."""
+    """Decompress an element; at most `room` bytes are allowed."""
     engine = zlib.decompressobj()
     out = engine.decompress(data, room)
     if engine.unconsumed_tail:
@@ -102,7 +102,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 @dataclass(frozen=True, slots=True)
 class _Matrix:
-    """The content of an array."""
+    """Type, shape and data of an array in the file."""
 
     kind: int
     logical: bool
@@ -112,7 +112,7 @@ class _Matrix:
 
 
 def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
-    """Name and content of a matrix element; an element without parts is an empty array."""
+    """Name and content of a matrix element; an element without sub-elements is an empty array."""
     parts = list(islice(_elements(data, order), MAX_ARRAYS + 1))
     if len(parts) > MAX_ARRAYS:
         raise _DamageError("too many parts")
@@ -130,7 +130,7 @@ def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
 
 
 def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth: int) -> None:
-    """The array, or the fields of a structure; everything else is left out."""
+    """Add a numeric array, or the fields of a structure, to `found`; other variables are left out."""
     if depth > _DEEPEST or len(found) > MAX_ARRAYS:
         raise _DamageError("nested too deeply, or too many arrays")
     if matrix.kind == _STRUCT:
@@ -145,14 +145,14 @@ def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth:
 
 
 def complex_of(real: Array, turned: Array) -> Array:
-    """Complex numbers from their real and imaginary parts."""
+    """Return complex numbers with these real and imaginary parts."""
     made = np.empty(real.shape, dtype=np.complex128)
     made.real, made.imag = real, turned
     return made
 
 
 def _part(name: str, matrix: _Matrix, index: int, order: str) -> Array:
-    """The real parts of an array, or the imaginary ones."""
+    """The real (`index` 0) or imaginary (1) parts of an array, flattened."""
     values = _numbers(matrix.parts[index], order) if index < len(matrix.parts) else np.zeros(0)
     if len(values) != math.prod(matrix.shape):
         shown = " x ".join(map(str, matrix.shape))

@@ -1,7 +1,7 @@
 """Logs in `.mcap` files (extra `mcap`), read and written: messages of ROS 1 and 2, JSON, Protocol Buffers.
 
-Written files hold JSON with a schema, which Foxglove can plot: a topic per trace, a message per sample. A
-metadata record describes the signals, so that reading the file back gives the same trace.
+Files are written as JSON messages with a schema, which Foxglove can plot: one topic per trace, one message
+per sample. A metadata record describes the signals, so that reading the file back gives the same trace.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ _READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
 def read(path: Path) -> Recording:
-    """The numbers in all messages; signals that are not in every message of their topic are left out.
+    """Read the numbers in all messages; a signal that is missing in a message of its topic is left out.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
         MissingError: R301, `mcap`, or a package for an encoding, is not installed.
-        TraceError: E603, another format, damaged, or without numbers.
+        TraceError: E603, the file is of another format, damaged, or without numbers.
     """
     log = Log(path)
     with damage(path):
@@ -61,7 +61,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(slots=True)
 class _File:
-    """The state of reading a file."""
+    """State of reading one file."""
 
     log: Log
     room: Room
@@ -90,7 +90,7 @@ class _File:
             self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
 
     def decoder(self, channel: Any) -> Decode | None:
-        """The decoder of a channel's messages; None, with a reason, where none exists."""
+        """Return the decoder of a channel's messages; None, with the reason in the log, if there is none."""
         schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
         described = "" if schema is None else schema.encoding
         try:
@@ -109,7 +109,7 @@ class _File:
 
 
 def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
-    """Add the messages of a file to a log; returns the metadata of files that stlc wrote."""
+    """Add the messages of a file to a log; returns the metadata that stlc writes, None for other files."""
     reader = needed("mcap.stream_reader").StreamReader
     ours: Mapping[str, str] | None = None
     with mapped(path) as data:
@@ -148,7 +148,7 @@ def _of_json(data: bytes) -> Iterable[MessageNumber]:
 
 
 def _protobuf(schema: Any) -> Decode:
-    """The decoder of messages by the descriptors in the file."""
+    """Return the decoder of Protocol Buffers messages, made from the descriptors in the file."""
     pool = needed("google.protobuf.descriptor_pool").DescriptorPool()
     files = needed("google.protobuf.descriptor_pb2").FileDescriptorSet.FromString(schema.data)
     left = {each.name: each for each in files.file}
@@ -204,11 +204,13 @@ def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[Messa
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write signals as messages of JSON: topic `/NAME` of a file `NAME.mcap`, or `/NAME/0`, `/NAME/1`, ….
+    """Write the signals of a trace as JSON messages.
+
+    The topic is `/NAME` for a file `NAME.mcap`; with several traces the topics are `/NAME/0`, `/NAME/1`, ….
 
     Raises:
-        MissingError: R301, `mcap` is not installed; R201, no room or no permission; an old file stays as it
-            was.
+        MissingError: R301, `mcap` is not installed; R201, no space left or no permission; an existing file is
+            not changed.
     """
     writers = needed("mcap.writer")
     base = "/" + topic_of(Path(path).stem, empty="trace")
@@ -234,7 +236,7 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def _cell(value: float) -> str:
-    """A number as JSON; null for NaN, and a number beyond the range of floats for infinity."""
+    """JSON text of a number: null for NaN, and a number beyond the range of floats for infinity."""
     if math.isnan(value):
         return "null"
     return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"
@@ -254,7 +256,7 @@ def _schema(trace: Trace) -> dict[str, object]:
 
 
 def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
-    """The trace that stlc wrote; None where the file has been changed since."""
+    """Restore the trace that stlc wrote to this file; None if the file was changed afterwards."""
     topics, origin = json.loads(ours.get("topics", "[]")), int(ours.get("origin", "0"))
     if not isinstance(topics, list) or not topics or not all(isinstance(topic, str) for topic in topics):
         return None

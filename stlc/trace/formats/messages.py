@@ -1,8 +1,8 @@
-"""Logged messages as a recording: every number is a signal, every topic has a clock.
+"""Logged messages converted to signals: every number is a signal, and every topic has its own times.
 
-`/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`; a message with the single field `data`
-is named after its topic. Times are those at which a message was logged, in seconds since the first one. Most
-logs are read with `--resample`, since no two topics share a clock.
+A number `twist.twist.linear.x` in topic `/odom` is the signal `odom.twist.twist.linear.x`; in a message with
+the single field `data` the signal has the name of the topic. Times are those at which messages were logged,
+in seconds since the first message. Topics have different times, so most logs are read with `--resample`.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class MessageNumber:
     """A number in a message.
 
     Attributes:
-        name: its path in the message, `twist.linear.x`.
+        name: path of the number in the message, such as `twist.linear.x`.
         value: the number.
-        whole: it is an integer or a truth value.
+        whole: whether the field is an integer or a truth value.
     """
 
     name: str
@@ -62,7 +62,7 @@ Decode = Callable[[bytes], Iterable[MessageNumber]]
 
 
 class DamageError(Exception):
-    """Bytes that do not follow the format."""
+    """The bytes violate the file format."""
 
 
 @dataclass(slots=True)
@@ -72,7 +72,7 @@ class _Topic:
     whole: set[str] = field(default_factory=set)
 
     def arrays(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Increasing times in ns, and the signals that occur in every message, as arrays (messages,)."""
+        """Return increasing times in ns, and the signals that occur in every message: name -> (messages,)."""
         times = np.array(self.times, dtype=np.int64)
         kept = {n: np.array(x, dtype=np.float64) for n, x in self.values.items() if len(x) == len(times)}
         if (np.diff(times) < 0).any():
@@ -83,11 +83,11 @@ class _Topic:
 
 @contextmanager
 def mapped(path: Path) -> Iterator[mmap]:
-    """The bytes of a file, memory-mapped.
+    """Open a file as a memory map.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        TraceError: E603, it is empty, or larger than it may be.
+        TraceError: E603, the file is empty, or larger than the limit.
     """
     with opened(path), path.open("rb") as file:
         size = file.seek(0, 2)
@@ -101,11 +101,11 @@ def mapped(path: Path) -> Iterator[mmap]:
 
 
 class Log:
-    """The collected messages of one or several files.
+    """Messages collected from one or several files.
 
     Attributes:
-        path: for messages.
-        unread: why topics are left out: topic -> reason.
+        path: path of the log, for messages.
+        unread: topic -> reason why it was left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -137,10 +137,10 @@ class Log:
             raise unreadable(self.path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
 
     def recording(self) -> Recording:
-        """A recording with a clock for each topic; signals must be in every message of their topic.
+        """Convert the messages to signals; a signal is left out unless it is in every message of its topic.
 
         Raises:
-            TraceError: E603, no message has a number.
+            TraceError: E603, no message contains a number.
         """
         found = {name: topic.arrays() for name, topic in self._topics.items()}
         origin = min((int(times[0]) for times, _ in found.values() if len(times)), default=0)
@@ -158,7 +158,7 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return times in ns and signals of one topic; empty where it has no message."""
+        """Return times in ns and signals of one topic; empty arrays if it has no message."""
         return self._topics.get(name, _Topic()).arrays()
 
     def _nothing(self) -> str:
@@ -177,7 +177,7 @@ def numbers_of(content: object) -> Iterator[MessageNumber]:
     """Yield all numbers of a JSON message, with their paths.
 
     Raises:
-        OverflowError: a number is larger than a float.
+        OverflowError: a number exceeds the range of floats.
     """
     if isinstance(content, dict) and set(content) == {"data"}:
         content = content["data"]
@@ -213,19 +213,19 @@ def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Mes
 
 
 class Room:
-    """The limit on decompressed bytes, shared by all parts of a file."""
+    """Remaining number of bytes that may still be decompressed from a file."""
 
     def __init__(self, path: Path, size: int) -> None:
         self.path = path
         self.left = min(MAX_BYTES, max(_ROOM, _RATIO * size))
 
     def unpacked(self, how: str, data: bytes, size: int) -> bytes:
-        """The decompressed bytes (`bz2`, `lz4`, `zstd`, or none), as many as were declared.
+        """Decompress data that declares `size` decompressed bytes; `how` is `bz2`, `lz4`, `zstd`, or none.
 
         Raises:
-            TraceError: E603, more than there is room for.
-            MissingError: R301, the compression needs a package.
-            DamageError: another number of bytes.
+            TraceError: E603, the data exceeds the remaining limit.
+            MissingError: R301, the compression method needs a package.
+            DamageError: the decompressed data has another size.
         """
         if size > self.left:
             raise unreadable(self.path, f"it unpacks to {size / 1e9:.3g} GB or more", advice="split it")
@@ -246,11 +246,11 @@ class Room:
         return out
 
     def whole(self, message: bytes) -> bytes:
-        """A message, decompressed where it is a `zstd` frame of its own, as in ROS 2."""
+        """Return a message, decompressed if it is a `zstd` frame, as ROS 2 stores compressed messages."""
         return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
 
     def of_unknown_size(self, data: bytes) -> bytes:
-        """The bytes of a `zstd` frame that may not declare its size."""
+        """Decompress a `zstd` frame, which need not declare its size."""
         with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
             out: bytes = reader.read(self.left + 1)
         if len(out) > self.left:

@@ -1,7 +1,7 @@
 """Traces as `.npz` archives, read without unpickling.
 
-The archive is read member by member: the header of each array is checked against the size that the archive
-declares before memory is allocated, against pickles and decompression bombs.
+The archive is read one array at a time. To be safe against pickles and decompression bombs, the header of
+each array is checked against the size that the archive declares before memory is allocated.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def read_npz(path: Path) -> dict[str, Array]:
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        TraceError: E603, it is no archive of plain arrays, is damaged, or would not fit into memory.
+        TraceError: E603, the file is not an archive of plain arrays, is damaged, or would not fit into
+            memory.
     """
     with opened(path):
         file = path.open("rb")
@@ -107,8 +108,8 @@ class ArchiveMember:
     """An array of an open archive, read as a whole or in consecutive chunks of samples.
 
     Attributes:
-        length: number of samples: of the last axis of (samples,) and (1, samples), else of the first one; -1
-            where samples are not contiguous.
+        length: number of samples: the last axis of (samples,) and (1, samples), else the first axis; -1 if
+            the array is stored in Fortran order, so that its samples are not contiguous.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
@@ -122,12 +123,12 @@ class ArchiveMember:
             self.length = -1
 
     def read(self, count: int) -> Array:
-        """The next `count` samples: (count,) or (count, …)."""
+        """Read the next `count` samples: (count,) or (count, …)."""
         values = self._values(count * self._width)
         return values if self._width == 1 else values.reshape(count, *self._shape[1:])
 
     def whole(self) -> Array:
-        """The whole array, in its own shape."""
+        """Read the whole array, in its own shape."""
         values = self._values(math.prod(self._shape)).copy()
         return values.reshape(self._shape, order="F" if self._fortran else "C")
 
@@ -141,7 +142,7 @@ class ArchiveMember:
 
 
 def _infos(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The members of an archive by the names of their arrays."""
+    """The files in an archive by the names of their arrays."""
     members = archive.infolist()
     if len(members) > MAX_ARRAYS:
         raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
@@ -168,7 +169,7 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
 
 
 def _check_letters(path: Path, name: str, values: Array) -> None:
-    """Check that texts hold valid code points. Raises TraceError (E603)."""
+    """Check that texts consist of valid Unicode code points. Raises TraceError (E603)."""
     if values.dtype.kind == "U" and values.dtype.itemsize and values.size:
         letters = values.view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
         if ((letters > _LAST_LETTER) | ((letters >= _PAIRS[0]) & (letters <= _PAIRS[1]))).any():
@@ -178,7 +179,11 @@ def _check_letters(path: Path, name: str, values: Array) -> None:
 def _checked_header(
     path: Path, stream: IO[bytes], member: zipfile.ZipInfo, name: str
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """The header of an array of numbers or texts, checked against the size of the archive's member."""
+    """Read the header (shape, Fortran order, dtype) of an array of numbers or texts.
+
+    Raises:
+        TraceError: E603, another kind of array, or a size that differs from that in the archive.
+    """
     shape, fortran, dtype = _read_header(stream)
     if dtype.hasobject:
         raise unreadable(
@@ -210,14 +215,14 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
 
 
 def read(path: Path) -> Recording:
-    """The trace of a file. Raises as `read_npz`, and TraceError (E603) for a `meta` that is none."""
+    """Return the content of a trace file. Raises as `read_npz`, and TraceError (E603) for a bad `meta`."""
     arrays = read_npz(path)
     meta, columns = read_meta(path, arrays.pop("meta", None))
     return replace(of_arrays(path, arrays, meta), columns=columns)
 
 
 def size(path: Path) -> int:
-    """Bytes of all arrays; 0 where it is no archive."""
+    """Size of all arrays in bytes; 0 if the file is not an archive."""
     if not zipfile.is_zipfile(path):
         return 0
     try:
@@ -249,7 +254,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write all of a trace. Raises as `write_npz`."""
+    """Write a trace with its extras and metadata. Raises as `write_npz`."""
     arrays: dict[str, Array] = {"t": trace.times, **trace.data}
     arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
     arrays["meta"] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
@@ -257,11 +262,11 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def write_npz(path: Path | str, arrays: Mapping[str, Array]) -> None:
-    """Write arrays beside `path`, then rename; the same arrays always give the same bytes.
+    """Write arrays to a temporary file and rename it to `path`; equal arrays always give equal bytes.
 
     Raises:
         TraceError: E603, a name is too long.
-        MissingError: R201, no room or no permission; an old file stays as it was.
+        MissingError: R201, no space left or no permission; an existing file is not changed.
     """
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():

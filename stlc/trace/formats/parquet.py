@@ -1,7 +1,7 @@
 """Traces as `.parquet` files (extra `parquet`): numbers, truth values, times, words and lists.
 
-Units stand in brackets behind a name, `v [km/h]`, or in the field's metadata under `unit`. Columns that hold
-anything else, such as structures, are left out.
+The unit of a column is in brackets after its name, `v [km/h]`, or in the field's metadata under `unit`.
+Columns of other types, such as structures, are left out.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ MAX_LETTERS = 64
 
 
 def read(path: Path) -> Recording:
-    """The columns of a file that can be signals, and its words.
+    """Read the columns of numbers and words of a file.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
         MissingError: R301, `pyarrow` is not installed.
-        TraceError: E603, no such file format, or damaged; E605, columns that do not fit.
+        TraceError: E603, the file is of another format, or damaged; E605, columns that do not fit together.
     """
     file = open_parquet(path)
     with damage(path):
@@ -56,7 +56,7 @@ def open_parquet(path: Path, *, whole: bool = True) -> Any:
 
 
 def size(path: Path) -> int:
-    """Bytes of all numbers."""
+    """Size of all numbers in bytes."""
     metadata = open_parquet(path, whole=False).metadata
     return int(metadata.num_rows * metadata.num_columns * 8)
 
@@ -75,7 +75,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 
 
 def _names(file: Any) -> list[str]:
-    """The columns that can be signals, or hold words."""
+    """Names of the columns of numbers or words."""
     types = needed("pyarrow").types
     found = []
     for field in file.schema_arrow:
@@ -100,10 +100,10 @@ def _list(kind: Any, types: Any) -> bool:
 
 
 def _table(path: Path, table: Any) -> Table:
-    """An arrow table as numbers and words; a missing number is NaN, a missing word empty.
+    """Convert an Arrow table to numbers and words; a missing number is NaN, a missing word empty.
 
     Raises:
-        TraceError: E605, a name twice, lists of different lengths; E603, no line of numbers.
+        TraceError: E605, duplicate column names, or lists of different lengths; E603, there are no lines.
     """
     columns: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
@@ -143,7 +143,7 @@ def _even(lists: Any, size: int) -> bool:
 
 
 def _words(values: Any) -> NDArray[np.str_]:
-    """Texts, deduplicated before they are laid out."""
+    """Texts as an array; each distinct text is converted once."""
     encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
     array = encoded.unify_dictionaries().combine_chunks()
     texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
@@ -151,7 +151,7 @@ def _words(values: Any) -> NDArray[np.str_]:
 
 
 def _floats(values: Any) -> Floats:
-    """Numbers; durations in seconds, time stamps in seconds since the first."""
+    """Numbers as floats; durations in seconds, time stamps in seconds since the first one."""
     arrow = needed("pyarrow")
     kind = values.type
     if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):

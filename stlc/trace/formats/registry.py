@@ -1,11 +1,11 @@
-"""Formats of trace files: one table, and helpers shared by their readers.
+"""Formats of trace files: one table, and helper functions that their readers share.
 
-A format is a module of this package and a line of `FORMATS`. The module holds
+A format is a module of this package and an entry of `FORMATS`. The module contains
 
 - `read(path) -> Recording`;
-- if it `writes`: `write(path, trace)`;
-- if it is `chunked`: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in chunks), and
-  `chunks(path, samples) -> Iterator[Recording]`.
+- if the format has `writes` set: `write(path, trace)`;
+- if the format has `chunked` set: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in
+  chunks), and `chunks(path, samples) -> Iterator[Recording]`.
 
 It imports optional libraries with `needed`.
 """
@@ -32,13 +32,13 @@ class Format:
     """A format of trace files.
 
     Attributes:
-        module: of this package.
-        suffixes: of its files, in lower case; files are written with the first.
-        extra: of the package `stlc`, that installs the packages of the format.
-        packages: modules of that extra.
-        writes: traces can be written.
-        chunked: files can be read a number of samples at a time.
-        folder: a folder may be one recording.
+        module: name of the module in this package.
+        suffixes: suffixes of its files, in lower case; files are written with the first one.
+        extra: name of the extra of the package `stlc` that installs the libraries of the format.
+        packages: modules of these libraries.
+        writes: whether traces can be written in this format.
+        chunked: whether files can be read a number of samples at a time.
+        folder: whether a folder may be one trace.
     """
 
     module: str
@@ -50,7 +50,7 @@ class Format:
     folder: bool = False
 
     def function(self, name: str) -> Any:
-        """A function of the module, imported now."""
+        """Import the module and return one of its functions."""
         return getattr(import_module(f"{__package__}.{self.module}"), name)
 
 
@@ -69,7 +69,7 @@ _PACKAGES = {"google": "protobuf"}
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file, by its suffix; by default the first."""
+    """The format of a file by its suffix; the first format of the table if the suffix is unknown."""
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
@@ -79,7 +79,7 @@ def format_of(path: Path) -> Format:
 
 
 def needed(module: str) -> Any:
-    """The module, imported.
+    """Import and return a module.
 
     Raises:
         MissingError: R301, its package is not installed.
@@ -94,7 +94,7 @@ def needed(module: str) -> Any:
 
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
-    """E603: the file cannot be read, or is not safe to read."""
+    """Return the error E603: the file cannot be read, or is not safe to read."""
     return TraceError(
         Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
     )
@@ -124,5 +124,5 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def room_for(path: Path) -> int:
-    """Limit in bytes on the unpacked size of a packed file."""
+    """Greatest allowed unpacked size of a compressed file, in bytes."""
     return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))

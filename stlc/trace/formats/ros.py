@@ -1,9 +1,10 @@
-"""Decoders of ROS 1 and ROS 2 messages, from the definitions in the bag.
+"""Decoders of ROS 1 and ROS 2 messages, made from the message definitions in the bag.
 
-A definition is the text of a `.msg` file, followed by those of the messages within, each behind a line of `=`
-and `MSG: package/Type` (https://wiki.ros.org/msg,
-https://design.ros2.org/articles/interface_definition.html). A message is packed bytes in ROS 1; in ROS 2 it
-is CDR: a head of 4 bytes, then values on multiples of their size. No definition is ever turned into code.
+A definition is the text of a `.msg` file, followed by the definitions of nested messages, each preceded by a
+line of `=` and `MSG: package/Type` (https://wiki.ros.org/msg,
+https://design.ros2.org/articles/interface_definition.html). A ROS 1 message is a sequence of packed values; a
+ROS 2 message is CDR: a header of 4 bytes, then values aligned to multiples of their size. Definitions are
+interpreted, never executed.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ _MAX_NESTED = 32
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field: name, type (a message where `inner`), and count.
+    """A field of a message: name, type and count; a nested message has its layout in `inner`.
 
     Attributes:
-        count: of an array of fixed length, -1 of one of any length, None of a single value.
+        count: length of a fixed-length array, -1 for an array of variable length, None for a single value.
     """
 
     name: str
@@ -49,22 +50,22 @@ class _Field:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """The fields of a message in order, and its least number of bytes."""
+    """The fields of a message in order, and its smallest possible number of bytes."""
 
     fields: tuple[_Field, ...]
     least: int
 
     @property
     def stamp(self) -> bool:
-        """True if the message is a time stamp."""
+        """True if the message is a time stamp (seconds and nanoseconds)."""
         return {each.name for each in self.fields} in STAMPS
 
 
 def decoder(definition: str, form: Form) -> Decoder:
-    """The decoder of the messages of a definition.
+    """Return the decoder of messages of a definition.
 
     Raises:
-        DamageError: it is no definition, has no end, or names a message that it does not define.
+        DamageError: the text is not a definition, contains itself, or refers to an undefined message.
     """
     if len(definition) > _MAX_TEXT:
         raise DamageError("a definition of more than a million letters")
@@ -77,12 +78,12 @@ def decoder(definition: str, form: Form) -> Decoder:
 
 
 def _short(name: str) -> str:
-    """`package/Type`, without the folder that ROS 2 adds."""
+    """Message type as `package/Type`, without the folder `msg`, `action` or `srv` that ROS 2 adds."""
     return name.replace("/msg/", "/").replace("/action/", "/").replace("/srv/", "/")
 
 
 class _Builder:
-    """Builder of layouts from the texts of definitions."""
+    """Builder of message layouts from the texts of definitions."""
 
     def __init__(self, texts: dict[str, str], form: Form) -> None:
         self.texts, self.form = texts, form
@@ -106,7 +107,7 @@ class _Builder:
         return _Field(match["name"], kind, count, self.inner(kind, package, depth))
 
     def inner(self, kind: str, package: str, depth: int) -> _Layout | None:
-        """The layout of a nested message; None for a plain type."""
+        """Layout of a nested message type; None for a type that is not a message."""
         if kind in _CODES or kind in _TEXTS or (kind in _STAMPS and self.form == "ros1"):
             return None
         name = "std_msgs/Header" if kind == "Header" else _short(kind)
@@ -145,11 +146,11 @@ class Decoder:
     form: Form
 
     def __call__(self, data: bytes) -> Iterator[MessageNumber]:
-        """All numbers of a message, by path; stamps of headers are left to the clock.
+        """Yield all numbers of a message with their paths; headers are skipped.
 
         Raises:
-            DamageError: the message is shorter than its definition, or has a length that it cannot have.
-            struct.error: it ends early.
+            DamageError: the message is shorter than its definition, or an array is longer than the message.
+            struct.error: the message ends early.
         """
         if self.form == "ros1":
             cursor = _Cursor(data, 0, "<", self.form)
@@ -163,7 +164,7 @@ class Decoder:
 
 
 def _kept(numbers: Iterator[MessageNumber], wanted: bool) -> Iterable[MessageNumber]:
-    """The numbers, or none where they are not wanted: then all are read, to move the position past them."""
+    """The numbers if `wanted`, else none; the iterator is consumed then, to move the position past them."""
     if wanted:
         return numbers
     deque(numbers, maxlen=0)
@@ -171,7 +172,7 @@ def _kept(numbers: Iterator[MessageNumber], wanted: bool) -> Iterable[MessageNum
 
 
 class _Cursor:
-    """A position in a message."""
+    """Read position in a message."""
 
     def __init__(self, data: bytes, start: int, order: str, form: Form) -> None:
         self.data, self.at, self.start, self.order, self.form = data, start, start, order, form
@@ -204,7 +205,7 @@ class _Cursor:
             yield from _kept(self.value(f"{name}[{i}]", each, depth + 1), wanted)
 
     def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
-        """The numbers of an array; long arrays are data and are skipped."""
+        """Yield the numbers of an array; long arrays (images, point clouds) are skipped."""
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
             self.align(size)
@@ -245,7 +246,7 @@ class _Cursor:
         self.at += length
 
     def take(self, code: str) -> tuple[Any, ...]:
-        """The next values, all of one size."""
+        """Read values of the `struct` format `code`."""
         if self.form == "cdr":
             self.align(struct.calcsize(code[0]))
         values = struct.unpack_from(self.order + code, self.data, self.at)

@@ -1,4 +1,4 @@
-"""Recordings from tables with one line per sample; lines may belong to several traces."""
+"""Tables with one line per sample, converted to signals; lines may belong to several traces."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _SPELLINGS = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A file as read.
+    """Content of a table file.
 
     Attributes:
         columns: name -> values, one per line of the file; numbers, or texts.
-        units: unit in brackets behind a name, "" where there is none.
+        units: name -> unit in brackets after the name; "" if there is none.
     """
 
     columns: dict[str, Array]
@@ -47,7 +47,7 @@ class Table:
 
 
 def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recording:
-    """Return the recording of a table, with one clock.
+    """Convert a table to signals with one time column.
 
     Raises:
         TraceError: E605, traces that differ in length or in their times, or an invalid unit.
@@ -66,7 +66,7 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
 
 
 def is_unit(text: str) -> bool:
-    """True if a text in brackets after a name is a unit."""
+    """True if a text in parentheses after a name is a known unit."""
     if text.lower() in _SPELLINGS:
         return True
     try:
@@ -77,13 +77,13 @@ def is_unit(text: str) -> bool:
 
 
 def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
-    """The times of a column in seconds. Raises TraceError (E605) for a unit that is not a time."""
+    """Times of a column in seconds. Raises TraceError (E605) for a unit that is not a unit of time."""
     scale = clock_scale(f"`{path}`", name, unit)
     return clock if scale == 1 or clock.dtype.kind == "U" else clock * scale
 
 
 def clock_scale(trace: str, name: str, unit: str) -> float:
-    """Return the seconds of one unit of a clock. Raises TraceError (E605) for a unit that is not a time."""
+    """Return the number of seconds per unit of a time column. Raises TraceError (E605) for other units."""
     text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
     try:
         time = parse_unit(text)
@@ -96,7 +96,7 @@ def clock_scale(trace: str, name: str, unit: str) -> float:
 
 
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
-    """Columns (lines,) -> (traces, samples)."""
+    """Reshape columns (lines,) to (traces, samples)."""
     labels, sizes = np.unique(keys, return_counts=True)
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))
