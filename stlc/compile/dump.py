@@ -25,16 +25,16 @@ LONG, SHOWN = 24, 8
 """Length in lines from which a formula is truncated, and lines shown then."""
 
 _TIED = re.compile(r" (?=[<>=!*/+-]+ )|(?<= [<>=!*/+-]) |(?<=[<>=!]=) ")
-"""Blanks around the signs of comparisons and sums."""
+"""Pattern of the blanks around the signs of comparisons and sums."""
 
 Part: TypeAlias = Literal["all", "steps", "states", "ir"]
-"""Part to show: everything, time in samples, the states, or the formulas."""
+"""Part of the text to show: everything, the intervals in samples, the states, or the formulas."""
 
 
 def dump(compiled: Compiled, part: Part = "all") -> str:
     """Return the text of one part of a compiled specification.
 
-    It is determined by the specification and the time grid.
+    It depends on nothing but the specification and the time grid.
     """
     blocks = ["\n".join(_head(compiled))]
     if part == "all":

@@ -45,9 +45,9 @@ from stlc.source import Span
 Purpose: TypeAlias = Literal["train", "check"]
 """Purpose of a compilation.
 
-`train`: plans over the horizon; absolute intervals and past operators become states, and no window may extend
-beyond the plan (E306).
-`check`: recorded traces; absolute intervals are evaluated on the mission clock.
+`train`: plans over the horizon. Absolute operators (`always@[a, b]`, timed from the start of the mission) and
+past operators become added states, and no window may extend beyond the plan (E306).
+`check`: recorded traces. Absolute operators are timed from the first sample.
 """
 
 
@@ -265,7 +265,7 @@ class _Stage:
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
         """Return a requirement with `always@[a, b]` and its like, and for training past operators, rewritten.
 
-        For recorded traces it is a formula that is evaluated at the first sample.
+        For recorded traces a formula with such operators is evaluated at the first sample.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

@@ -55,7 +55,7 @@ class Bracket:
 
 
 def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """Yield the lexemes (words, numbers, strings, signs) of a part of a text; every text has some split.
+    """Yield the lexemes (words, numbers, strings, signs) of a part of a text, whatever the text.
 
     Blanks and comments are left out.
     """

@@ -51,7 +51,7 @@ def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
 
     Args:
         num: a number in SI units.
-        facts: ranges that columns never leave, in stored units.
+        facts: ranges that signals never leave, each in the unit in which the signal is stored.
     """
     match num:
         case ir.Const(value):

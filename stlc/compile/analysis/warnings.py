@@ -118,7 +118,7 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
 
     Args:
         formula: resolved formula.
-        ranges: ranges of columns, declared or enforced, in stored units.
+        ranges: declared or enforced ranges, each in the unit in which its signal is stored.
     """
     for node in nodes(formula):
         if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
@@ -148,9 +148,10 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W503 for implications whose left side is never true, or else for a formula never false.
+    """Yield W503 for each implication in a formula whose left side is never true.
 
-    Only ranges that signals never leave (`facts`) are used: a nominal range does not constrain a signal.
+    Without any, yield W503 if the formula is never false. Only ranges that signals never leave (`facts`) are
+    used: a nominal range does not constrain a signal.
     """
     found = False
     for left in _antecedents(formula):

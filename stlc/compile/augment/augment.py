@@ -134,7 +134,7 @@ _LATCHED: Mapping[AbsoluteOp, str] = {
     "until": "true where {right} holds, false where {left} fails before",
     "release": "true where {left} holds, false where {right} fails before",
 }
-"""Operator -> the condition that latches its status."""
+"""Absolute operator -> text of the condition that decides its status."""
 
 
 def _about(formula: Absolute) -> str:

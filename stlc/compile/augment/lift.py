@@ -38,7 +38,7 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
     """True if the window of `node` contains the present sample.
 
-    A past window that does not may be empty, which decides the operator whatever its body.
+    A past window that does not contain it may be empty; the truth of `node` then does not depend on its body.
     """
     return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
 

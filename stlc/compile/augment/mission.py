@@ -76,7 +76,7 @@ class GoalBranch:
 
 
 Goal: TypeAlias = GoalLeaf | GoalBranch
-"""Boolean structure of a requirement, with its absolute formulas as leaves."""
+"""A requirement as `and`s and `or`s of its absolute formulas (`always@[a, b] p`), which are the leaves."""
 
 
 def last_step(formula: Absolute) -> int:
@@ -102,7 +102,7 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """Return a function from the column of a status to the value of that status one step later.
+    """Return a function from the signal of a status (open, true or false) to its value one step later.
 
     A status that is true or false stays so.
     """

@@ -156,7 +156,7 @@ def _ahead(formula: typed.Formula) -> int:
 
 
 _OPAQUE = (typed.Shift, typed.Edge, typed.Freeze, typed.Recalled)
-"""Formulas that have no form over the past; their operands are not visited."""
+"""Formulas that cannot be stated in terms of the past; their operands are not visited."""
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:
@@ -292,7 +292,7 @@ class _Writer:
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
         """Return a past formula with the truth that `formula` had `steps` samples ago.
 
-        By then `formula` is decided: its lookahead is at most `steps`.
+        Its lookahead is at most `steps`, so that this truth is decided by now.
         """
         if not looks_ahead(formula):
             return self._ago(formula, steps)

@@ -35,7 +35,7 @@ from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 
 REGISTER = 64
-"""Maximum delay in samples that a register holds, one state per sample."""
+"""Maximum number of samples for which the truth of a formula is stored, with one state per sample."""
 
 _ZERO, _ONE = ir.Const(0.0), ir.Const(1.0)
 _SO_FAR = ir.Window(0, None)

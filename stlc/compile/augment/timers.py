@@ -26,7 +26,7 @@ OPEN, TRUE, FALSE = 0.0, 1.0, -1.0
 """Values of a status."""
 
 MISSING = 1000.0
-"""Robustness lost per missing step before a plan, as counted by a timer."""
+"""Robustness lost for each step that a timer lacks before the plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class TimerTable:
         return (*clocks, *self._known.values())
 
     def clock(self, latest: int) -> ir.Signal:
-        """Return the signal of the mission clock, which counts steps, extended to count to `latest`."""
+        """Return the signal of the mission clock (steps since the start), counting to `latest` at least."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")

@@ -27,9 +27,9 @@ from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest, same_dims
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
-"""Source text of a number with its unit."""
+"""Pattern of a number with its unit in the source."""
 _OF_POINTS = ("min", "max", "clip", "choice", "uniform")
-"""Functions that select among points, or draw between them."""
+"""Functions that select among temperatures in degC, or draw between them."""
 
 _LENGTHS = ("abs", "norm", "norm1", "norminf")
 _TEMPERATURE = (0, 0, 0, 0, 1)
@@ -45,7 +45,7 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
     Args:
         name: name of an entry of `stlc.compile.ir.functions.FUNCTIONS`.
-        args: arguments; their number is valid.
+        args: arguments, as many as the function takes.
         span: source location of the whole expression, for findings.
         scope: receives findings.
 
@@ -72,12 +72,12 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
-    """Convert bare numbers to the common unit of all; return the arguments and a template of a result.
+    """Convert numbers without a unit to the unit of the others; return all numbers, and a template.
 
     The template is a number of that unit, whose other fields the caller replaces.
 
     Args:
-        args: numbers that must have one unit.
+        args: numbers that must have one unit, those without a unit (`Number.bare`) excepted.
         what: verb for the message: "compare", "add", or the name of a function.
         span: source location for the finding.
         scope: receives findings.
@@ -167,7 +167,7 @@ def too_large(span: Span | None) -> Diagnostic:
 
 
 def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
-    """Return a bare number with the unit `unit`: 30 becomes 30 deg.
+    """Return a number that was written without a unit as a number of `unit`: 30 becomes 30 deg.
 
     Raises:
         Failed: the result exceeds the range of double precision (E005).
@@ -284,9 +284,9 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 
 
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
-    """Convert numbers, some of which are temperatures, to one offset.
+    """Convert numbers, some of them temperatures in degC, to a common unit.
 
-    It is that of a temperature that is not constant, if there is one.
+    It is the unit of a temperature that varies, if there is one.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -624,7 +624,7 @@ def negated(number: Number, span: Span) -> Number:
 
 
 def half(span: Span) -> Number:
-    """Return the margin of a truth value, 1/2."""
+    """Return the number 1/2, the margin of a truth value."""
     return literal(Fraction(1, 2), span)
 
 

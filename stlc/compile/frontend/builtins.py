@@ -58,7 +58,10 @@ FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "dilate": ("region", "margin"),
     }
 )
-"""Names of the arguments; `polygon`, `union` and `intersect` take any number of them without names."""
+"""Names of the arguments of region functions.
+
+`polygon`, `union` and `intersect` take any number of arguments without names.
+"""
 
 
 def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Region:
@@ -185,7 +188,7 @@ _SECOND = SYMBOLS["s"]
 def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of a function that reads other samples, such as `next`, `shift` or `rise`.
 
-    The number of arguments is valid.
+    The call has as many arguments as the function takes.
 
     Raises:
         Failed: an argument is no formula (E201) or has a wrong type (E205).
@@ -423,7 +426,7 @@ def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
 def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
     """Return `ind(phi, sharpness = w)`: 1 where the state formula phi holds, else 0.
 
-    In training it is smoothed (Eq. 6 of the paper), with the factor w.
+    In training it is smoothed with the factor w (`stlc.compile.ir.nodes.Indicator`).
     """
     if not call.args or call.args[0].name is not None or len(call.args) > 2:
         message = "`ind` takes a formula, and perhaps `sharpness = w`"

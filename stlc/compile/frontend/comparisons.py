@@ -33,7 +33,7 @@ from stlc.units import Unit
 
 
 def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> typed.Formula:
-    """Return the conjunction of adjacent comparisons in a chain `a <= b < c`."""
+    """Return the conjunction of the comparisons in a chain such as `a <= b < c`."""
     pairs = []
     for index, op in enumerate(expr.ops):
         left, right = expr.operands[index], expr.operands[index + 1]

@@ -180,7 +180,7 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
 def columns_of(
     decl: ast.Signal | ast.Param, enums: Mapping[str, Labels], interface: Interface | None, scope: Scope
 ) -> tuple[Column, ...]:
-    """Return the columns of a signal or parameter, one per component, without ranges.
+    """Return the columns (name, unit, kind) of a signal or parameter, one per component, without ranges.
 
     If there is a system, they are matched with its columns.
 
@@ -267,7 +267,7 @@ def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Inte
 def ranged(
     columns: Sequence[Column], unit: Unit, decl: ast.Signal | ast.Param, scope: Scope
 ) -> tuple[Column, ...]:
-    """Return the columns with their declared ranges, in stored units.
+    """Return the columns with their declared ranges, each in the unit of its column.
 
     The ranges of `env` signals are enforced: analyses may rely on them. Those of others are nominal.
 
@@ -318,7 +318,7 @@ def ends_of(
 def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope) -> Iterator[float | None]:
     """Yield the values of constant expressions in the unit of the column; None for `inf`.
 
-    A bare number is in the declared `unit`.
+    A number without a unit is in the declared `unit`.
     """
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, TimeExpr) and value.end:
@@ -500,7 +500,7 @@ _ENTRIES: Mapping[type, Callable[[_EntryBuilder, Any], Entry]] = {
     ast.Def: _EntryBuilder.macro,
     ast.Extern: lambda builder, item: external(item, builder.interface, _about(item), builder.scope),
 }
-"""Class of declarations -> its entry in the name table."""
+"""Class of declarations -> function that returns the entry of a declaration in the name table."""
 
 
 def _about(item: ast.Item) -> str:

@@ -708,4 +708,4 @@ _REPEATS: Mapping[type[ast.Node], Callable[[Any, Value], bool]] = MappingProxyTy
         ast.Call: lambda _, value: isinstance(value, typed.Edge),
     }
 )
-"""Class of expressions -> whether their expansion has operands twice: `a <-> b` is `a -> b` and `b -> a`."""
+"""Class of expressions -> whether the expansion repeats operands: `a <-> b` is `a -> b` and `b -> a`."""

@@ -104,7 +104,7 @@ def resolve_number(
         expr: syntax tree of the expression.
         scope: names that it may use; findings are appended to `scope.sink`.
         expected: column that stores the number. The members of its enum are in scope; `true` is 1, and a
-            formula is 1 where it holds; a bare number takes its unit, and any other unit is E203.
+            formula is 1 where it holds; a number without a unit takes its unit, and any other unit is E203.
         what: role of the number, for messages: "the flow of `x`".
 
     Raises:
@@ -173,7 +173,10 @@ def _member_of_column(value: EnumMember, expr: ast.Expr, column: Column, scope: 
 
 
 def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:
-    """Return a number after checking its type and unit against the column; a bare one takes its unit."""
+    """Return a number after checking its type and unit against a column.
+
+    A number without a unit takes the unit of the column.
+    """
     values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
     if column.kind in ("bool", "enum"):
         fits = (number.kind == column.kind and number.labels == column.labels) or number.constant in values

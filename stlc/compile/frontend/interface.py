@@ -36,7 +36,7 @@ class Interface:
 
     Attributes:
         name: name of the system.
-        signature: states in order, with stored units.
+        signature: states in order, with the units in which they are stored.
         constants: (value in SI units, unit) of each constant, by name.
         externs: names of the functions that the system provides.
         functions: loaded functions, by name.

@@ -25,7 +25,7 @@ TIME_WORDS = MappingProxyType(
         "end": TimeExpr(end=True),
     }
 )
-"""Built-in time -> its value."""
+"""Name of a built-in time -> its value."""
 
 
 def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
@@ -97,7 +97,7 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
 
 
 def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
-    """Return a bare number as a time in the unit of the `time` pragma or, without one, in seconds.
+    """Return a number without a unit as a time, in the unit given by `time UNIT`, else in seconds.
 
     In seconds it is reported by W101, unless it is 0.
     """

@@ -75,7 +75,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Return a value in the declared unit: a bare number takes it, any other number must agree."""
+    """Return a value in the declared unit, which a number without a unit takes and others must agree with."""
     if isinstance(value, VectorValue):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)

@@ -76,7 +76,7 @@ def parameters(
     Args:
         decl: declaration.
         columns: columns of its components, with their ranges.
-        unit: declared unit, which bare numbers take.
+        unit: declared unit, which numbers without a unit take.
         interface: interface of the system, which may have the parameter as a state.
         scope: names that the distribution may use; receives findings.
 

@@ -165,8 +165,9 @@ def composed(
     Args:
         region: the composed region.
         inner: function that returns the signed distance to a part.
-        opposite: function that returns the signed distance to a region of which the complement is taken,
-            still without its sign reversed. It returns the greatest one where `inner` returns the least.
+        opposite: function that returns the signed distance to a region whose complement is taken, before its
+            sign is reversed. Where `inner` returns the least distance, it returns the greatest, and vice
+            versa.
         margin: function that returns the margin of a dilation.
         span: source location of the expression.
         scope: receives findings.
@@ -221,9 +222,10 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
 
 
 def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return twice the signed area of a triangle of varying points: positive if `point` is left of it.
+    """Return `turn(start, end, point)` for points that vary.
 
-    This is `turn(start, end, point)`, and "left" is seen along the edge from `start` to `end`.
+    It is twice the signed area of the triangle: positive if `point` is left of the edge from `start` to
+    `end`.
     """
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)

@@ -128,7 +128,7 @@ class Definition:
         name: name of the definition.
         body: the expression.
         formals: names of the arguments.
-        unit: unit that the value must have, and that bare numbers take; None for any.
+        unit: unit that the value must have, and that numbers without a unit take; None for any.
         sort: type that the value must have.
         about: description, for messages.
         span: source location of its declaration.
@@ -182,8 +182,8 @@ class Scope:
         error: class of the errors raised: `SpecError`, or `SystemFileError` in a system file.
         samplers: whether random draws such as `uniform(…)` are allowed.
         temporal: whether temporal operators are allowed.
-        time_unit: unit of bare numbers in intervals; "" without a `time` pragma.
-        facts: ranges that columns never leave, in stored units.
+        time_unit: unit of numbers without a unit in intervals; "" if the file does not declare one.
+        facts: ranges that signals never leave, each in the unit in which the signal is stored.
         system_hints: advice for names that only the system declares, by name.
         modules: scopes of imported files, by alias.
         product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)` (`@product`).
@@ -312,7 +312,7 @@ def constant_entries(
 
 
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Return the ranges that columns never leave, in stored units.
+    """Return the ranges that columns never leave, each in the unit of its column.
 
     These are the ranges of bools and enums, and those that the column declares as a fact.
     """

@@ -48,10 +48,10 @@ from stlc.source import Span
 _SHORT = 1e-9
 """Length in SI units below which a segment counts as a point."""
 _AHEAD = 1e-6
-"""Parameter offset into a piece at which its active faces are determined."""
+"""Distance into a piece, as a share of the segment, at which its active faces are determined."""
 
 Pair = tuple[Number, Number]
-"""A number at both ends of the segment; linear in between."""
+"""Values of a number at both ends of the segment; it is linear in between."""
 T = TypeVar("T")
 
 
@@ -209,7 +209,7 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Return the distance of the segment to every edge; where they cross, the negative crossing depth."""
+        """Return the distance of the segment to every edge; where they cross, minus the crossing depth."""
         now, then = self.ends
         past = edges([self.past(corner) for corner in corners])
         turns = edges([side(corner, now, then, self.span, self.scope) for corner in corners])

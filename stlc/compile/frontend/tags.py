@@ -24,7 +24,7 @@ from stlc.source import Span
 
 
 def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Return every declared range, enforced or not, in stored units."""
+    """Return the declared range of each column that has one, enforced or not, in the unit of the column."""
     return {
         column.name: (column.low, column.high)
         for column in columns

@@ -39,9 +39,9 @@ class _Definedness(Analysis[Defined]):
         return np.ones(self.samples, dtype=bool)
 
     def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
-        """Return where all operands that an operator reads are defined.
+        """Return, per sample, whether the operands are defined at every instant at which they are read.
 
-        Where the window of the operator is empty, it reads no operand.
+        An operator with an empty window reads none.
         """
         if all(each == ir.NOW for each in offsets):
             return reduce(np.logical_and, parts)

@@ -104,7 +104,11 @@ def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | 
 
 
 def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
-    """Return the first sample of an interval that starts at `lo` (in steps), an excluded end left out."""
+    """Return the first sample inside an interval that starts at `lo` (in steps).
+
+    If `lo` lies between two samples, this is the earlier one if `outward`, else the later one. A sample at
+    `lo` is skipped if `excluded`.
+    """
     if lo.denominator != 1:
         return math.floor(lo) if outward else math.ceil(lo)
     return int(lo) + 1 if excluded else int(lo)

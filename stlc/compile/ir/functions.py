@@ -4,8 +4,8 @@ An entry gives arity, units, implementations for numbers, arrays and C, derivati
 added here is available in the resolver, the array back ends, the C code with its gradients, interval
 arithmetic and the editors.
 
-The names are those of `stlc.compile.ir.nodes.Op`, except those of functions that the front end rewrites
-(`REWRITTEN`).
+An `ir.Op` refers to an entry by its name. Functions that the front end rewrites to arithmetic (`REWRITTEN`)
+have no entry.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ SHARED: Final = "shared"
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One entry of the table.
+    """Entry of the table of built-in functions.
 
     Attributes:
         name: name of the function in an `ir.Op`.
         least: smallest number of arguments.
         most: largest number of arguments; None for any.
         rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
-            `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions.
+            `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions; the
+            others: units are multiplied, divided, … like the numbers.
         kind: `operator`: written with a sign; `sampler`: draws random values, only in initial sets and
             events; `function`: any other.
         doc: one sentence for editors; "" for operators.
@@ -47,8 +48,8 @@ class Function:
         array: function that builds the result from the operands by operations of a tape
             (`stlc.compile.backends.array.tape`); None: the kernel of the same name of the array library is
             called.
-        numpy: name of that kernel in NumPy; "" where `NumpyOps` defines it itself.
-        torch: name of that kernel in torch; "" where `TorchOps` defines it itself.
+        numpy: name of the kernel in NumPy; "" if `NumpyOps` defines the kernel itself.
+        torch: name of the kernel in torch; "" if `TorchOps` defines the kernel itself.
         c: function from the C expressions of the arguments to the C expression of the result; that of an
             extremum takes two arguments.
         slopes: function from the C expressions of the result and of the arguments to the C expressions of the
@@ -57,10 +58,10 @@ class Function:
             name of the one that reduces the results (`norm1` is `abs`, then `add`).
         bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
             ValueError, OverflowError or ZeroDivisionError where it is undefined.
-        exact: rational arguments give a rational result.
-        whole: integer arguments give an integer result.
-        integral: the result is always an integer.
-        linear: scaling all arguments by a positive factor scales the result by that factor.
+        exact: whether rational arguments give a rational result.
+        whole: whether integer arguments give an integer result.
+        integral: whether the result is always an integer.
+        linear: whether scaling all arguments by a positive factor scales the result by that factor.
         symbol: sign with which an operator is written; "" for others.
     """
 
@@ -181,14 +182,14 @@ def _function(
     """Return the entry of a function with one argument per slope.
 
     Args:
-        name: as for `Function`.
-        doc: as for `Function`.
-        rule: as for `Function`.
-        fold: as for `Function`.
+        name: as in `Function`.
+        doc: as in `Function`.
+        rule: as in `Function`.
+        fold: as in `Function`.
         c: C expression of the result, in the arguments `{0}`, `{1}`, ….
         slopes: one C expression per argument: the derivative by it, in the arguments `{0}`, `{1}`, … and the
             result `{r}`.
-        bounds: as for `Function`; None: the function is monotone in each argument.
+        bounds: as in `Function`; None: the function is monotone in each argument.
         **rest: other attributes of `Function`.
     """
     return Function(
@@ -232,7 +233,10 @@ def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str 
 
 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
-    """Return the entry of a function of one or more arguments that scales with them (`Function.linear`)."""
+    """Return the entry of a function of one or more arguments.
+
+    Scaling all of them by a positive factor scales its result (`Function.linear`).
+    """
     return Function(name, 1, None, "same", doc=doc, fold=fold, bounds=bounds, linear=True, **rest)
 
 
@@ -428,7 +432,7 @@ _SAMPLERS = (
 FUNCTIONS: Mapping[str, Function] = MappingProxyType(
     {function.name: function for function in (*_OPERATORS, *_FUNCTIONS, *_SAMPLERS)}
 )
-"""Every `ir.Op` by name."""
+"""Table of built-in functions: entry by name, to which an `ir.Op` refers."""
 
 REWRITTEN: Mapping[str, tuple[int, int | None]] = MappingProxyType(
     {
@@ -441,7 +445,7 @@ REWRITTEN: Mapping[str, tuple[int, int | None]] = MappingProxyType(
         "ind": (1, 2),
     }
 )
-"""Functions rewritten to arithmetic -> least and largest number of arguments."""
+"""Functions that the front end rewrites to arithmetic -> least and largest number of arguments."""
 
 REGIONS: tuple[str, ...] = (
     *("circle", "ball", "box", "polygon", "halfspace"),
@@ -452,7 +456,7 @@ REGIONS: tuple[str, ...] = (
 OPERATORS: Mapping[str, str] = MappingProxyType(
     {function.symbol: function.name for function in _OPERATORS if function.least == 2}
 )
-"""The written sign of binary arithmetic -> name of the function."""
+"""Sign of an arithmetic operator with two operands -> name of its function."""
 
 STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
     {
@@ -460,7 +464,7 @@ STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
         **{"shift": (2, 2), "delta": (1, 1), "sweep": (1, 1)},
     }
 )
-"""Functions of other samples -> least and largest number of arguments."""
+"""Functions that read other samples -> least and largest number of arguments."""
 
 
 def callable_names() -> tuple[str, ...]:

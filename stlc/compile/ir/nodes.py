@@ -60,10 +60,11 @@ class Op:
 
 @dataclass(frozen=True, slots=True)
 class Indicator:
-    """1 where a state formula holds, else 0; smoothed in training by `stlc.compile.semantics.switch`.
+    """Number that is 1 where a state formula holds, else 0.
 
-    `sharpness` is the factor w in the smoothed indicator `(1 + tanh(w rho)) / 2` (Eq. 6 of the paper); None:
-    the default sharpness of the switch that evaluates the condition.
+    In training it is smoothed by `stlc.compile.semantics.switch`: `sharpness` is the factor w in `(1 + tanh(w
+    rho)) / 2` (Meng and Fan 2023, Eq. 6), where rho is the margin of the formula; None: the default of the
+    switch that evaluates it.
     """
 
     cond: Formula
@@ -72,7 +73,7 @@ class Indicator:
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """`yes` where a state formula holds, else `no`."""
+    """Number that is `yes` where a state formula holds, else `no`."""
 
     cond: Formula
     yes: Num
@@ -112,7 +113,7 @@ class Body:
 Num: TypeAlias = Const | Signal | ShiftedSignal | FrozenVar | Op | Indicator | Where | Extern
 
 ELAPSED = "#elapsed"
-"""Column that every evaluator provides: index of the current sample."""
+"""Name of the signal that every evaluator provides: the index of the current sample."""
 
 _LONG = 1 << 30
 
@@ -155,7 +156,7 @@ class Operator:
     def offsets(self) -> tuple[Offsets, ...]:
         """Offsets at which each operand is read, in field order.
 
-        Where the last operand, which is read over the window, has no instant, no operand is read.
+        The last operand is read over the window; if the window is empty, no operand is read.
         """
         raise NotImplementedError
 
@@ -191,7 +192,7 @@ class Windowed(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operand: the window."""
+        """Offsets of the operand, which is read over the window."""
         return (self.window_offsets,)
 
 
@@ -272,7 +273,7 @@ class Until(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of `left`, from now to the end of the window, and of `right`: the window."""
+        """Offsets of the operands: `left` from now to the end of the window, `right` over the window."""
         return Offsets(0, self.window.hi), self.window_offsets
 
 
@@ -290,7 +291,7 @@ class Since(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of `left`, from the far end of the window to now, and of `right`: the window."""
+        """Offsets of the operands: `left` from the far end of the window to now, `right` over the window."""
         return Offsets(self.window_offsets.first, 0), self.window_offsets
 
 
@@ -347,9 +348,9 @@ Formula: TypeAlias = (
 OPERATORS: Mapping[str, Any] = MappingProxyType(
     {name: kind for kind in get_args(Formula) if issubclass(kind, Operator) for name in kind.names}
 )
-"""Name of an operator -> its node."""
+"""Name of an operator -> class of its node."""
 
 DUAL: Mapping[str, Any] = MappingProxyType(
     {name: dual for kind in OPERATORS.values() for name, dual in (kind.names, kind.names[::-1])}
 )
-"""Operator -> the operator of its negation."""
+"""Name of an operator -> name of its dual, which a negation turns it into."""

@@ -79,7 +79,7 @@ def _unless(node: typed.Until) -> typed.Formula:
 
 
 def condition(formula: typed.Formula, *, negated: bool = False, flat: bool = False) -> ir.Formula:
-    """Return a state formula as a condition of the IR, with operands that are constant removed.
+    """Return a state formula as a condition of the IR, simplified where an operand is constant.
 
     Args:
         formula: a state formula (`stlc.compile.ir.traverse.is_state`): its truth depends on one instant.
@@ -118,9 +118,10 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
 
 
 def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
-    """Return the `and` or `or` of formulas, with constants removed or, if one decides the result, returned.
+    """Return the `and` or `or` of formulas, simplified where one is a constant.
 
-    `neutral` is the value of the operator without operands: true for `and`, false for `or`.
+    A constant that makes no difference is removed; one that decides the result is the result. `neutral` is
+    the value of the operator without operands: true for `and`, false for `or`.
     """
     kept: list[ir.Formula] = []
     for item in items:

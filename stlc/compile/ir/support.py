@@ -81,7 +81,7 @@ def reach(formula: ir.Formula) -> Reach:
     """Return how many samples before and after its instant a formula requires (lookback and lookahead).
 
     Of a window to the end of the trace only the start is required. The interval of an operator such as
-    `always@[a, b]` counts from the first sample, wherever the operator stands, so its end is a lookahead.
+    `always@[a, b]` counts from the first sample, wherever the operator stands; its end counts as lookahead.
     """
     past, future, clocked = fold(formula, _REQUIRED)
     return Reach(past, max(future, clocked))
@@ -117,7 +117,7 @@ def _offsets(steps: Sequence[int]) -> Reach:
 
 
 _Needs: TypeAlias = tuple[int, int, int]
-"""Lookback, lookahead, and lookahead of operators on the mission clock."""
+"""Lookback; lookahead; and lookahead of operators such as `always@[a, b]`, counted from the first sample."""
 
 
 @final
@@ -134,7 +134,7 @@ class _Required(Analysis[_Needs]):
         return 0, 0, 0
 
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
-        """Return the farthest samples that the operands require, the offsets at which they are read included.
+        """Return what an operator requires: the needs of its operands, shifted by the offsets of the reads.
 
         Of an unbounded window only the near end is required.
         """
@@ -186,7 +186,7 @@ def columns(formula: ir.Formula) -> frozenset[str]:
 
 
 def depends_on_ends(num: ir.Num) -> bool:
-    """True if a number depends on where the trace begins or ends."""
+    """True if a number depends on where the trace begins or ends, as a clamped read does."""
     return any(leaf.clamped for leaf in _shifts(num))
 
 

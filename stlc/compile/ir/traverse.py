@@ -30,7 +30,7 @@ _SORTS: Mapping[str, _Sort] = {
     "tuple[Num, ...]": "numbers",
     "tuple[tuple[str, Num], ...]": "bindings",
 }
-"""Declared type of a field -> sort of its value."""
+"""Declared type of a field of a node class -> kind of children that it holds."""
 
 
 @cache
@@ -176,7 +176,7 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """Return the key under which a program reads a leaf from its inputs."""
+    """Return the key of a signal, a shifted signal or a frozen value in the inputs of a compiled program."""
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name

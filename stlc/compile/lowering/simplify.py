@@ -3,7 +3,8 @@
 Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true until q`
 becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
 associative, nested `and`s and nested `or`s are merged; if it is idempotent, repeated items are removed; if it
-is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`, and likewise for `F`, `H` and `O`.
+is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`, and likewise for `F`, `H` and `O` (eventually,
+historically, once).
 """
 
 from __future__ import annotations
@@ -113,4 +114,4 @@ _LAWS: Mapping[type, Callable[[Any, Semantics], ir.Formula]] = MappingProxyType(
         ir.AtStart: _at_start,
     }
 )
-"""Node class -> law, for nodes with simplified operands."""
+"""Node class -> law that simplifies a node whose operands are simplified already."""

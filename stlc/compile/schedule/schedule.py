@@ -20,10 +20,10 @@ from stlc.compile.ir.traverse import operands as parts_of
 Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """Treatment of instants beyond the last sample.
 
-`strict`: they do not exist, needing one is an error. `truncate`: windows are cut. `lower` and `upper`: the
-trace is open, with unknown predicates -inf or +inf; windows to the end of the trace still end at the last
-known sample. `both` (NumPy, without `freeze`): two traces, the first with lower, the second with upper
-bounds.
+`strict`: they do not exist, and it is an error if one is needed. `truncate`: windows are cut at the last
+sample. `lower` and `upper`: the trace is open, that is, it continues with unknown predicates, of robustness
+-inf or +inf; windows to the end of the trace still end at the last known sample. `both` (NumPy,
+without `freeze`): the batch holds two traces, the first with lower, the second with upper bounds.
 """
 
 Pick: TypeAlias = Literal["min", "max"]
@@ -31,10 +31,10 @@ Pick: TypeAlias = Literal["min", "max"]
 PICKS: Mapping[str, Pick] = MappingProxyType(
     {name: "min" if name == kind.names[0] else "max" for name, kind in ir.OPERATORS.items()}
 )
-"""Operator -> its extremum (of `until`, `since` and their duals, that over the window)."""
+"""Operator -> the extremum that it takes (`until`, `since` and their duals: over the window)."""
 
 _FAR = 256
-"""Instants beyond the last sample up to which no test for a constant tail is made."""
+"""Number of instants beyond the last sample up to which no constant tail of a formula is searched."""
 
 
 def dual(pick: Pick) -> Pick:

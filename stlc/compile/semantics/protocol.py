@@ -9,7 +9,7 @@ from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.schedule.schedule import Pick
 
 Parts: TypeAlias = tuple[Array, ...]
-"""Partial result of an extremum: the extremum so far, or sums that determine it."""
+"""Partial result for some of the operands: their extremum, or sums that determine it."""
 
 
 class Semantics(Protocol):

@@ -38,7 +38,10 @@ __all__ = [
 ]
 
 TOLERANCE = 1e-6
-"""Tolerance of satisfaction, robustness >= -TOLERANCE in float64 (times and start states lie on grids)."""
+"""A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
+
+Times and start states lie on grids, so that exact ties occur.
+"""
 
 
 def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:

@@ -1,7 +1,7 @@
 """Switches: conditions as numbers from 0 to 1, choices as weighted means of their branches.
 
 A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the smooth
-approximation of the paper (Eq. 6); `StraightThrough` has exact values with smooth gradients.
+approximation of Meng and Fan 2023 (Eq. 6); `StraightThrough` has exact values with smooth gradients.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Switch(Protocol):
         Args:
             rho: margin of the condition, which is true iff the margin is > 0 (`strict`) or >= 0.
             strict: whether the inequality is strict.
-            sharpness: factor w of this indicator (Eq. 6 of the paper); None: the default of the switch.
+            sharpness: factor w of a smooth indicator `(1 + tanh(w rho)) / 2`; None: the default of the
+                switch.
             ops: the array library.
         """
 
@@ -58,14 +59,14 @@ class Hard:
         return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """Return the value of the taken branch, bit for bit."""
+        """Return `yes` or `no`, whichever the indicator `weight` selects, bit for bit."""
         return ops.where(ops.gt(weight, 0.5), yes, no)
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class Tanh:
-    """Smooth switching by `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)` (Eq. 6 of the paper).
+    """Smooth switching by `(1 + tanh(w rho)) / 2 = sigmoid(2 w rho)` (Meng and Fan 2023, Eq. 6).
 
     A choice is the mean of both branches, weighted with the indicator.
     """

@@ -210,7 +210,10 @@ def align(lines: Sequence[AlignedColumn]) -> Iterator[str]:
 
 
 def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
-    """Return the lines with first parts of equal width among adjacent declarations of one kind."""
+    """Return the lines with first parts, such as `def NAME`, padded to equal width.
+
+    Padded together are adjacent declarations of one kind.
+    """
     result = list(lines)
     for group in _groups(lines, by_kind=True):
         heads = [i for i in group if lines[i].head]

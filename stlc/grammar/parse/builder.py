@@ -264,4 +264,4 @@ EXPRESSIONS: Mapping[str, BuildRule] = MappingProxyType(
         "if_then_else": node(ast.IfThenElse),
     }
 )
-"""Rule of the grammar -> its function."""
+"""Rule of the grammar -> function that converts its parse-tree nodes."""

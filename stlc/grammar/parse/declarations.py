@@ -190,7 +190,7 @@ DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
         "assume_decl": _declaration(ast.Assume, "formula"),
     }
 )
-"""Rule of the grammar -> its function."""
+"""Rule of the grammar -> function that converts its parse-tree nodes."""
 
 # ---------------------------------------------------------------------- the whole
 

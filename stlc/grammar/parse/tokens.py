@@ -143,7 +143,7 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 def _own(token: Token) -> tuple[Comment, ...]:
     """Return the comments of a dropped token, each on its own line.
 
-    A `##` comment at its end of line becomes a `#` comment, so that it does not document the next item.
+    A `##` comment after the token gets a `#` in front, so that it does not document the next item.
     """
     if token.after is None:
         return token.before

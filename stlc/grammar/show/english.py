@@ -28,7 +28,7 @@ _NAMED = ast.Def | ast.Region | ast.Const
 
 
 REPEATED = 200_000
-"""Limit in characters on definitions repeated with each requirement that uses them."""
+"""Limit in characters up to which a definition is repeated with each requirement that uses it."""
 
 
 class Meanings:
@@ -199,4 +199,4 @@ _PHRASES: Mapping[type, Callable[[Any], str]] = MappingProxyType(
         ast.Name: lambda expr: f"{expr.name} holds",
     }
 )
-"""Class of expressions -> its text in words; other expressions are shown as written."""
+"""Class of expressions -> function that returns one in words; others are shown in the language."""

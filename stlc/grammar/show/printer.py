@@ -168,7 +168,7 @@ _LEVELS: Mapping[type, Level] = MappingProxyType(
         **dict.fromkeys((ast.Index, ast.Attr, ast.Call), Level.POSTFIX),
     }
 )
-"""Expression class -> precedence, where it is constant; other classes are atoms."""
+"""Class of expressions -> precedence, if all of the class have the same; other classes are atoms."""
 
 _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
@@ -193,7 +193,7 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
         ast.IfThenElse: _if,
     }
 )
-"""Class of expressions -> its text."""
+"""Class of expressions -> function that returns the text of one."""
 
 
 # ------------------------------------------------------------------ names, numbers
@@ -341,7 +341,7 @@ _DECLARED: Mapping[type, Callable[[Any], str]] = MappingProxyType(
         ast.Assume: lambda item: f"assume {own_name(item.name)}: {show_expr(item.formula)}",
     }
 )
-"""Class of declarations -> its text, without tags and comment."""
+"""Class of declarations -> function that returns the text of one, without tags and comment."""
 
 _PARTS: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
@@ -355,4 +355,4 @@ _PARTS: Mapping[type, Callable[[Any], str]] = MappingProxyType(
         ast.SetLiteral: show_set,
     }
 )
-"""Class of other nodes -> its text."""
+"""Class of other nodes -> function that returns the text of one."""

@@ -21,8 +21,8 @@ from stlc.compile.semantics.protocol import Parts
 class Mean(ABC):
     """Minimum as a mean: a function of two sums over the operands.
 
-    The parts, which partial results consist of, are the exact minimum, which decides the sign; the sums over
-    the positive and over the negative operands; and the number of finite operands.
+    A partial result (`Parts`) consists of the exact minimum, which decides the sign; the sums over the
+    positive and over the negative operands; and the number of finite operands.
     """
 
     __slots__ = ()
@@ -39,18 +39,24 @@ class Mean(ABC):
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Return the summand of an operand -x, x >= 0; it is 0 for x = 0.
+        """Return the summand of an operand -x that is not positive (x >= 0); it is 0 for x = 0.
 
         The sum is used where some operand is not positive.
         """
 
     @abstractmethod
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """Return the mean where all operands are positive; `count` is the number of finite operands."""
+        """Return the mean where all operands are positive.
+
+        `gains` is the sum of their summands, `count` the number of finite operands.
+        """
 
     @abstractmethod
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """Return the mean where some operand is not positive; `count` is the number of finite operands."""
+        """Return the mean where some operand is not positive.
+
+        `losses` is the sum of the summands of such operands, `count` the number of finite operands.
+        """
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
         """Return the parts of each operand: its value, its two summands, and whether it is finite."""

@@ -16,10 +16,10 @@ class ArithmeticGeometricMean(Mean):
 
     `min(x)` is the geometric mean of `1 + x`, minus 1, where all operands are positive; else the arithmetic
     mean of the negative ones, with the others as 0. It rewards more satisfied operands and larger margins.
-    Predicates should be of similar magnitude: the paper normalises them to [-1, 1].
+    Predicates should be of similar magnitude: the authors normalise them to [-1, 1].
 
-    Sound: the sign is that of the exact robustness. The value is no bound on perturbations of predicates.
-    The gradient is discontinuous where an operand changes sign.
+    Sound: the sign is that of the exact robustness. The value is no bound on perturbations of predicates. The
+    gradient is discontinuous where an operand changes sign.
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:

@@ -1,4 +1,4 @@
-"""`smooth`: log-sum-exp approximations of minimum and maximum, as in the paper."""
+"""`smooth`: log-sum-exp approximations of minimum and maximum (Meng and Fan 2023)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stlc.compile.semantics.protocol import Associative
 @final
 @dataclass(frozen=True, slots=True)
 class LogSumExp(Associative):
-    """The paper's smooth operators (its equation for the approximated robustness score).
+    """Smooth minimum and maximum by log-sum-exp (approximated robustness score of Meng and Fan 2023).
 
     `max(x) = log(sum(exp(k x))) / k`, which overestimates by at most log(n) / k, and `min(x) = -max(-x)`,
     which underestimates by as much.
