@@ -18,7 +18,10 @@ PROGRAM = Program(
         "method and its version, version of the guard, seeds. What is there is not measured again.",
     ),
     package="benchmarks.tables",
-    order=("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
+    order=(
+        *("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
+        "gym",
+    ),
 )
 
 

@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--guard", choices=("none", "paper"), default="none")
     given = parser.parse_args()
     controller = Controller.load(given.controller, given.guard)
-    env = make(given.spec, steps=given.steps)
+    env = make(given.spec, steps=given.steps, world=True)
     for seed in range(given.episodes):
         episode = drive(controller, env, seed=seed)
         word = "satisfied" if episode.satisfied else "violated"

@@ -354,6 +354,7 @@ ROOMS = {
     "export": "export: torch programs, ONNX graphs, C headers",
     "view": "view: plots, animations, reports",
     "editor": "editor: the language server",
+    "gym": "gym: tasks as gymnasium environments",
     "cli": "cli: the command line",
     "../benchmarks": "benchmarks: the tables of the documentation, beside the package",
 }

@@ -60,6 +60,7 @@ HOMES = {
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
     "gymnasium": ("stlc.gym",),
+    "stable_baselines3": ("stlc.gym", "stlc.controller.methods"),
     "lsprotocol": ("stlc.editor",),
     "PIL": ("stlc.view",),
     "numpy": (

@@ -11,6 +11,7 @@ from types import UnionType
 from typing import Any, Literal, NotRequired, TypedDict, Union, get_args, get_origin, get_type_hints
 
 from benchmarks.deployments import Row as DeploymentRow
+from benchmarks.episodes import EpisodeSpeed
 from benchmarks.feasible import KnownFeasible
 from benchmarks.formulas import Timing
 from benchmarks.repairs import Mended
@@ -52,6 +53,7 @@ ROWS: dict[str, dict[str, type]] = {
     "repair": {"rows": Mended},
     "step": {"steps": StepTiming, "speeds": Speed},
     "robustness": {"rows": Timing},
+    "gym": {"rows": EpisodeSpeed},
 }
 """Name of a table -> key in its result -> record of a row."""
 

@@ -1,4 +1,4 @@
-"""The environment passes gymnasium's checker, and its rewards are robustness."""
+"""The single environment passes gymnasium's checker, and is rewarded by the specification."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ import stlc  # noqa: E402
 import stlc.gym  # noqa: E402
 from stlc.diagnostics import UsageError  # noqa: E402
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SPECS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
 
 
+@pytest.mark.parametrize("world", [False, True])
 @pytest.mark.parametrize(("name", "normalised"), [*((name, False) for name in SPECS), (SPECS[0], True)])
 @pytest.mark.filterwarnings("ignore:.*(render|symmetric).*:UserWarning")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_it_passes_the_checker(name: str, normalised: bool) -> None:
-    env = stlc.gym.make(ROOT / "specs" / f"{name}.stl", normalised=normalised)
+def test_it_passes_the_checker(name: str, normalised: bool, world: bool) -> None:
+    env = stlc.gym.make(ROOT / "specs" / f"{name}.stl", normalised=normalised, world=world)
     for space in (env.action_space, env.observation_space):
         assert np.isfinite(space.low).all()
         assert np.isfinite(space.high).all()
@@ -72,8 +73,9 @@ def test_actuators_get_the_action_where_a_feedback_lies_beneath_plans(tmp_path: 
     assert info["state"].tolist() == pytest.approx([0.5])
 
 
-def test_dense_rewards_sum_to_the_robustness_of_the_episode() -> None:
-    env = stlc.gym.make(ROOT / "specs" / "ship_safe.stl")
+@pytest.mark.parametrize("world", [False, True])
+def test_dense_rewards_sum_to_the_robustness_of_the_episode(world: bool) -> None:
+    env = stlc.gym.make(ROOT / "specs" / "ship_safe.stl", reward="dense", world=world)
     _, first = env.reset(seed=4)
     earned, states, actions, over = 0.0, [first["state"]], [], False
     while not over:
@@ -93,8 +95,9 @@ def test_dense_rewards_sum_to_the_robustness_of_the_episode() -> None:
     assert info["satisfied"] == (rho >= -1e-6)
 
 
-def test_sparse_rewards_come_last_and_seeds_repeat() -> None:
-    env = stlc.gym.make(ROOT / "specs" / "reach_n_avoid.stl", reward="sparse")
+@pytest.mark.parametrize("world", [False, True])
+def test_robustness_comes_last_and_seeds_repeat(world: bool) -> None:
+    env = stlc.gym.make(ROOT / "specs" / "reach_n_avoid.stl", world=world)
     action = np.zeros(1, dtype=np.float32)
     runs = []
     for _ in range(2):
@@ -136,9 +139,39 @@ def test_the_rest_of_stlc_does_without_gymnasium() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
 
 
-@pytest.mark.filterwarnings("ignore:.*(infinity|render|Box).*:UserWarning")
-def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "docs" / "gym.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(ROOT)
-    exec(compile(text.split("```python\n")[1].split("```")[0], "gym.md", "exec"), {})
-    assert "in_river" in capsys.readouterr().out
+@pytest.mark.parametrize("reward", ["task", "accuracy"])
+def test_rewards_are_those_of_many_environments(reward: str) -> None:
+    path = ROOT / "specs" / "traffic.stl"
+    single = stlc.gym.make(path, reward=reward)  # type: ignore[arg-type]
+    many = stlc.gym.make_vec(path, 3, reward=reward)  # type: ignore[arg-type]
+    state = single.task.sample(1, seed=8)[0].numpy()
+    ours, _ = single.reset(seed=0, options={"state": state})
+    theirs, _ = many.reset(seed=0, options={"state": state})
+    action = np.array([2.0], dtype=np.float32)
+    for k in range(single.steps):
+        np.testing.assert_allclose(ours, theirs[1], atol=1e-5)
+        ours, reward_here, over, _, info = single.step(action)
+        theirs, rewards, done, _, infos = many.step(np.tile(action, (3, 1)))
+        assert reward_here == pytest.approx(rewards[1], abs=1e-4)
+        assert over == done.all() == (k == single.steps - 1)
+    end = infos["final_info"]
+    assert info["rho"] == pytest.approx(end["rho"][1], abs=1e-9)
+    assert info["robustness"] == pytest.approx(
+        {name: end["robustness"][name][1] for name in info["robustness"]}, abs=1e-9
+    )
+
+
+def test_the_world_goes_beyond_the_model() -> None:
+    path = ROOT / "specs" / "traffic.stl"
+    with pytest.raises(UsageError, match="at most 25 steps"):
+        stlc.gym.make(path, steps=26, world=False)
+    with pytest.raises(UsageError, match="shape"):
+        stlc.gym.make(path).reset(options={"state": [1.0, 2.0]})
+
+
+def test_registered_environments_are_made_by_name() -> None:
+    env = gymnasium.make("stlc/traffic-v0", reward="accuracy", normalised=True)
+    assert env.unwrapped.reward == "accuracy"
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    assert {f"stlc/{name}-v0" for name in SPECS} == {key for key in gymnasium.registry if "stlc/" in key}

@@ -1,0 +1,30 @@
+"""A specification and a system as `gymnasium` environments, for training by other libraries.
+
+`make` gives one environment, `make_vec` many side by side, stepped as one batch in C. Importing this package
+registers the six benchmarks with gymnasium: `gymnasium.make("stlc/traffic-v0")` and `gymnasium.make_vec(…)`.
+A policy that maximises the robustness of episodes satisfies the specification. Needs the extra `stlc[gym]`.
+"""
+
+from __future__ import annotations
+
+try:
+    import gymnasium
+except ModuleNotFoundError:
+    message = "stlc.gym needs gymnasium, which is not installed: pip install 'stlc[gym]'"
+    raise ModuleNotFoundError(message, name="gymnasium") from None
+
+from stlc.gym.single import Reward, SpecEnv, make
+from stlc.gym.vector import SpecVectorEnv, make_vec
+
+__all__ = ["BENCHMARKS", "Reward", "SpecEnv", "SpecVectorEnv", "make", "make_vec"]
+
+BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
+"""Specifications that are registered, each as `stlc/NAME-v0`."""
+
+for _name in BENCHMARKS:
+    gymnasium.register(
+        id=f"stlc/{_name}-v0",
+        entry_point="stlc.gym.single:make",
+        vector_entry_point="stlc.gym.vector:make_vec",
+        kwargs={"spec": f"{_name}.stl"},
+    )

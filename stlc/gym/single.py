@@ -1,0 +1,235 @@
+"""One environment: an episode on the model of a system, or in its world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias, get_args
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.batched import Setting, Worlds
+from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
+from stlc.controller.problem.task import Task
+from stlc.controller.world import world_type
+from stlc.diagnostics import usage
+from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation, task_of
+
+Reward: TypeAlias = Literal["robustness", "accuracy", "task", "dense"]
+"""`dense` is the increase of the robustness in each step: in sum that of the episode less its start's."""
+
+AHEAD = 64
+"""Initial states that are drawn at a time."""
+
+
+class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
+    """Environment of one agent on the model of a system, or in its world, rewarded by a specification.
+
+    An observation is the policy's observation, (k,) float32, followed by the elapsed share of the episode if
+    the episode terminates at its end (the remaining return depends on it). Observations are clipped to finite
+    bounds: those of the states' nominal ranges and of random plans, widened by half. An action is the
+    actuator command, (m,) float32, in physical units, clipped to their range. `info` holds `state`, (n,)
+    float64; after the last step, and with the reward `dense` after each, also `robustness` by requirement,
+    `rho` of the whole, and `satisfied`. Robustness is that of the last horizon, of as much of it as there is
+    (`end = "truncate"`), clipped to ±10.
+
+    Args:
+        task: specification and system.
+        steps: of an episode; by default the horizon of a plan, after which the episode is *terminated*. A
+            longer one continues in the world of the system and is *truncated*.
+        reward: `robustness` or `accuracy` of the episode (0 or 100), with the last step; `task`, the reward
+            of each step that the system file declares; or `dense`, the increase of the robustness in each
+            step.
+        normalised: observations and actions are from -1 to 1, which most learners expect.
+        time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
+        world: whether the agent is in the world of the system; None: only in longer episodes.
+
+    Raises UsageError (U101) where there is no such reward, or a long episode is to be without a world.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        steps: int | None = None,
+        reward: Reward = "robustness",
+        normalised: bool = False,
+        time: bool | None = None,
+        world: bool | None = None,
+    ) -> None:
+        if reward not in get_args(Reward):
+            raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(get_args(Reward))}")
+        if reward != "dense":
+            require_reward(task, reward)
+        self.task, self.reward, self.normalised = task, reward, normalised
+        self.steps = steps or task.horizon
+        self.time = self.steps <= task.horizon if time is None else time
+        if world is False and self.steps > task.horizon:
+            raise usage(
+                f"an episode on the model has at most {task.horizon} steps", "take a world: world=True"
+            )
+        self._actuators, self._bounds = of_actuators(task), of_observation(task, time=self.time)
+        self.action_space = self._actuators.space(unit=normalised)
+        self.observation_space = self._bounds.space(unit=normalised)
+        self._formulas = [rule.formula for rule in task.rules]
+        in_world = self.steps > task.horizon if world is None else world
+        self._motion: _Motion = _InWorld(task, self.steps) if in_world else _OnModel(task)
+        self._driven: list[Tensor] = []
+        self._seeded = False
+        self._rho = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode. The same seed gives the same episodes from here on.
+
+        Args:
+            seed: of all random numbers from here on.
+            options: `state`, (n,), an initial state in place of a random one.
+        """
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            self._motion.seed(int(self.np_random.integers(2**62)))
+            self._seeded = True
+        given = (options or {}).get("state")
+        x = self._motion.begin(None if given is None else initial_state(self.task, given, 1))
+        self._driven = [x]
+        info = self._told(judged=self.reward == "dense")
+        self._rho = info.get("rho", 0.0)
+        return self._seen(), info
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Advance by one step under `action`, (m,)."""
+        if not 0 < len(self._driven) <= self.steps:
+            raise usage("the episode is over", "call `reset` first")
+        held = self._actuators.physical(action, unit=self.normalised)
+        x, u = self._driven[-1], torch.as_tensor(held).reshape(1, -1)
+        plan = self.task.system.planned(x, u)
+        self._driven.append(self._motion.advance(x, plan, len(self._driven)))
+        over = len(self._driven) > self.steps
+        info = self._told(judged=over or self.reward == "dense")
+        whole = self.steps <= self.task.horizon
+        return self._seen(), self._earned(x, plan, info), over and whole, over and not whole, info
+
+    def _earned(self, before: Tensor, plan: Tensor, info: Mapping[str, Any]) -> float:
+        """Reward of the last step, from the state `before` it, (1, n), under `plan`, (1, m)."""
+        if self.reward == "dense":
+            earned, self._rho = info["rho"] - self._rho, info["rho"]
+            return float(earned)
+        system, earned = self.task.system, 0.0
+        if self.reward == "task":
+            earned = float(system.reward(self._driven[-1], system.commanded(before, plan)))
+        if "rho" in info:
+            earned += float(reward_at_end(self.reward, torch.tensor([info["rho"]], dtype=torch.float64)))
+        return earned
+
+    def _seen(self) -> Floats:
+        step = len(self._driven) - 1
+        seen = self.task.system.observe(self._motion.seen(self._driven[-1], step))[0].numpy(force=True)
+        values = np.append(seen, step / self.steps) if self.time else seen
+        return self._bounds.shown(values.astype(np.float32), unit=self.normalised)
+
+    def _told(self, *, judged: bool) -> dict[str, Any]:
+        """The state, and if `judged` the robustness of the last horizon of the episode, or of less."""
+        state = {"state": self._driven[-1][0].numpy(force=True).copy()}
+        if not judged:
+            return state
+        driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
+        columns = {name: driven[:, i, None] for i, name in enumerate(self.task.system.names)}
+        margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")
+        each = np.clip([float(np.broadcast_to(margin, (1, 1))[0, 0]) for margin in margins], -MOST, MOST)
+        named = zip(self.task.rules, each, strict=True)
+        return {
+            **state,
+            "robustness": {rule.name: float(value) for rule, value in named},
+            "rho": float(self.task.graph.overall(torch.as_tensor(each)[None])),
+            "satisfied": bool((each >= -TOLERANCE).all()),
+        }
+
+
+class _Motion(Protocol):
+    """What moves the agent; states are (1, n) float64."""
+
+    def seed(self, seed: int) -> None:
+        """Seed all random numbers from the next episode on."""
+
+    def begin(self, state: Tensor | None) -> Tensor:
+        """Initial state of an episode: `state`, or a random one."""
+
+    def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:
+        """State after step number `step` under `plan`, (1, m)."""
+
+    def seen(self, x: Tensor, step: int) -> Tensor:
+        """State as the agent sees it."""
+
+
+class _OnModel:
+    """Episodes on the model."""
+
+    def __init__(self, task: Task) -> None:
+        self._episodes = Environments(task, 1, generator=torch.Generator(), ahead=AHEAD)
+        self.seed = self._episodes.seed
+
+    def begin(self, state: Tensor | None) -> Tensor:
+        self._episodes.reset(state)
+        return self._episodes.states
+
+    def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:  # noqa: ARG002
+        return self._episodes.step(plan).states
+
+    def seen(self, x: Tensor, step: int) -> Tensor:  # noqa: ARG002
+        return x
+
+
+class _InWorld:
+    """Episodes in the world of the system, each with a world of its own."""
+
+    def __init__(self, task: Task, steps: int) -> None:
+        self._task, self._steps, self._type = task, steps, world_type(task.system.decl)
+        self._random = np.random.default_rng()
+
+    def seed(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+
+    def begin(self, state: Tensor | None) -> Tensor:
+        seeds = (int(self._random.integers(2**62)),)
+        self._worlds = Worlds(self._task, self._type, Setting(seeds, 1, self._steps))
+        x = self._worlds.reset()
+        return x if state is None else state
+
+    def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:
+        return self._worlds.advance(x, plan, step)
+
+    def seen(self, x: Tensor, step: int) -> Tensor:
+        return self._worlds.disturbance.seen(x, step)
+
+
+def make(
+    spec: Path | str,
+    system: Path | str | None = None,
+    *,
+    steps: int | None = None,
+    reward: Reward = "robustness",
+    normalised: bool = False,
+    time: bool | None = None,
+    world: bool | None = None,
+) -> SpecEnv:
+    """Make the environment of a specification file and a system file (default: the one the former names).
+
+    The other arguments are those of `SpecEnv`.
+
+    Raises:
+        UsageError: there is no such file, no system is named, or an argument is wrong.
+        SpecError, SystemFileError: a file is invalid, or they do not fit.
+    """
+    task = task_of(spec, system)
+    return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time, world=world)

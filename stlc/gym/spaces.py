@@ -1,0 +1,127 @@
+"""Observation and action spaces of a task, physical or normalised to [-1, 1], with their conversions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from stlc.compile.analysis.ranges import bounds
+from stlc.controller.problem.task import Task
+from stlc.diagnostics import usage
+from stlc.dynamics.model.system import System
+from stlc.files import find_spec, find_system, read_source
+from stlc.grammar.parse.parser import parse
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Floats: TypeAlias = NDArray[np.float32]
+
+PROBED = 256
+"""Random plans whose observations widen the bounds of the space."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Bounds of a space, (k,) float32, with the conversion between physical and normalised values."""
+
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def of(cls, ranges: Sequence[tuple[float, float]]) -> Bounds:
+        """Bounds from pairs (low, high)."""
+        ends = np.array(ranges, dtype=np.float32).reshape(-1, 2)
+        return cls(ends[:, 0].copy(), ends[:, 1].copy())
+
+    def space(self, *, unit: bool) -> Any:
+        """The space between the bounds, (k,); with `unit` from -1 to 1."""
+        if unit:
+            return Box(-1.0, 1.0, self.low.shape, dtype=np.float32)
+        return Box(self.low, self.high, dtype=np.float32)
+
+    def physical(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
+        """Values (…, k) in physical units, clipped to the bounds; with `unit` they are given normalised."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        value = np.asarray(given, dtype=np.float64)
+        return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)
+
+    def shown(self, value: NDArray[np.float32], *, unit: bool) -> Floats:
+        """Physical values (…, k) clipped to the bounds; with `unit` normalised."""
+        if not unit:
+            return np.clip(value, self.low, self.high)
+        factor = 2.0 / (self.high - self.low)
+        scaled: Floats = value * factor
+        scaled -= self.low * factor + 1.0
+        return np.clip(scaled, -1.0, 1.0, out=scaled)
+
+
+def of_actuators(task: Task) -> Bounds:
+    """Ranges of the actuators."""
+    return Bounds.of(task.system.actuators)
+
+
+def of_observation(task: Task, *, time: bool) -> Bounds:
+    """Bounds of the policy's inputs: nominal ranges and those of random plans, widened by a quarter each way.
+
+    With `time` the elapsed share of the episode, from 0 to 1, is the last of them.
+    """
+    system = task.system
+    generator = torch.Generator().manual_seed(0)
+    x0 = task.sample(PROBED, seed=0, dtype=torch.float64)
+    low, high = system.control_low.double(), system.control_high.double()
+    shape = (PROBED, task.horizon, len(low))
+    plans = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+    seen = system.observe(system.rollout(x0, plans)).flatten(0, 1)
+    facts = {
+        each.name: (each.low, each.high)
+        for each in system.signature.columns
+        if each.low is not None and each.high is not None
+    }
+    found = []
+    for number, column in zip(system.observed, seen.unbind(1), strict=True):
+        ends = bounds(number, facts) or (math.inf, -math.inf)
+        least, most = min(ends[0], float(column.min())), max(ends[1], float(column.max()))
+        if not math.isfinite(most - least):
+            least, most = float(column.min()), float(column.max())
+        wider = 0.25 * max(most - least, 1e-3)
+        found.append((least - wider, most + wider))
+    return Bounds.of([*found, *([(0.0, 1.0)] if time else [])])
+
+
+def initial_state(task: Task, given: object, count: int) -> Tensor:
+    """Initial states of the option `state`: (n,) for all environments, or (count, n); float64.
+
+    Raises UsageError (U101) where the shape or a value is wrong.
+    """
+    width = len(task.system.names)
+    x = torch.as_tensor(np.array(given, dtype=np.float64))
+    if x.shape not in ((width,), (count, width)) or not bool(torch.isfinite(x).all()):
+        raise usage(
+            f"the option `state` has the shape {tuple(x.shape)} or is not finite",
+            f"give {width} numbers: {', '.join(task.system.names)}",
+        )
+    return x.expand(count, width).contiguous()
+
+
+def task_of(spec: Path | str, system: Path | str | None) -> Task:
+    """The task of a specification file and a system file (default: the one the former names).
+
+    Raises:
+        UsageError: there is no such file, or no system is named.
+        SpecError, SystemFileError: a file is invalid, or they do not fit.
+    """
+    path = find_spec(spec)
+    parsed = parse(read_source(path))
+    named = system or parsed.system
+    if named is None:
+        raise usage(f"`{spec}` names no system", "give one")
+    return Task.of(parsed, System.load(find_system(str(named), None if system else path)))

@@ -1,0 +1,191 @@
+"""Many environments of one task, stepped as one batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.controller.problem.environments import MOST, Environments, Transition
+from stlc.controller.problem.environments import Reward as EpisodeReward
+from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.diagnostics import usage
+from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation, task_of
+
+AHEAD = 1024
+"""Least number of initial states that are drawn at a time."""
+
+Info = dict[str, Any]
+Flags = NDArray[np.bool_]
+
+
+class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
+    """Episodes of one task on the model of its system, side by side in one batch.
+
+    All episodes begin together, last one horizon and *terminate* together. Observations, (N, k), and actions,
+    (N, m), are those of `SpecEnv`. `info` holds `state`, (N, n) float64, and at the end of the episodes
+    `robustness` by requirement, `rho` of the whole, and `satisfied`, (N,) each; as in gymnasium's own vector
+    environments a key `_name` marks the environments that have `name`.
+
+    Args:
+        task: specification and system.
+        num_envs: number of environments, N.
+        reward: `robustness` or `accuracy` of the episode (0 or 100), with the last step, or `task`, the
+            reward of each step that the system file declares.
+        normalised: observations and actions are from -1 to 1, which most learners expect.
+        time: whether the elapsed share of the episode is observed.
+        autoreset: where episodes end. By default (`SAME_STEP`) the last step returns the observations of the
+            next initial states, `info["final_obs"]` and `info["final_info"]` hold those of the end. With
+            `NEXT_STEP` it returns the final observations, and the step after it begins the next episodes
+            without regard to actions, with reward 0.
+
+    Raises UsageError (U101) where there is no such reward, or an argument is wrong.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        reward: EpisodeReward = "robustness",
+        normalised: bool = False,
+        time: bool = True,
+        autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
+        if num_envs < 1:
+            raise usage(f"there are no {num_envs} environments", "give at least 1")
+        if autoreset is AutoresetMode.DISABLED:
+            raise usage(
+                "episodes that end begin anew by themselves", "take AutoresetMode.SAME_STEP or NEXT_STEP"
+            )
+        self.task, self.reward, self.normalised, self.time = task, reward, normalised, time
+        self.num_envs, self.autoreset = num_envs, AutoresetMode(autoreset)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset}
+        self._episodes = Environments(
+            task, num_envs, reward=reward, generator=torch.Generator(), ahead=max(AHEAD, num_envs)
+        )
+        self._actuators, self._bounds = of_actuators(task), of_observation(task, time=time)
+        self.single_action_space = self._actuators.space(unit=normalised)
+        self.single_observation_space = self._bounds.space(unit=normalised)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._all: Flags = np.ones(num_envs, dtype=np.bool_)
+        self._begun = False
+        self._next: Tensor | None = None
+
+    @property
+    def steps(self) -> int:
+        """Steps of an episode."""
+        return self._episodes.steps
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, Info]:
+        """Begin all episodes. The same seed gives the same episodes from here on.
+
+        Args:
+            seed: of all random numbers from here on, one for all environments.
+            options: `state`, (n,) or (N, n), initial states in place of random ones.
+
+        Raises UsageError (U101) for a list of seeds, a part of the environments, or a wrong state.
+        """
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise usage("all environments share one stream of random numbers", "give one seed, not several")
+        given = dict(options or {})
+        mask = given.pop("reset_mask", None)
+        if mask is not None and not np.all(mask):
+            raise usage("all episodes begin and end together", "leave `reset_mask` out")
+        super().reset(seed=None if seed is None else int(seed))
+        if seed is not None or not self._begun:
+            self._episodes.seed(int(self.np_random.integers(2**62)))
+        self._begun, self._next = True, None
+        state = given.get("state")
+        start = None if state is None else initial_state(self.task, state, self.num_envs)
+        return self._shown(self._episodes.reset(start)), self._told(self._episodes.states)
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[Floats, NDArray[np.float64], Flags, Flags, Info]:
+        """Advance all environments by one step under `actions`, (N, m)."""
+        if not self._begun:
+            raise usage("no episode has begun", "call `reset` first")
+        none: Flags = np.zeros(self.num_envs, dtype=np.bool_)
+        if self._next is not None:
+            seen, self._next = self._shown(self._next), None
+            return seen, np.zeros(self.num_envs), none, none.copy(), self._told(self._episodes.states)
+        moved = self._episodes.step(self._plans(actions))
+        reward, done = moved.reward.double().numpy(), moved.done.numpy()
+        if moved.verdicts is None:
+            return self._shown(moved.final), reward, done, none, self._told(moved.states)
+        final, end = self._shown(moved.final), self._at_end(moved, moved.verdicts)
+        if self.autoreset is AutoresetMode.NEXT_STEP:
+            self._next = moved.observation
+            return final, reward, done, none, end
+        info = self._told(self._episodes.states)
+        info |= self._marked({"final_obs": _objects(final), "final_info": end})
+        return self._shown(moved.observation), reward, done, none, info
+
+    def _plans(self, actions: NDArray[np.float32]) -> Tensor:
+        """Controls of the model, (N, m), for which actuators get `actions`."""
+        if np.shape(actions) != self.action_space.shape:
+            raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
+        held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))
+        return self.task.system.planned(self._episodes.states, held)
+
+    def _shown(self, seen: Tensor) -> Floats:
+        """Observations (N, k) of the space from those of the episodes, whose last value is the time."""
+        values = seen.numpy() if self.time else seen[:, :-1].numpy()
+        return self._bounds.shown(values, unit=self.normalised)
+
+    def _told(self, states: Tensor) -> Info:
+        return self._marked({"state": states.numpy(force=True)})
+
+    def _at_end(self, moved: Transition, verdicts: PlanVerdicts) -> Info:
+        """Info of the last step of all episodes."""
+        each = verdicts.requirements.clamp(-MOST, MOST).numpy(force=True)
+        names = (rule.name for rule in self.task.rules)
+        robustness = {name: each[:, i] for i, name in enumerate(names)}
+        rho = torch.nan_to_num(verdicts.rho).clamp(-MOST, MOST)
+        end = {
+            "state": moved.states.numpy(force=True),
+            "robustness": self._marked(robustness),
+            "rho": rho.numpy(force=True),
+            "satisfied": satisfied(verdicts.rho).numpy(force=True),
+        }
+        return self._marked(end)
+
+    def _marked(self, values: Info) -> Info:
+        """Info with the masks that gymnasium puts beside every key."""
+        return values | {f"_{name}": self._all for name in values}
+
+
+def _objects(rows: Floats) -> NDArray[np.object_]:
+    """Array of the rows as objects, (N,), the form of `final_obs`."""
+    found = np.empty(len(rows), dtype=object)
+    for i, row in enumerate(rows):
+        found[i] = row
+    return found
+
+
+def make_vec(
+    spec: Path | str,
+    num_envs: int = 1,
+    system: Path | str | None = None,
+    *,
+    reward: EpisodeReward = "robustness",
+    normalised: bool = False,
+    time: bool = True,
+    autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+) -> SpecVectorEnv:
+    """Make many environments of a specification file and a system file (default: the one the former names).
+
+    The other arguments are those of `SpecVectorEnv`.
+
+    Raises:
+        UsageError: there is no such file, no system is named, or an argument is wrong.
+        SpecError, SystemFileError: a file is invalid, or they do not fit.
+    """
+    task = task_of(spec, system)
+    return SpecVectorEnv(task, num_envs, reward=reward, normalised=normalised, time=time, autoreset=autoreset)
