@@ -1,7 +1,7 @@
-"""Pictures of training and deployment: curves, signals, failures, animation, one report.
+"""Pictures of training and deployment: learning curves, signals, failures, animations, and one report.
 
 Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). They are imported only when a picture is
-drawn, so that training and deployment work without them; `available` checks for them.
+drawn, so that training and deployment work without them; `available` tells whether they are installed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Animations drawn frame by frame, and their encoding as GIF, video or still."""
+"""Animations drawn frame by frame, and their encoding as GIF, video or still picture."""
 
 from __future__ import annotations
 
@@ -39,16 +39,17 @@ QUALITY = 86
 
 @dataclass(frozen=True, slots=True)
 class Animation:
-    """A picture for each of a number of instants.
+    """Animation: a function that draws the picture of each instant.
 
     Attributes:
         frames: number of instants.
         dt: seconds between instants.
-        size: size of the picture in inches.
-        begin: sets up an empty figure; returns the function that draws an instant on the figure's canvas.
+        size: width and height of the picture in inches.
+        begin: prepares an empty figure; returns the function that draws an instant, by index, on the figure's
+            canvas.
         alt: description in words.
-        moment: index of the most informative instant, for a still.
-        draws: whether that function renders the canvas itself; otherwise it only updates artists.
+        moment: index of the instant shown in a still picture.
+        draws: whether the returned function renders the canvas itself; otherwise it only updates artists.
     """
 
     frames: int
@@ -73,10 +74,10 @@ class VectorAnimation:
     """An animation as drawing commands.
 
     Attributes:
-        width, height: of the picture, in dots.
+        width, height: size of the picture in dots.
         commands: the distinct drawing commands: `["p", path, fill, stroke, width, dash, clip]`, `["t", x, y,
             text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
-        frames: numbers of the commands of every frame, in the order of drawing.
+        frames: for every frame, indices into `commands` in the order of drawing.
     """
 
     width: int
@@ -86,17 +87,17 @@ class VectorAnimation:
 
     @property
     def colors(self) -> set[str]:
-        """Colours in use, as `#rrggbb`."""
+        """All colours that the commands use, as `#rrggbb`."""
         found = {str(color)[:7] for c in self.commands if c[0] == "p" for color in c[2:4] if color}
         return found | {str(c[5])[:7] for c in self.commands if c[0] == "t"}
 
     @property
     def pictured(self) -> bool:
-        """True if there are pictures among the commands."""
+        """True if the commands contain images."""
         return any(command[0] == "i" for command in self.commands)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """The animation as dictionaries and lists for JSON."""
         return {
             "width": self.width,
             "height": self.height,
@@ -106,7 +107,7 @@ class VectorAnimation:
 
 
 def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Colour -> colour in the dark scheme; empty if any has images, or colours outside the palette."""
+    """Colours for the dark scheme: colour -> colour; empty if an animation has images or other colours."""
     known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}
 
@@ -167,7 +168,7 @@ def save_still(animation: Animation, path: Path, *, at: int | None = None, dpi: 
 def still_bytes(
     animation: Animation, kind: Literal["png", "webp"] = "webp", *, at: int | None = None, dpi: int = DPI
 ) -> bytes:
-    """File content of one instant of `animation` (default: its `moment`)."""
+    """Return a PNG or WebP file of one instant of `animation` (default: its `moment`), as bytes."""
     index = min(animation.frames - 1, animation.moment if at is None else at)
     (picture,) = frames_in(animation, range(index, index + 1), dpi)
     buffer = io.BytesIO()
@@ -179,7 +180,7 @@ def still_bytes(
 
 
 def frames_in(animation: Animation, indices: range, dpi: int) -> Iterator[Image]:
-    """The instants as RGB images."""
+    """Yield the instants `indices` as RGB images."""
     from PIL import Image
 
     with picture_style():
@@ -205,7 +206,7 @@ NARROWEST = 160  # pixels
 
 
 def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> bytes:
-    """`pictures` as a GIF, made smaller in width until it has at most `max_bytes`."""
+    """Encode pictures as a GIF, reduced in width until it has at most `max_bytes`."""
     data = encoded(pictures, milliseconds)
     while len(data) > max_bytes and pictures[0].width > NARROWEST:
         factor = max(0.6, 0.95 * (max_bytes / len(data)) ** 0.5)
@@ -216,7 +217,7 @@ def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> byt
 
 
 def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
-    """`pictures` as a GIF that repeats for ever; the palette is taken from a few of them."""
+    """Encode pictures as a GIF that repeats forever; the palette is computed from a few of the pictures."""
     from PIL import Image
 
     many = min(SAMPLED, len(pictures))
@@ -240,10 +241,10 @@ def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
 
 
 def _palette(sheet: Image) -> Image:
-    """Palette: the most frequent colours, exactly (white stays white), then the least represented ones.
+    """Colour palette of a picture: its most frequent colours, then the colours worst represented by these.
 
-    A colour is added by its distance to the palette times its frequency, so that small details such as a
-    legend's dot or a violating line keep their colour.
+    White stays exactly white. A colour is added by its distance to the palette times its frequency, so that
+    small details such as a legend's dot or a violating line keep their colour.
     """
     from PIL import Image
 
@@ -261,7 +262,7 @@ def _palette(sheet: Image) -> Image:
 
 
 def _apart(colours: NDArray[np.float64], one: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared distances of `colours` (many, 3) from `one`."""
+    """Squared distances of `colours` (colours, 3) from the colour `one` (3,)."""
     return np.asarray(((colours - one) ** 2).sum(1))
 
 
@@ -273,7 +274,7 @@ _CODING = ("-c:v", "libx264", "-preset", "veryfast", "-crf", "23", "-pix_fmt", "
 
 
 def encoder() -> str | None:
-    """The program that writes videos: `ffmpeg` on the path, else that of imageio-ffmpeg."""
+    """Path of the program that writes videos: `ffmpeg`, else that of imageio-ffmpeg; None without either."""
     found = shutil.which("ffmpeg")
     if found is not None or find_spec("imageio_ffmpeg") is None:
         return found

@@ -1,4 +1,4 @@
-"""Robots as bodies, by PyBullet: rendered without a display, or in its window."""
+"""Drawing of robots as 3D bodies by PyBullet: rendered without a display, or in PyBullet's window."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def available() -> bool:
 
 
 def stage_drawing(stage: Stage) -> Draw:
-    """Function that draws frame `index` of a scene: a rendered picture of all robots, side by side."""
+    """Return the function that draws frame `index` of a scene: all robots rendered side by side."""
     renderer = Renderer(stage, "picture")
 
     def draw(axes: Any, scene: Scene, index: int) -> None:
@@ -91,7 +91,7 @@ def require_window() -> None:
 
 
 class Renderer:
-    """PyBullet scene of a stage: its robots and their balls, side by side along x."""
+    """PyBullet simulation that shows the robots of a stage and the balls at them, side by side along x."""
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
         with _silenced():
@@ -122,7 +122,7 @@ class Renderer:
                 self.client.disconnect()
 
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
-        """Show frame `index`, robots coloured by decision source `who`, (robots,)."""
+        """Show frame `index`; each robot is coloured by `who`, the source of its decision, (robots,)."""
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
             angles = self.stage.joints[index, robot, :, None].tolist()
@@ -136,7 +136,7 @@ class Renderer:
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
 
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Frame `index` as (height, width, 3); transparent balls are blended here, as the renderer cannot."""
+        """Render frame `index` as (height, width, 3); transparent balls are blended here, not by PyBullet."""
         self.turn(index, who)
         whole = self._rendered()
         for body in (body for bodies in self.balls for body in bodies):
@@ -155,7 +155,7 @@ class Renderer:
         return robots
 
     def _disc(self, place: NDArray[np.float64]) -> int:
-        """Disc on which a robot stands."""
+        """Add the disc on which a robot stands; returns its PyBullet number."""
         radius = 0.28 * self.stage.reach
         shape = self.client.createVisualShape(self.client.GEOM_CYLINDER, radius=radius, length=0.01)
         return int(self.client.createMultiBody(0, -1, shape, (place - (0, 0, 0.006)).tolist()))
@@ -173,7 +173,7 @@ class Renderer:
         return int(self.client.createMultiBody(0, -1, shape))
 
     def _colour(self, robot: int, source: int) -> None:
-        """Colour the disc by the source of the decision, and the robot too if the guard intervened."""
+        """Colour the disc by the source of the decision; if the guard intervened, colour the robot, too."""
         self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
         body = _WHITE if source == 0 else _rgba(DECIDED[source])
         for link in self.links:
@@ -249,15 +249,15 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 
 
 def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
-    """Path of a robot description with visual geometry: `urdf` if it has some, else a copy in `folder`.
+    """Return the path of a robot description with visual geometry: `urdf` itself, or else a copy in `folder`.
 
     Args:
-        urdf: description of the robot; kinematics suffice.
-        meshes: link -> mesh file of PyBullet; other links are drawn as rods.
-        folder: folder of the copy.
+        urdf: path of the robot description (URDF); it may contain the kinematics only.
+        meshes: link -> mesh file of PyBullet; links without a mesh are drawn as rods.
+        folder: folder for the copy.
 
     Raises:
-        OSError, ValueError: the file cannot be read, or is no robot description.
+        OSError, ValueError: the file cannot be read, or is not a robot description.
     """
     robot = robot_of(read_urdf(urdf))
     if robot.find("link/visual") is not None:
@@ -288,7 +288,7 @@ def _mesh(name: str | None) -> Path | None:
 
 
 def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, float]]]:
-    """Link -> positions of its joints, in metres from the link's origin."""
+    """Positions of the joints at each link, in metres from the link's origin: link -> positions."""
     found: dict[str, list[tuple[float, float, float]]] = {}
     for joint in robot.findall("joint"):
         parent, origin = joint.find("parent"), joint.find("origin")
@@ -300,7 +300,7 @@ def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, floa
 
 
 def _weigh(link: ElementTree.Element) -> None:
-    """Give a link a mass; PyBullet warns of links without one."""
+    """Give a link a mass, since PyBullet warns of links without one."""
     if link.find("inertial") is None:
         inertial = ElementTree.SubElement(link, "inertial")
         ElementTree.SubElement(inertial, "mass", value="1")
@@ -308,7 +308,7 @@ def _weigh(link: ElementTree.Element) -> None:
 
 
 def _rod(link: ElementTree.Element, end: tuple[float, float, float]) -> None:
-    """A rod from the link's origin to `end`, with a ball there."""
+    """Add a rod from the link's origin to `end`, with a ball there."""
     length = math.hypot(*end)
     x, y, z = end
     if length > ROD / 2:

@@ -1,4 +1,4 @@
-"""Contents of a run's folder for a report; every part is optional."""
+"""Contents of a run's folder that a report shows; every part is optional."""
 
 from __future__ import annotations
 
@@ -29,21 +29,22 @@ TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")
 
 @dataclass(frozen=True, slots=True)
 class RunContents:
-    """The parts of one run's folder; what is missing or unreadable is None or empty.
+    """Contents of a run's folder; a part that is missing or unreadable is None or empty.
 
     Attributes:
-        run: folder of the run.
+        run: the run folder.
         record: content of `run.json`.
         rows: lines of `train.jsonl`.
         requirements: name -> declaration, parsed from the run's specification.
         outside: whether the specification uses external functions of its system.
-        texts: file name -> text, for those of `TEXTS` that exist.
-        signature: of the system, for units and labels.
-        held_out: held-out starts and the robustness of their plans.
-        simulation: content of `eval/simulate.json`.
-        units: requirement -> unit of its robustness; without requirements that have none.
-        usual: default numbers of agents and steps of the system, under the deployment's scenario.
-        trace: the recorded deployment.
+        texts: file name -> text, for those of the files `TEXTS` that exist.
+        signature: names, units and labels of the system's states.
+        held_out: held-out starts (initial states not used in training) and the robustness of the plans from
+            them.
+        simulation: content of `eval/simulate.json`, the results of the closed-loop runs.
+        units: requirement -> unit of its robustness; requirements without a unit are left out.
+        usual: default numbers of agents and steps of the system, under the scenario of the closed-loop runs.
+        trace: trace recorded in the closed-loop runs.
     """
 
     run: RunDir
@@ -61,7 +62,7 @@ class RunContents:
 
     @property
     def result(self) -> Record:
-        """Result of the training; empty until it is finished."""
+        """Result of the training, from `run.json`; empty until the training is finished."""
         result = self.record.get("result")
         return result if isinstance(result, Mapping) else {}
 
@@ -72,10 +73,10 @@ class RunContents:
 
 
 def read_contents(run: RunDir) -> RunContents:
-    """Read everything that a report can show.
+    """Read all parts of a run folder that a report can show.
 
     Raises:
-        RunError: R101, the folder is no run.
+        RunError: R101, the folder is not a run.
     """
     decl = readable(lambda: load_system_decl(run.path / "system.yaml"))
     simulation = readable(lambda: run.read_json(SIMULATION))
@@ -105,7 +106,7 @@ def read_contents(run: RunDir) -> RunContents:
 
 
 def readable(read: Callable[[], T]) -> T | None:
-    """The result of `read`, or None if the file is missing, damaged or invalid."""
+    """Return the result of `read()`, or None if the file is missing, damaged or invalid."""
     try:
         return read()
     except (OSError, StlcError):
@@ -113,7 +114,7 @@ def readable(read: Callable[[], T]) -> T | None:
 
 
 def untagged(declared: ast.Require) -> Span:
-    """A requirement without the tags before it."""
+    """Source location of a requirement without the tags before it."""
     end = max((tag.span.end for tag in declared.tags), default=declared.span.start)
     text = declared.span.source.text
     start = max(end, declared.span.start)

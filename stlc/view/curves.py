@@ -38,20 +38,20 @@ def draw_curves(rows: Rows) -> Picture | None:
 
 
 def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Seconds and values of the rows that have `key`."""
+    """Times in seconds and values of the rows of `train.jsonl` that have `key`."""
     pairs = [(float(row["seconds"]), float(row[key])) for row in rows if row.get(key) is not None]
     seconds, values = np.array(pairs).reshape(-1, 2).T
     return seconds, values
 
 
 def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Moving average of `values` over a 30th of them, with a shorter window at the ends."""
+    """Moving average over 1/30 of the number of values; the window is shorter at the ends."""
     window = np.ones(2 * (len(values) // 60) + 1)
     return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
 
 
 def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
-    """Set limits that show most of the lowest and all of the highest curve; first points may be cut off."""
+    """Set limits that show all of the highest curve and most of the lowest; first points may be cut off."""
     low = min((float(np.quantile(curve, 0.08)) for curve in values if len(curve)), default=0.0)
     high = max((float(curve.max()) for curve in values if len(curve)), default=1.0)
     low = max(0.0, np.floor(20 * (low - 0.02)) / 20)

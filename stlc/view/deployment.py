@@ -1,4 +1,4 @@
-"""Report sections on a deployment: runs, metrics and decisions with and without a guard."""
+"""Report sections on closed-loop runs: metrics and decisions with and without a guard."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
 def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
-    """Key figures of the deployment for the first screen."""
+    """Key figures of the closed-loop runs for the head of the report: (name, value) pairs."""
     guards = _guards(contents)
     if not guards:
         return []
@@ -32,7 +32,7 @@ def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
 
 
 def deployment_section(contents: RunContents) -> Section | None:
-    """Tables of metrics (a column per guard), sources of decisions, and decision times."""
+    """Section with tables of metrics (one column per guard), sources of decisions, and decision times."""
     guards = _guards(contents)
     if not guards:
         return None
@@ -50,7 +50,7 @@ def deployment_section(contents: RunContents) -> Section | None:
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
-    """A table with a column per guard; None without rows."""
+    """A table with one column per guard; None if there are no rows."""
     if not rows:
         return None
     header = ["", *(guard_words(name).title for name in guards)]
@@ -71,7 +71,7 @@ def _setting(simulation: Record) -> str:
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
-    """Explanation of a gap between the satisfaction of plans and of closed-loop runs."""
+    """Paragraph on the share of starts from which the world followed the model; None if it always did."""
     consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if consistent is None or consistent >= 1.0:
         return None
@@ -89,7 +89,7 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Rows: runs that satisfy all rules, the share among viable ones, and each rule."""
+    """Table rows: share of runs that satisfy all rules, the same among viable runs, and of each rule."""
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
     if not known:
@@ -112,7 +112,7 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _broken(simulation: Record | None) -> Html | None:
-    """Table of the guarded runs that violated a rule."""
+    """Table of the closed-loop runs that violated a rule although a guard was active."""
     each = list(drives_of(simulation).values())
     broken = each[-1]["broken"] if each else []
     if not broken:
@@ -129,7 +129,7 @@ def _broken(simulation: Record | None) -> Html | None:
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:
-    """Names of all metrics, in the order of the first guard that has them."""
+    """Names of all metrics, in the order of the first guard that has each one."""
     return list(dict.fromkeys(name for guard in guards.values() for name in guard.get("metrics") or {}))
 
 
@@ -146,7 +146,7 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Share of the starts from which the executed trajectory satisfies each requirement."""
+    """Table rows: share of start instants from which the executed trajectory satisfies each requirement."""
     names = [name for name in _names(guards) if name.startswith(HOLDS)]
     return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
 

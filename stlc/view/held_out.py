@@ -1,7 +1,7 @@
-"""Failure region on held-out starts: found by subgroup discovery, described in words, and drawn.
+"""Region of failing held-out starts (initial states): found by subgroup discovery, described and drawn.
 
-The region is a conjunction of simple conditions that covers many failing starts and few others; a beam search
-maximises its F-score.
+The region is a conjunction of simple conditions that contains many failing starts and few others; a beam
+search maximises its F-score.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """The held-out starts of a run and the robustness of the policy's plans.
+    """The held-out starts (initial states) of a run and the robustness of the policy's plans from them.
 
     Attributes:
-        names: state of each column of `x0`.
+        names: name of the state in each column of `x0`.
         requirements: names, in the order of the columns of `each`.
-        x0: starts, (starts, columns).
+        x0: initial states, (starts, columns).
         rho: robustness over all requirements, (starts,).
         each: robustness per requirement, (starts, requirements).
-        known: mask of the starts with a known satisfying plan, (starts,); None if not recorded.
-        searched: mask of the starts that the policy solves or for which a plan was searched, (starts,); None
-            for all.
+        known: True for starts from which a satisfying plan is known, (starts,); None if not recorded.
+        searched: True for starts that the policy solves or from which a plan was searched, (starts,); None:
+            all.
     """
 
     names: tuple[str, ...]
@@ -72,21 +72,21 @@ class HeldOut:
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Number of failing starts, and number of failing starts with a known satisfying plan."""
+        """Number of failing starts, and how many of these have a known satisfying plan."""
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Condition on a start: the state in `column` compared with `value`."""
+    """Condition on an initial state: the state in `column` compared with `value`."""
 
     column: int
     op: Literal["<=", ">=", "="]
     value: float
 
     def holds(self, x0: Array) -> Mask:
-        """Mask, (starts,), of the starts (starts, columns) that meet the condition."""
+        """True for each of the starts (starts, columns) that meets the condition, (starts,)."""
         return np.asarray(_COMPARE[self.op](x0[:, self.column], self.value))
 
 
@@ -99,11 +99,11 @@ class Weakness:
 
     Attributes:
         requirement: index of the requirement.
-        failing: share of all starts that fail the requirement.
-        conditions: the region is their conjunction.
-        inside: share of the region's starts that fail.
+        failing: share of all starts from which the requirement fails.
+        conditions: the region is the conjunction of these conditions.
+        inside: share of the starts in the region that fail.
         covered: share of the failing starts that lie in the region.
-        axes: the two columns that separate failures best.
+        axes: indices of the two states that separate failing from satisfied starts best.
     """
 
     requirement: int
@@ -115,7 +115,7 @@ class Weakness:
 
 
 def load_held_out(path: Path) -> HeldOut | None:
-    """The held-out set that training wrote to `path`; None if the file is missing or damaged."""
+    """Load the held-out set that training wrote to `path`; None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(str(file["meta"]))
@@ -135,7 +135,7 @@ def load_held_out(path: Path) -> HeldOut | None:
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """Region in which `requirement` (default: the worst) fails; None if it never fails."""
+    """Return the region in which `requirement` (default: the worst) fails; None if it never fails."""
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
@@ -153,7 +153,7 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
-    """Best conjunction of a beam search; each added condition must improve the score enough."""
+    """The conjunction that a beam search finds; each condition must raise the score by `LEAST_GAIN` times."""
     best: tuple[Condition, ...] = ()
     best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
     values = [_Values.of(column) for column in x0.T]
@@ -173,7 +173,7 @@ def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
 
 
 def _region(x0: Array, conditions: Sequence[Condition]) -> Mask:
-    """Mask of the starts that meet all conditions."""
+    """True for starts that meet all conditions, (starts,)."""
     return np.asarray(np.all([np.ones(len(x0), dtype=bool), *(c.holds(x0) for c in conditions)], axis=0))
 
 
@@ -184,9 +184,10 @@ def _f_score(region: Mask, failing: Mask) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """Frequent single values of a column, and whether there are others.
+    """Values that occur frequently in one column of initial states; `continuous` if it has many other values.
 
-    A continuous column may have such values too: a timer that starts at 0, a sentinel for "nothing there".
+    A continuous state may have frequent values, too: a timer that starts at 0, a value that means "nothing
+    there".
     """
 
     common: tuple[float, ...]
@@ -202,7 +203,7 @@ class _Values:
 
 
 def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
-    """Candidate conditions that narrow the region."""
+    """Conditions that may be added to narrow the region."""
     found: list[Condition] = []
     bad = x0[region & failing]
     for column, kinds in enumerate(values):
@@ -226,7 +227,7 @@ def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tup
 
 
 def _separation(values: Array, failing: Mask) -> float:
-    """Kolmogorov-Smirnov distance between failing and satisfied starts along one column."""
+    """Kolmogorov-Smirnov distance between failing and satisfied starts in one state."""
     if failing.all() or not failing.any():
         return 0.0
     order = np.sort(values)
@@ -241,7 +242,7 @@ def _separation(values: Array, failing: Mask) -> float:
 def region_text(
     conditions: tuple[Condition, ...], names: tuple[str, ...], signature: Signature | None = None
 ) -> str:
-    """The region in the notation of specifications: `sign = stop, -2.1 <= x <= -1 [m]`."""
+    """The region in the syntax of specifications: `sign = stop, -2.1 <= x <= -1 [m]`."""
     return ", ".join(
         _column_text([c for c in conditions if c.column == column], names[column], signature)
         for column in dict.fromkeys(condition.column for condition in conditions)
@@ -265,7 +266,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a region: failure rate inside, and its share of all failures."""
+    """Clause on a failure region: failure rate in it, and its share of all failures."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -277,7 +278,7 @@ def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None
 
 
 def unsolved_text(held: HeldOut) -> str:
-    """Number of unsolved starts, and of those among them with a known satisfying plan."""
+    """Sentence on unsolved starts: how many there are, and from how many a satisfying plan is known."""
     failing, known = held.unsolved
     text = f"{failing:,} of {len(held.x0):,} starts"
     if held.known is None or not failing:
@@ -298,12 +299,12 @@ def unsolved_text(held: HeldOut) -> str:
 def draw_failures(
     held: HeldOut, signature: Signature | None = None, units: Mapping[str, str] | None = None
 ) -> Picture | None:
-    """Draw the worst requirement over the two most separating columns; None if nothing fails.
+    """Draw the worst requirement's robustness over the two most separating states; None if nothing fails.
 
     Args:
         held: starts and robustness of their plans.
-        signature: of the system, for units and labels of states.
-        units: requirement -> unit of its robustness; without requirements that have none.
+        signature: names, units and labels of the system's states.
+        units: requirement -> unit of its robustness; requirements without a unit are left out.
     """
     weakness = find_weakness(held)
     if weakness is None:

@@ -18,7 +18,7 @@ _VOID = frozenset({"br", "hr", "img", "input", "meta"})
 
 
 class Html(str):
-    """Trusted markup. Plain `str` is text and gets escaped."""
+    """Trusted HTML markup; a plain `str` is text and gets escaped."""
 
     __slots__ = ()
 
@@ -27,7 +27,7 @@ Child: TypeAlias = "Html | str | Iterable[Html | str] | None"
 
 
 def el(name: str, *children: Child, attrs: Mapping[str, str] | None = None) -> Html:
-    """The element `name` with `attrs` around `children`; None leaves a child out."""
+    """HTML element `name` with attributes `attrs` and `children`; a child None is left out."""
     written = "".join(f' {key}="{text_of(value)}"' for key, value in (attrs or {}).items())
     if name in _VOID:
         return Html(f"<{name}{written}>")
@@ -35,7 +35,7 @@ def el(name: str, *children: Child, attrs: Mapping[str, str] | None = None) -> H
 
 
 def join(*children: Child) -> Html:
-    """`children` one after the other."""
+    """Concatenate `children`."""
     return Html("".join(_written(child) for child in children))
 
 
@@ -50,12 +50,12 @@ def _written(child: Child) -> str:
 
 
 def classed(name: str, kind: str, *children: Child) -> Html:
-    """The element `name` of class `kind`."""
+    """HTML element `name` of CSS class `kind`."""
     return el(name, *children, attrs={"class": kind})
 
 
 def with_code(text: str) -> Html:
-    """Text whose parts in backticks are code."""
+    """Text with its parts in backticks marked as code."""
     return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
 
 
@@ -66,7 +66,7 @@ def table(
     numeric: Sequence[int] = (),
     kind: str = "plain",
 ) -> Html:
-    """A table of class `kind`; the columns `numeric` are right-aligned."""
+    """HTML table of CSS class `kind`; the columns with indices `numeric` are right-aligned."""
 
     def row(cell: str, cells: Sequence[Child]) -> Html:
         attrs = [{"class": "num"} if index in numeric else None for index in range(len(cells))]
@@ -78,13 +78,13 @@ def table(
 
 
 def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
-    """A picture with its caption."""
+    """Picture with a caption; `uri` is its address and `alt` its description."""
     image = classed("div", "scroll", el("img", attrs={"src": uri, "alt": alt}))
     return classed("figure", kind, image, el("figcaption", caption) if caption else None)
 
 
 def facts(pairs: Iterable[tuple[str, Child]]) -> Html:
-    """Names and values, side by side."""
+    """Names and values in two columns."""
     return classed("dl", "facts", [Html(el("dt", name) + el("dd", value)) for name, value in pairs if value])
 
 
@@ -93,13 +93,13 @@ def facts(pairs: Iterable[tuple[str, Child]]) -> Html:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the page.
+    """A section of the page.
 
     Attributes:
-        anchor: its name in links; also the file name of its picture.
-        title: its heading; empty for the section at the head of the page.
-        body: its content.
-        picture: the one drawn figure in it, if any.
+        anchor: name of the section in links; also the file name of its picture.
+        title: heading; empty for the section at the head of the page.
+        body: content.
+        picture: the drawn figure in the section, if any.
     """
 
     anchor: str
@@ -109,7 +109,7 @@ class Section:
 
     @property
     def html(self) -> Html:
-        """The markup."""
+        """Markup of the section."""
         heading = el("h2", self.title) if self.title else None
         return el("section", heading, self.body, attrs={"id": self.anchor})
 
@@ -117,14 +117,14 @@ class Section:
 def page(
     title: str, head: Child, sections: Sequence[Section], foot: Child, script: Html | None = None
 ) -> str:
-    """The whole document.
+    """The HTML page.
 
     Args:
-        title: of the browser's tab.
-        head: content above the links.
-        sections: in order.
-        foot: the last line.
-        script: the only script that the page's security policy allows.
+        title: title of the browser's tab.
+        head: content above the links to the sections.
+        sections: sections in order.
+        foot: last line of the page.
+        script: the only script that the page's security policy allows; None: no script.
     """
     links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -163,12 +163,12 @@ _YAML = re.compile(r"(?P<cm>(?:^|(?<=\s))#[^\n]*)|(?P<kw>^[ ]*(?:- )?[\w.-]+(?=:
 
 
 def spec_html(text: str) -> Html:
-    """A specification's text, highlighted."""
+    """The text of a specification with highlighted syntax."""
     return _marked(text, _SPEC)
 
 
 def yaml_html(text: str) -> Html:
-    """A system file's text, highlighted."""
+    """The text of a system file with highlighted syntax."""
     return _marked(text, _YAML)
 
 

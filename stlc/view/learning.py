@@ -1,7 +1,7 @@
-"""The verdict on a training: the share of the known feasible starts that a policy solves, and advice.
+"""Verdict on a training: the share of feasible starts that the policy solves, and advice.
 
-Numbers and sentences only, no drawing. The terminal, the JSON document, the report and `stlc report` share
-this verdict.
+A start (initial state) counts as feasible if a satisfying plan from it is known. The module makes numbers and
+sentences only, no pictures; terminal, JSON output, report and `stlc report` share the verdict.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Curve:
     """Extrapolation of a learning curve.
 
     Attributes:
-        state: `short`: too few rounds; `flat`: twice the steps would change little; `rising`.
-        times: multiple of the steps that reaches the share `TRAINED` at the present slope; curves flatten, so
-            its square is the upper end of the forecast. None beyond `MOST_TIMES`, or if the curve is not
-            rising.
+        state: `short`: too few search rounds; `flat`: twice the steps would change little; `rising`.
+        times: multiple of the steps made at which the curve reaches the share `TRAINED` at its present slope;
+            curves flatten, so its square is the upper end of the forecast. None if it exceeds `MOST_TIMES` or
+            if the curve is not rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -58,12 +58,13 @@ class Learning:
     """Verdict on a training.
 
     Attributes:
-        level: degree of training.
-        share: accuracy over the known feasible starts; None without any.
+        level: how far the policy is trained, or that no plan exists.
+        share: share of the starts with a known satisfying plan that the policy solves; None if there are
+            none.
         sentence: level and share as a sentence.
         advice: sentences of advice.
-        command: the next command.
-        worst: the worst requirement and its failure region, as a sentence; "" if none fails.
+        command: the command to run next.
+        worst: the worst requirement and the region where it fails, as a sentence; "" if none fails.
     """
 
     level: Level
@@ -74,7 +75,7 @@ class Learning:
     worst: str = ""
 
     def summary(self) -> dict[str, object]:
-        """For JSON documents."""
+        """The verdict as a dictionary for JSON."""
         return {
             "level": self.level,
             "share_of_feasible": self.share,
@@ -87,10 +88,10 @@ class Learning:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """Commands of one run that a verdict may recommend.
+    """Commands for one run that a verdict may recommend.
 
     Attributes:
-        train_on: resumes the training; a budget is appended.
+        train_on: resumes the training; the caller appends the budget option.
         simulate: simulates the policy under the recommended guard.
         report: writes the report.
     """
@@ -101,9 +102,9 @@ class Commands:
 
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
-        """Commands of the run with the name `run`; the `newest` run is simulated without its name.
+        """Commands for the run named `run`; if it is the `newest`, the command to simulate needs no name.
 
-        `guard` is the recommended one: `none`, `paper` or `full`.
+        `guard` is the recommended guard: `none`, `paper` or `full`.
         """
         run = shell((operand(run),))
         simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))
@@ -111,7 +112,7 @@ class Commands:
 
 
 def recommended(record: Mapping[str, Any]) -> str:
-    """The guard that a run's record recommends; `paper` without closed-loop results."""
+    """The guard that `run.json` recommends; `paper` if there are no closed-loop results."""
     result = record.get("result")
     driven = result.get("closed_loop") if isinstance(result, Mapping) else None
     guard = driven.get("recommended") if isinstance(driven, Mapping) else None
@@ -119,9 +120,9 @@ def recommended(record: Mapping[str, Any]) -> str:
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
-    """Closed-loop results of a run: a line for each guard, best first, and the recommendation.
+    """Lines on the closed-loop results of a run: one per guard, best first, and the recommendation.
 
-    Empty without a record; the reason if no simulation was possible.
+    Empty if there are no closed-loop results in the record; the reason if no simulation was possible.
     """
     found = result.get("closed_loop")
     if not isinstance(found, Mapping):
@@ -146,7 +147,7 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def _driven_line(each: Mapping[str, Any]) -> str:
-    """`51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) without a guard, 98.3 % safe`."""
+    """Line on a guard: `51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) without a guard`."""
     low, high = each["interval"]
     safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
     part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
@@ -155,7 +156,7 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """Runs that a guard gains and loses, compared on the same starts with no guard."""
+    """Line on the closed-loop runs that a guard gains and loses, compared with no guard."""
     if not each.get("compared"):
         return ""
     return (
@@ -166,10 +167,10 @@ def _changed_line(each: Mapping[str, Any]) -> str:
 
 
 def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
-    """The verdict on the training of a run; None if it is not finished.
+    """The verdict on the training of a run; None if the training is not finished.
 
     Raises:
-        RunError: R101, its record is damaged.
+        RunError: R101, `run.json` is damaged.
     """
     try:
         signature = load_system_decl(run.path / "system.yaml").signature
@@ -182,7 +183,7 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
 def learning_on_record(
     record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
 ) -> Learning | None:
-    """The verdict on the training with this `run.json` and `train.jsonl`; None if it is not finished."""
+    """The verdict on a training from the contents of `run.json` and `train.jsonl`; None if not finished."""
     result = record.get("result")
     if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
         return None
@@ -190,7 +191,7 @@ def learning_on_record(
 
 
 def clause(held: HeldOut | None, signature: Signature | None) -> str:
-    """Region in which the worst requirement fails, or ""."""
+    """Clause on the region in which the worst requirement fails; "" if none fails."""
     weakness = None if held is None else find_weakness(held)
     return "" if held is None or weakness is None else weakness_text(weakness, held, signature)
 
@@ -201,10 +202,10 @@ def learning_of(
     """The verdict on a finished training.
 
     Args:
-        result: that of `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
+        result: the result in `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
         rows: lines of `train.jsonl`.
         commands: commands that may be recommended.
-        where: failure region of the worst requirement as a clause ("fails in …"), or "".
+        where: region where the worst requirement fails, as a clause ("fails in …"), or "".
     """
     accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
     if feasible <= 0.0:
@@ -243,11 +244,11 @@ def learning_of(
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
-    """Extrapolate plan accuracy towards `feasible`, from the rows of a training and its final `accuracy`.
+    """Extrapolate the accuracy of plans towards `feasible` from a training's rows and its final `accuracy`.
 
-    The log-odds of success are fitted by a line over the logarithm of the step, without the first quarter of
-    the steps; the line is continued from the final accuracy. The forecast is rough, as the learning rate
-    decays at the end of every training.
+    A line is fitted to the log-odds of success over the logarithm of the step, without the first quarter of
+    the steps, and continued from the final accuracy. The forecast is rough, as the learning rate decays at
+    the end of every training.
     """
     pairs = [
         (float(row["step"]), float(row["accuracy"]) / feasible)
@@ -271,7 +272,7 @@ def _log_odds(value: float) -> float:
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
-    """Advice on a longer training, and its command; "" if that would not help."""
+    """Advice on a longer training, and the command for it; the command is "" if that would not help."""
     twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
     match curve.state, curve.times:
         case "rising", float(times):
@@ -318,7 +319,7 @@ def _rough(seconds: float) -> float:
 
 
 def budget_text(seconds: float) -> str:
-    """The next round budget of at least `seconds`: `60s`, `5min`, `2h`."""
+    """The smallest of the usual budgets that is at least `seconds`: `60s`, `5min`, `2h`."""
     fitting = [time for time in ROUND_TIMES if time >= 0.95 * seconds]
     time = fitting[0] if fitting else 3600.0 * math.ceil(0.95 * seconds / 3600.0)
     if time < 120.0:

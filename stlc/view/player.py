@@ -1,8 +1,8 @@
-"""Interactive animation at the head of the report: playback, scrubbing, and jumps to violations.
+"""Interactive animation at the head of the report: playback, a time slider, and links to violations.
 
-Without scripts the page shows a still. The animation is stored as drawing commands
-(`stlc.view.vector`), not as pixels: the picture is sharp at every width and follows the reader's light or
-dark scheme; `player.js` replays the commands.
+Without scripts the page shows a still picture. The animation is stored as drawing commands
+(`stlc.view.vector`), which `player.js` executes: the picture is sharp at every width and follows the reader's
+light or dark scheme.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _WIDE, _HIGH = 1000, 40  # of a track
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """A strip chart of the page: name, curve, and value at every frame."""
+    """A strip chart on the page: its name, its curve, and its value at every frame."""
 
     name: str
     curve: Html
@@ -46,7 +46,7 @@ class _Track:
 
 
 def player_section(contents: RunContents) -> Section | None:
-    """The animation of the newest deployment; None without a recording."""
+    """The animation of the latest closed-loop run; None if none was recorded."""
     panels = run_panels(contents.run)
     if not panels:
         return None
@@ -67,7 +67,7 @@ def player_section(contents: RunContents) -> Section | None:
 
 
 def script() -> Html:
-    """Script of the page; it loads nothing else."""
+    """The page's script; it loads nothing else."""
     return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
 
 
@@ -75,7 +75,7 @@ def script() -> Html:
 
 
 def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], contents: RunContents) -> Html:
-    """A canvas for each run, and a still for readers without scripts."""
+    """A drawing area per run, and a still picture for readers without scripts."""
     figures = [
         el(
             "figure",
@@ -98,7 +98,7 @@ def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], co
 
 
 def _still(contents: RunContents) -> Html | None:
-    """The still of the animation, drawn if it is missing."""
+    """The still picture of the animation, drawn if its file is missing."""
     path = contents.run.path / STILL
     if current(contents.run) and path.is_file():
         kind, content = "png", path.read_bytes()
@@ -135,12 +135,12 @@ def _keys(panels: Sequence[RunPanel]) -> Html:
 
 
 def _inks(color: str) -> str:
-    """Inline style of a colour in the light and in the dark scheme."""
+    """Inline style that sets a colour for the light and for the dark scheme."""
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
 
 
 def _files(contents: RunContents) -> Html | None:
-    """The animation as files beside the page."""
+    """Links to the animation files beside the page; None if there are none."""
     names = [f"{animation_name(contents.run)}{suffix}" for suffix in (".gif", ".mp4")]
     links = [
         join(el("a", name, attrs={"href": name}), " ")
@@ -220,13 +220,13 @@ def _svg(parts: Iterable[Html]) -> Html:
 
 
 def _up(values: Floats, limits: tuple[float, float]) -> Floats:
-    """Vertical coordinates of values in a track with these limits, from its upper edge."""
+    """Vertical coordinates of values in a strip chart with these limits, measured from its upper edge."""
     low, high = limits
     return np.asarray(_HIGH - _HIGH * (np.clip(values, low, high) - low) / ((high - low) or 1.0))
 
 
 def _across(times: Floats) -> Floats:
-    """Horizontal coordinates of the samples, and of the right edge."""
+    """Horizontal coordinates of the samples in a strip chart, and of its right edge."""
     span = float(times[-1] - times[0]) or 1.0
     return np.append(_WIDE * (times - times[0]) / span, _WIDE)
 
@@ -255,7 +255,7 @@ def _area(times: Floats, base: Floats, values: Floats, limits: tuple[float, floa
 
 
 def _events(panels: Sequence[RunPanel]) -> Html | None:
-    """List of violations by requirement; each line links to its instant."""
+    """List of violations by requirement; each entry links to its instant. None without violations."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.requirements))
     if not names:
         return None
@@ -300,7 +300,7 @@ def _data(
     tracks: Sequence[Sequence[_Track]],
     shown: range,
 ) -> Html:
-    """The replayed data as JSON, escaped for a `<script>` element."""
+    """Data of the animations as JSON, escaped for a `<script>` element."""
     dt = panels[0].dt
     document: dict[str, Any] = {
         "times": [round(index * dt, 9) for index in shown],

@@ -1,4 +1,4 @@
-"""Report sections on the recorded trace: verdicts, signals with robustness, causes, map."""
+"""Report sections on the trace of the closed-loop runs: verdicts, signals with robustness, causes, map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MAP_CAPTION = (
 
 
 def recorded_section(contents: RunContents) -> Section | None:
-    """Verdicts on the recorded traces; None without a trace that can be judged."""
+    """Section with verdicts on the recorded traces; None without a trace."""
     trace = contents.trace
     if trace is None:
         return None
@@ -55,7 +55,7 @@ def recorded_section(contents: RunContents) -> Section | None:
 
 
 def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
-    """Verdicts by the rules for runs stored in the trace; None if there are none."""
+    """Verdicts by the separate specification for closed-loop runs in the trace; None if there is none."""
     if not trace.meta.judge_text:
         return None
     try:
@@ -83,7 +83,7 @@ def _monitor(contents: RunContents, trace: Trace) -> Monitor:
 
 
 def map_section(contents: RunContents) -> Section | None:
-    """The map of paths over regions; None if the specification names no planar region."""
+    """Section with the map of paths over regions; None if the specification names no planar region."""
     trace = contents.trace
     if trace is None:
         return None
@@ -129,7 +129,7 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
 
 
 def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
-    """The instant of the worst violation; without one, the start of the window with the least robustness."""
+    """Text: the instant of the worst violation; without a violation, the start of the least robust window."""
     moment, cause = verdict.subject.moment, causes.get(judgement.name)
     if cause is None:
         return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
@@ -171,7 +171,7 @@ def _caption(trace: Trace, once: list[str]) -> Html:
 
 
 def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
-    """Worst violation of each violated requirement: part, instant and values."""
+    """List of the worst violation of each violated requirement: part of the formula, instant and values."""
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
@@ -196,7 +196,7 @@ def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) ->
 
 
 def _marked(text: str, marks: list[tuple[int, int]]) -> Html:
-    """`text` with the ranges `marks` (start, end) highlighted; overlapping ranges are merged."""
+    """Text with the ranges `marks` (start, end) highlighted; overlapping ranges are merged."""
     parts: list[Html | str] = []
     last = 0
     for start, end in marks:

@@ -1,4 +1,4 @@
-"""Map of a trace: regions of the specification, paths through them, and their occupancy over time."""
+"""Map of a trace: regions of the specification, paths through them, and share of traces in them over time."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ class RegionMap:
     """Data of a map.
 
     Attributes:
-        trace: the recording.
-        plane: the two signals and their regions.
-        violated: (traces,), whether a trace violates a requirement.
+        trace: the recorded trace.
+        plane: the two signals on the axes, and their regions.
+        violated: whether a trace violates a requirement, (traces,).
     """
 
     trace: Trace
@@ -72,28 +72,28 @@ class RegionMap:
 
     @property
     def paths(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Both coordinates, (traces, samples)."""
+        """Horizontal and vertical coordinates of the paths, (traces, samples) each."""
         across, up = self.plane.axes
         return self.trace.data[across], self.trace.data[up]
 
     def color(self, region: MapRegion) -> str:
-        """Colour of a region: red if it must be avoided, else its own."""
+        """Colour of a region: red if it must be avoided, else a colour assigned to it."""
         if region.role == "avoid":
             return RED
         others = [other for other in self.plane.regions if other.role != "avoid"]
         return _TINTS[others.index(region) % len(_TINTS)]
 
     def inside(self, region: MapRegion) -> Mask:
-        """Mask of the traces in a region over time, (traces, samples)."""
+        """True where a trace is inside a region, (traces, samples)."""
         return region.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
-        """Indices of at most `most` traces, violating ones first."""
+        """Indices of at most `most` traces, those with violations first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
 def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> RegionMap | None:
-    """The map of a judged trace; None if its specification names no planar regions."""
+    """The map of an evaluated trace; None if its specification names no planar regions."""
     plane = plane_of(spec, [judgement.rule for judgement in verdict], trace)
     if plane is None:
         return None
@@ -102,7 +102,7 @@ def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> RegionMap | None:
 
 
 def draw_map(region_map: RegionMap) -> Picture:
-    """Draw all paths over the regions; beside them, for each region, the share of traces in it over time."""
+    """Draw all paths over the regions, and beside them the share of traces in each region over time."""
     with picture_style():
         figure = new_figure(9, 4.4)
         plot, rows = _layout(figure, region_map)
@@ -114,7 +114,7 @@ def draw_map(region_map: RegionMap) -> Picture:
 
 
 def map_animation(region_map: RegionMap, *, title: str = "") -> Animation:
-    """Film of the map: active regions are filled, trails fade behind the agents."""
+    """Animation of the map: a region is filled while it is active, and agents leave fading trails."""
 
     def begin(figure: Figure) -> Callable[[int], None]:
         plot, rows = _layout(figure, region_map)
@@ -159,7 +159,7 @@ def _summary(region_map: RegionMap) -> str:
 
 
 def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
-    """Axes of the map, and of a row for each region beside it."""
+    """Axes of the map, and beside it a row of axes for each region."""
     (left, right), (low, high) = region_map.plane.window(region_map.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
     grid = figure.add_gridspec(1, 2, width_ratios=[1.55 * ratio**0.5, 1])
@@ -176,7 +176,7 @@ def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
 
 
 def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
-    """Draw every region; return the filled patch of each, empty for an invisible one."""
+    """Draw every region; return its filled patch, which is empty for a region outside of the picture."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -213,7 +213,7 @@ def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]])
 
 
 def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
-    """Draw satisfying paths in ink, violating ones in red above them; mark start and end."""
+    """Draw satisfying paths in ink and violating ones in red above them, with marks at start and end."""
     across, up = region_map.paths
     chosen = region_map.first(MOST_PATHS)
     for violated, color, order in ((False, INK, 3), (True, RED, 4)):
@@ -232,12 +232,12 @@ def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
 
 
 def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Concatenate rows, separated by NaN, into one line, which draws fast."""
+    """Concatenate rows, separated by NaN, so that they are drawn as one line, which is faster."""
     return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
 
 
 def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None:
-    """Draw the share of traces in a region over time, with its active time shaded."""
+    """Draw the share of traces in a region over time, and shade the times at which the region is active."""
     color, times = region_map.color(region), region_map.trace.times
     for low, high in region.windows:
         axes.axvspan(
@@ -300,10 +300,10 @@ class Use:
     """An occurrence of a region in a requirement.
 
     Attributes:
-        requirement: its name.
-        negative: whether the region is to be avoided: it is under an odd number of negations.
-        visit: whether one visit is enough: the region is under an `eventually`.
-        window: active time, in seconds from the start of the trace; None if always active.
+        requirement: name of the requirement.
+        negative: whether the region is to be avoided: it occurs under an odd number of negations.
+        visit: whether one visit is enough: the region occurs under an `eventually` or the like.
+        window: time in which the occurrence counts, in seconds of the trace's time; None: always.
     """
 
     requirement: str
@@ -317,9 +317,9 @@ class MapRegion:
     """A region of the plane.
 
     Attributes:
-        name: as declared, or the text of the region.
+        name: name as declared, or the expression of the region.
         uses: occurrences of the region in the specification.
-        monitor: evaluates membership of a point.
+        monitor: evaluates whether a point is in the region.
     """
 
     name: str
@@ -344,35 +344,35 @@ class MapRegion:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Times at which it is active; empty for always."""
+        """Time intervals in which the region is active; empty if it is always active."""
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
     def active(self, seconds: Any) -> Mask:
-        """Mask of the times, in seconds from the start of the trace, at which it is active."""
+        """True for those times, in seconds of the trace's time, at which the region is active."""
         windows = self.windows or ((-np.inf, np.inf),)
         return np.asarray(np.any([(low <= seconds) & (seconds <= high) for low, high in windows], axis=0))
 
     def depth(self, points: Trace) -> NDArray[np.float64]:
-        """Signed distance to the border, positive inside: (traces, samples)."""
+        """Signed distance of points to the region's border, positive inside: (traces, samples)."""
         (margin,) = self.monitor.requirement_robustness(points).values()
         return np.atleast_2d(margin)
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Two signals and the regions of their plane.
+    """Two signals, as the axes of a plane, and the regions in it.
 
     Attributes:
-        axes: names of the two columns.
-        regions: in the order of the specification.
+        axes: names of the two signals.
+        regions: regions in the order of the specification.
     """
 
     axes: tuple[str, str]
     regions: tuple[MapRegion, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
-        """Part of the plane to show: all paths, and the regions near them."""
+        """Limits of the map along both axes: they contain all paths, and the regions near them."""
         ends = []
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
@@ -398,7 +398,7 @@ class Plane:
         *,
         count: int = GRID,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Signed distance of a region over a grid: the coordinates along both axes, and (y, x) values."""
+        """Signed distance to a region's border on a grid: coordinates along both axes, and values (y, x)."""
         (left, right), (low, high) = window
         xs, ys = np.linspace(left, right, count), np.linspace(low, high, count)
         across, up = np.meshgrid(xs, ys)
@@ -409,14 +409,14 @@ class Plane:
 
 
 def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
-    """The plane with most regions, each once; None if the requirements name none.
+    """The plane (pair of signals) in which most regions lie; None if the requirements name no region.
 
-    Regions that move with other signals and those of more than two dimensions are left out.
+    Regions that depend on other signals and regions of more than two dimensions are left out.
 
     Args:
-        spec: syntax tree.
+        spec: syntax tree of the specification.
         rules: its requirements, compiled for recorded traces.
-        trace: the trace to judge.
+        trace: the trace to evaluate.
     """
     members = {_key(node.span): node for node in descendants(spec) if isinstance(node, ast.Member)}
     uses: dict[tuple[str, str], list[Use]] = {}
@@ -442,7 +442,10 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
 
 
 def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
-    """A monitor of one membership predicate; None if it does not compile alone (it uses an argument, say)."""
+    """A monitor of one membership predicate; None if it cannot be compiled alone.
+
+    A predicate that uses an argument of a definition, for example, cannot.
+    """
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
     formula = replace(node, item=_point(node), negated=False)
     alone = ast.Require(name="inside", name_span=node.span, tags=(), doc="", span=node.span, formula=formula)
@@ -457,7 +460,7 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 
 
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Every predicate of a requirement, with its polarity and active time."""
+    """Yield every predicate of a requirement, with its polarity and the time in which it counts."""
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()
@@ -483,7 +486,7 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """The use within a temporal operand, window in seconds of the trace; unchanged if the window slides."""
+    """The occurrence inside a temporal operator; unchanged if the operator's window moves with time."""
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)
     if low is None or high is None or (interval.clock == "now" and slides):
@@ -504,7 +507,7 @@ def _key(span: Span) -> tuple[str, int, int]:
 
 
 def _point(node: ast.Member) -> ast.Expr:
-    """The point of a membership predicate; that of `sweep(p)` is `p`."""
+    """The point of a membership predicate; if it is `sweep(p)`, the point is `p`."""
     match node.item:
         case ast.Call(func=ast.Name(name="sweep"), args=(arg,)):
             return arg.value
@@ -513,12 +516,12 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """Key of a region: texts of the point and of the region."""
+    """Key that identifies a region: the texts of the point and of the region."""
     point, region = (" ".join(part.span.text.split()) for part in (_point(node), node.region))
     return point, region
 
 
 def uses_text(uses: Sequence[Use]) -> str:
-    """The requirements on a region with their times, such as `pass_gate 1 to 3 s`."""
+    """The requirements that name a region, with their times, such as `pass_gate 1 to 3 s`."""
     times = [f" {use.window[0]:g} to {use.window[1]:g} s" if use.window else "" for use in uses]
     return ", ".join(dict.fromkeys(use.requirement + time for use, time in zip(uses, times, strict=True)))

@@ -1,8 +1,8 @@
 """`report.html`: results of a run, its settings, its failures and the commands that repeat it.
 
-It begins with an interactive animation of the newest deployment. The page is self-contained: style,
-pictures and its one script are embedded, and it needs no network. Without scripts it shows a still; it
-follows the reader's light or dark scheme. Missing parts (a deployment, say) are left out.
+It begins with an interactive animation of the latest closed-loop run. The page is self-contained: style,
+pictures and its one script are embedded, and it needs no network. Without scripts it shows a still picture;
+it follows the reader's light or dark scheme. Parts without data are left out.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def write_report(run: RunDir) -> Path:
 
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
-        RunError: R101, the folder is no run.
+        RunError: R101, the folder is not a run.
     """
     require_drawing()
     contents = read_contents(run)
@@ -87,7 +87,7 @@ def sections_of(contents: RunContents) -> list[Section]:
 
 
 def render_report(contents: RunContents, sections: list[Section]) -> str:
-    """The page of a run."""
+    """The report of a run as an HTML page."""
     animation = player_section(contents)
     tiles = [(value, name) for value, name in _training_tiles(contents.result) if value]
     tiles += deployment_tiles(contents)
@@ -112,7 +112,7 @@ def render_report(contents: RunContents, sections: list[Section]) -> str:
 def headline(contents: RunContents) -> Html:
     """Result of the run in one sentence, with advice.
 
-    A simulated run is judged by its closed-loop runs, another by its plans.
+    If closed-loop runs were simulated, these count; otherwise the policy's plans.
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
     obeyed, viable = obeyed_sentence(simulation), viable_sentence(simulation)
@@ -153,7 +153,7 @@ def _beside(result: Mapping[str, Any]) -> str:
 
 
 def _advice(contents: RunContents) -> Html | None:
-    """Level of the training and advice if the policy falls short."""
+    """Advice on further training; None if the policy is trained."""
     where = clause(contents.held_out, contents.signature)
     commands = Commands.of(shlex.quote(contents.run.shown), guard=recommended(contents.record))
     learning = learning_on_record(contents.record, contents.rows, commands, where)
@@ -183,7 +183,7 @@ def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def requirements_section(contents: RunContents) -> Section | None:
-    """Every requirement with its text and the share of plans that satisfy it."""
+    """Table of the requirements, each with its text and the share of plans that satisfy it."""
     shares: Mapping[str, float] = contents.result.get("requirements") or {}
     names = list(shares) or list(contents.requirements)
     if not names:
@@ -216,7 +216,7 @@ def _described(contents: RunContents, name: str) -> Html:
 
 
 def training_section(contents: RunContents) -> Section:
-    """Curves, options, machine and versions."""
+    """Section with learning curves, training options, machine and versions."""
     curves = draw_curves(contents.rows)
     shown = figure(curves.data_uri(), curves.alt, CURVES_CAPTION) if curves else None
     last = contents.rows[-1] if contents.rows else {}
@@ -298,7 +298,7 @@ _TITLES = {
 
 
 def failures_section(contents: RunContents) -> Section | None:
-    """Region of the initial set in which the policy's plans fail."""
+    """Section on the region of initial states from which the policy's plans fail; None without failures."""
     if contents.held_out is None:
         return None
     picture = draw_failures(contents.held_out, contents.signature, contents.units)
@@ -316,7 +316,7 @@ def failures_section(contents: RunContents) -> Section | None:
 
 
 def repeat_section(contents: RunContents) -> Section:
-    """The commands that reproduce the run."""
+    """Section with the commands that reproduce the run."""
     intro = el(
         "p",
         "The same seed and steps give the same weights on the same machine. The folder of the run "
@@ -356,7 +356,7 @@ def _set(record: Mapping[str, Any]) -> list[str]:
 
 
 def _simulate(contents: RunContents) -> list[str]:
-    """The command of the newest deployment, or one with the backup policy if there is none."""
+    """Arguments of the command that repeats the latest closed-loop run; by default with the paper's guard."""
     done = contents.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
     words = ["stlc", "simulate", contents.run.shown, *guard_words(guard).option.split()]
@@ -378,7 +378,7 @@ def _simulate(contents: RunContents) -> list[str]:
 
 
 def texts_section(contents: RunContents) -> Section | None:
-    """The texts of specification and system, and collapsed the files derived from them."""
+    """Section with the texts of specification and system; the files derived from them are collapsed."""
     if not contents.texts:
         return None
     blocks = []

@@ -1,4 +1,4 @@
-"""Animation of a deployment: its world's scene, else a map of the specification's regions, else signals."""
+"""Animation of a closed-loop run: the world's scene if it draws one, else a map of regions, else signals."""
 
 from __future__ import annotations
 
@@ -50,40 +50,40 @@ PANEL = 5.8
 
 @dataclass(frozen=True, slots=True)
 class AnimationFiles:
-    """The files of an animation; without ffmpeg there is no video."""
+    """The files of an animation; the video is None without ffmpeg."""
 
     gif: Path
     mp4: Path | None
 
 
 def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
-    """Animation of the run's deployment; None if nothing was recorded.
+    """Return the animation of the run's latest closed-loop simulation; None if nothing was recorded.
 
-    Its world, loaded from the folder, draws the scene. Without a world, or if it fails, the animation shows
-    the paths of the trace over the regions of its specification, else the signals. The default title names
-    specification, scenario and run.
+    The world, loaded from the run's folder, draws the scene. Without a world, or if drawing fails, the
+    animation shows the paths of the trace over the regions of its specification, else the signals. The
+    default title consists of specification, scenario and run.
     """
     title = _title(run) if title is None else title
     return _scene_animation(run, title) or _signal_animation(run, title)
 
 
 def animation_name(run: RunDir) -> str:
-    """File name of the run's animation, without a suffix: that of its specification."""
+    """File name of the run's animation without suffix: the name of its specification."""
     return file_part(str(run.record().get("spec", "")), empty="deployment")
 
 
 def animate(
     run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES
 ) -> AnimationFiles | None:
-    """Animate the deployment of `run` into its folder, with a still beside it.
+    """Write the animation of the closed-loop run of `run` into its folder, with a still picture beside it.
 
     Args:
-        run: a simulated run.
-        max_frames: of the animation; instants are left out evenly beyond that.
-        max_bytes: of the GIF; the picture gets smaller where it would be larger.
+        run: a run with a closed-loop simulation.
+        max_frames: maximum number of frames; more instants are subsampled evenly.
+        max_bytes: maximum size of the GIF; the picture is made smaller to meet it.
 
     Returns:
-        The files, or None where nothing was recorded.
+        The files, or None if nothing was recorded.
 
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
@@ -101,7 +101,7 @@ def animate(
 
 
 def current(run: RunDir) -> bool:
-    """True if the animation in the folder shows the newest deployment."""
+    """True if the animation in the folder shows the latest closed-loop run."""
     gif = run.path / f"{animation_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
     return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
@@ -109,13 +109,13 @@ def current(run: RunDir) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RecordedScene:
-    """A recorded scene with its world.
+    """A recorded scene with the world that draws it.
 
     Attributes:
-        scene: snapshots stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
+        scene: recorded values stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
         world: draws the scene.
         dt: seconds between frames.
-        judged: verdicts on the agents; None if they cannot be judged.
+        judged: verdicts on the agents; None if they cannot be evaluated.
         events: violations of all requirements.
     """
 
@@ -127,12 +127,12 @@ class RecordedScene:
 
     @property
     def stage(self) -> Stage | None:
-        """The 3D stage of the robots; None if the world has none."""
+        """The 3D stage on which PyBullet draws the robots; None if the world has none."""
         return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
 
     @property
     def own_keys(self) -> Mapping[str, str]:
-        """Legend entries of the world."""
+        """Legend entries that the world adds: label -> colour."""
         return getattr(self.world, "KEYS", {})
 
     @property
@@ -142,7 +142,7 @@ class RecordedScene:
 
     @property
     def strip(self) -> Strip | None:
-        """Strip charts; None if margins or decisions are unknown."""
+        """Strip charts below the scene; None if neither margins nor decisions are known."""
         decisions = self.scene.get("decision")
         if self.judged is None or decisions is None:
             return None
@@ -150,9 +150,9 @@ class RecordedScene:
 
 
 def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None:
-    """The scene of the run's deployment; None without one, or if its world cannot be loaded.
+    """The recorded scene of the run's latest closed-loop simulation; None without one or without its world.
 
-    With `guarded` false: the same seed simulated without the guard, if recorded.
+    With `guarded` False, the simulation of the same seed without the guard, if it was recorded.
     """
     from stlc.controller.world import world_type
     from stlc.dynamics.declaration.load import load_system_decl
@@ -181,7 +181,7 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
 
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
-    """Verdicts on a scene's agents; None if the trace is of another deployment."""
+    """Verdicts on the agents of a scene; None if the trace belongs to another simulation."""
     decisions, trace = scene.get("decision"), load_trace(run.path / trace_name)
     if decisions is None or trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
         return None
@@ -208,17 +208,17 @@ class RunPanel:
     """One closed-loop run as shown on a page.
 
     Attributes:
-        title: name of the guard; empty for a single run.
+        title: with or without the guard; empty if there is only one run.
         alt: description in words.
         frames: number of instants.
         dt: seconds between frames.
-        t0: time of the first frame, s.
+        t0: time of the first frame in seconds.
         keys: legend entries.
         strip: strip charts.
         events: violations.
-        names: of the agents.
-        requirements: names of the requirements judged.
-        vector_frames: records the drawing of given frames.
+        names: names of the agents.
+        requirements: names of the evaluated requirements.
+        vector_frames: returns the drawing commands of the given frames.
     """
 
     title: str
@@ -234,7 +234,7 @@ class RunPanel:
     vector_frames: Callable[[range], VectorAnimation]
 
     def time(self, sample: int) -> float:
-        """Time of a sample, seconds."""
+        """Time of a sample in seconds."""
         return self.t0 + sample * self.dt
 
 
@@ -242,9 +242,10 @@ WITHOUT, WITH = "without the guard", "with the guard"
 
 
 def run_panels(run: RunDir) -> list[RunPanel]:
-    """Panels of the newest deployment for a page: the first seed without and with the guard.
+    """Panels for a page on the latest closed-loop simulation: its first seed without and with the guard.
 
-    One panel without a comparison; signals of the trace if there is no world; empty without a recording.
+    One panel if there is no run without the guard; the trace's signals if there is no world; empty without a
+    recording.
     """
     found, other = recorded_scene(run), recorded_scene(run, guarded=False)
     try:
@@ -283,7 +284,7 @@ def _scene_panel(found: RecordedScene, title: str) -> RunPanel:
 
 
 def _trace_panels(run: RunDir) -> list[RunPanel]:
-    """One panel of the trace: its paths over regions, or its signals."""
+    """Panel of the recorded trace: its paths over regions, or its signals."""
     animation = _signal_animation(run, "")
     if animation is None:
         return []
@@ -317,14 +318,14 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
 
 
 def _scenario(run: RunDir) -> str | None:
-    """The scenario of the newest deployment, if any."""
+    """Name of the scenario of the latest closed-loop simulation; None without one."""
     result = readable(lambda: run.read_json(SIMULATION))
     name = result.get("scenario") if isinstance(result, dict) else None
     return None if name is None else str(name)
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    """Animation of the trace: over the regions of its specification if it names any, else of its signals."""
+    """Animation of the trace: paths over the regions of its specification if it names any, else signals."""
     trace = readable(lambda: load_trace(run.path / TRACE))
     if trace is None:
         return None

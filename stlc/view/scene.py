@@ -1,4 +1,4 @@
-"""Animation of a recorded scene: the world's drawing, a legend above, and strip charts below."""
+"""Animation of a recorded scene: a legend above, the world's drawing, and strip charts below."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class LegendKey:
 
     Attributes:
         word: label.
-        color: of the symbol.
-        kind: `dot`, `ring`, or a line, `dash` or `solid`.
+        color: colour of the symbol.
+        kind: kind of symbol: `dot`, `ring`, or a line, `dash` or `solid`.
     """
 
     word: str
@@ -53,9 +53,9 @@ class SceneOptions:
     Attributes:
         draw: function that draws a frame on axes.
         dt: seconds between frames.
-        title: of the picture.
-        keys: label -> colour of further legend entries.
-        strip: strip charts; None leaves them out.
+        title: title of the picture.
+        keys: further legend entries: label -> colour.
+        strip: strip charts; None: no charts.
     """
 
     draw: DrawScene
@@ -67,7 +67,7 @@ class SceneOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """Layout in inches from the lower left: (left, bottom, width, height)."""
+    """Layout in inches from the lower left; a rectangle is (left, bottom, width, height)."""
 
     size: tuple[float, float]
     scene: tuple[float, float, float, float]
@@ -80,7 +80,7 @@ def frames_of(scene: Scene) -> int:
 
 
 def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
-    """Animation of a scene, whose arrays are (frames, …)."""
+    """Animation of a scene, a dictionary of arrays (frames, …)."""
     frames = frames_of(scene)
     keys = keys_of(scene, options.keys)
     plan = _planned(ratio_of(options.draw, scene), 0 if options.strip is None else options.strip.height, keys)
@@ -116,7 +116,7 @@ def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
 
 
 def _moment(scene: Scene, frames: int) -> int:
-    """Frame with most interventions, without the first and last ones; the middle one if there are none."""
+    """Frame with most interventions, first and last sixth excluded; the middle one without interventions."""
     middle = frames // 2
     low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)
     acted = (scene["decision"][low:high] > 0).sum(1) if "decision" in scene else np.zeros(0)
@@ -168,7 +168,7 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
 
 
 def keys_of(scene: Scene, own: Mapping[str, str]) -> list[LegendKey]:
-    """Legend: recorded sources of decisions, rejected plans, violations, and what the world adds."""
+    """Legend entries: recorded sources of decisions, rejected plans, violations, and the world's own."""
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
     keys = [LegendKey(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
     if "rejected" in scene and np.isfinite(scene["rejected"]).any():
@@ -189,7 +189,7 @@ def _handle(key: LegendKey) -> Line2D:
 
 
 def _head(figure: Figure, plan: _Plan, title: str, keys: list[LegendKey]) -> Text:
-    """Draw title, clock and legend; return the clock."""
+    """Draw title, time and legend; return the text that shows the time."""
     width, height = plan.size
     top = 1 - 0.5 * _HEAD / height
     figure.text(_EDGE / width, top, title, color=INK, va="center", weight="bold", fontsize=10)
@@ -212,7 +212,7 @@ def _head(figure: Figure, plan: _Plan, title: str, keys: list[LegendKey]) -> Tex
 
 
 def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[FrameUpdate]:
-    """Draw the strip charts with a heading above the first one."""
+    """Draw the strip charts, with a heading above the first one; return the artists to update per frame."""
     if strip is None or not plan.rows:
         return []
     updates = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])

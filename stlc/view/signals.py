@@ -1,4 +1,4 @@
-"""Signals and robustness margins over time: figures of traces, strip charts of films, films of traces."""
+"""Signals and robustness margins over time: figures and animations of traces, and strip charts."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _COVER = 0.72
 
 
 def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
-    """Sources of the decisions, (traces, steps); None if not recorded."""
+    """Source of every decision (policy, or a stage of the guard), (traces, steps); None if not recorded."""
     recorded = trace.extras.get("decision")
     if recorded is None or recorded.ndim != 2 or len(recorded) != trace.traces:
         return None
@@ -79,7 +79,7 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def margin_limits(rho: Floats) -> tuple[float, float]:
-    """Vertical limits for robustness, 0 included: large margins are cut so that violations stay visible."""
+    """Vertical limits for robustness, 0 included; large margins are cut off to keep violations visible."""
     finite = rho[np.isfinite(rho)]
     if not len(finite):
         return -1.0, 1.0
@@ -118,7 +118,7 @@ def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A trace to draw.
+    """A trace chosen to be drawn.
 
     Attributes:
         index: number of the trace.
@@ -132,14 +132,15 @@ class Choice:
 def choose_traces(
     least: Floats, names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
 ) -> tuple[Choice, ...]:
-    """The trace with the least robustness, and that with most interventions, else one of median robustness.
+    """Choose the traces to draw: the least robust one, and the one with most interventions.
 
-    One trace if both are the same.
+    If there are no interventions, the second trace is one of median robustness; one trace if both are the
+    same.
 
     Args:
         least: robustness per trace, (traces,); NaN if unknown.
-        names: of the traces; default: their numbers.
-        acted: number of interventions in each, (traces,).
+        names: names of the traces; default: their numbers.
+        acted: number of interventions of the guard in each trace, (traces,).
     """
     order = np.argsort(least, kind="stable")
     worst, other, word = int(order[0]), int(order[max(1, int(np.isfinite(least).sum())) // 2]), "typical"
@@ -157,10 +158,10 @@ def draw_signals(
     """Draw a column of panels per chosen trace: signals, decisions, and robustness of each requirement.
 
     Args:
-        trace: the recording.
+        trace: the recorded trace.
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
-        choices: the traces to show.
-        units: requirement -> unit of its robustness; without requirements that have none.
+        choices: the traces to draw.
+        units: requirement -> unit of its robustness; requirements without a unit are left out.
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
@@ -193,7 +194,7 @@ def left_out(trace: Trace) -> list[str]:
 
 
 def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
-    """(kind, name) of each panel: numeric signals, discrete signals, decisions, requirements."""
+    """Kind and name of each panel: numeric signals, discrete signals, decisions, requirements."""
     columns = trace.signature.columns
     rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
     if len(rows) > MOST_LINES:
@@ -248,7 +249,7 @@ def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, 
 
 
 def _broken(values: Floats) -> Floats:
-    """A signal with NaN at jumps (a reset, the next junction); a step function is unchanged."""
+    """A signal with NaN at jumps (such as a reset), where no line is drawn; a step function is unchanged."""
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
     span = float(np.ptp(values))
@@ -273,7 +274,7 @@ def _draw_discrete(axes: Axes, trace: Trace, values: Floats, column: Column) -> 
 
 
 def constant_ranges(values: NDArray[Any]) -> list[tuple[int, int, Any]]:
-    """(start, stop, value) of each range of equal values."""
+    """Ranges of consecutive equal values, as (start, stop, value)."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, values[a].item()) for a, b in pairwise(edges) if b > a]
 
@@ -286,12 +287,12 @@ class Strip:
     """Strip charts below an animation: least margin of each requirement, and interventions of the guard.
 
     Attributes:
-        times: of the frames, in seconds, (frames,).
-        margins: requirement -> least robustness of all agents from each instant on, (frames,); NaN if
+        times: times of the frames in seconds, (frames,).
+        margins: requirement -> robustness from each instant on, the least of all agents, (frames,); NaN if
             unknown.
-        decisions: sources of the decisions, (frames, agents); None if not recorded.
+        decisions: source of each decision, (frames, agents); None if not recorded.
         words: description of the margins, for a heading.
-        units: requirement -> unit of its margin; without requirements that have none.
+        units: requirement -> unit of its margin; requirements without a unit are left out.
     """
 
     times: Floats
@@ -314,13 +315,13 @@ class Strip:
 
     @property
     def acted(self) -> NDArray[np.int64]:
-        """Number of agents with an intervention of the guard, (frames,)."""
+        """Number of agents for which the guard intervened, (frames,)."""
         if self.decisions is None:
             return np.zeros(len(self.times), dtype=np.int64)
         return np.asarray((self.decisions > 0).sum(1))
 
     def stacked(self) -> Iterator[tuple[str, Floats, Floats]]:
-        """Interventions stacked by source: colour, lower and upper edge, (frames,)."""
+        """Yield bands of interventions, stacked by source: colour, lower edge, and upper edge (frames,)."""
         base = np.zeros(len(self.times))
         for source, color in enumerate(DECIDED[1:], start=1):
             more = base + (0 if self.decisions is None else (self.decisions == source).sum(1))
@@ -334,7 +335,7 @@ class FrameUpdate:
     """Artists that change from frame to frame.
 
     Attributes:
-        turn: updates the artists to a frame.
+        turn: function that updates the artists to a frame, by index.
         artists: the artists.
     """
 
@@ -391,7 +392,7 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> FrameUpdate:
 
 
 def _titled(axes: Axes, name: str) -> Text:
-    """Write a chart's name on its left; return the text on its right for the present value."""
+    """Write a chart's name on its left; return the text on its right, which shows the present value."""
     axes.axhspan(*axes.get_ylim(), color=FAINT, alpha=0.25, lw=0, zorder=0)
     beside: Any = {"transform": axes.transAxes, "va": "center", "fontsize": 8, "color": INK}
     axes.text(-0.012, 0.5, picture(name), ha="right", **beside)
@@ -399,7 +400,7 @@ def _titled(axes: Axes, name: str) -> Text:
 
 
 def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
-    """Cover the time after the present one, and draw a line at the present time."""
+    """Cover the times after the present frame, with a line at the present time; return the update."""
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))
@@ -420,7 +421,7 @@ def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
 
 
 def signal_animation(trace: Trace, *, title: str = "") -> Animation:
-    """Animation of a trace without a world or regions: a panel per signal, with all agents."""
+    """Animation of a trace's signals: one panel per signal, with all agents."""
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 
@@ -445,7 +446,7 @@ def signal_animation(trace: Trace, *, title: str = "") -> Animation:
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
-    """Draw a signal of at most `MOST_AGENTS` agents, as one line with gaps; return its update function."""
+    """Draw a signal of at most `MOST_AGENTS` agents; return the function that updates it to a frame."""
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     axes.set_ylabel(labelled(name, trace.signature[name].unit.text).replace(" [", "\n[", 1))

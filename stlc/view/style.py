@@ -1,6 +1,7 @@
 """Style of all pictures: few colours, colour-blind safe, legible on light and dark backgrounds.
 
-Figures are built without pyplot and inside `look`, so matplotlib's global settings stay unchanged.
+Figures are built without pyplot and inside `picture_style`, so that matplotlib's global settings stay
+unchanged.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def picture_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches. Call it inside `look`."""
+    """Return an empty figure; its size is in inches. Call this inside `picture_style`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -142,7 +143,7 @@ def hide_frame(axes: Axes) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure and its alternative text."""
+    """A drawn figure and its description in words."""
 
     figure: Figure
     alt: str
@@ -162,7 +163,7 @@ class Picture:
         return _themed(buffer.getvalue())
 
     def data_uri(self) -> str:
-        """The SVG as a `data:` URI."""
+        """The SVG picture as a `data:` URI."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
@@ -173,14 +174,14 @@ class Picture:
         return path
 
     def _lay_out(self) -> None:
-        """Compute the layout once: matplotlib would do so twice for every save."""
+        """Compute the layout once, since matplotlib would compute it twice for every saved file."""
         if self.figure.get_layout_engine() is not None:
             self.figure.draw_without_rendering()
             self.figure.set_layout_engine("none")
 
 
 def _themed(svg: str) -> str:
-    """`svg` with its colours as CSS variables, set for the light and the dark scheme."""
+    """Replace the colours in an SVG by CSS variables, which are set for the light and the dark scheme."""
     inks = "|".join(ON_DARK)
     svg = re.sub(rf"({inks})\b", lambda ink: f"var(--c{ink[1][1:]})", svg[svg.index("<svg") :])
     light = ";".join(f"--c{ink[1:]}:{ink}" for ink in ON_DARK)

@@ -1,7 +1,7 @@
-"""Animations as drawing commands, not pixels: paths, texts and images, for a page that replays them.
+"""Animations as drawing commands instead of pixels: paths, texts and images, for a page that replays them.
 
-`CommandRenderer` is the matplotlib renderer that records the commands. Commands shared by frames are stored
-once. Coordinates are whole quarters of a dot from the upper left.
+`CommandRenderer` is a matplotlib renderer that records the commands. A command that several frames use is
+stored once. Coordinates are integers in quarters of a dot, from the upper left.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outli
 def vector_frames(
     draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]
 ) -> VectorAnimation:
-    """Record frames drawn by `draw(axes, index)` on axes that fill a figure of a size in inches."""
+    """Record frames drawn by `draw(axes, index)` on axes that fill a figure; `size` is in inches."""
     with picture_style():
         figure = new_figure(*size)
         figure.set_dpi(DPI)
@@ -49,7 +49,7 @@ def vector_frames(
 
 
 def vector_animation(animation: Animation, frames: Sequence[int]) -> VectorAnimation:
-    """Record the frames of an animation."""
+    """Return the given frames of an animation as drawing commands."""
     with picture_style():
         figure = new_figure(*animation.size)
         figure.set_dpi(DPI)
@@ -73,11 +73,11 @@ class CommandRenderer(RendererBase):
         self._letters: Any = RendererAgg(width, height, DPI)  # type: ignore[no-untyped-call]
 
     def begin(self) -> None:
-        """Begin another frame."""
+        """Begin the next frame."""
         self._frames.append([])
 
     def recorded(self) -> VectorAnimation:
-        """The recording."""
+        """Return the drawing commands recorded since the renderer was made, by frame."""
         frames = tuple(tuple(frame) for frame in self._frames)
         return VectorAnimation(self.width, self.height, tuple(self._known), frames)
 
@@ -121,7 +121,11 @@ class CommandRenderer(RendererBase):
         ismath: Any = False,
         mtext: Any = None,
     ) -> None:
-        """Record a line of text; `align` is the horizontal anchor of (x, y), on the baseline."""
+        """Record a line of text.
+
+        The recorded position is on the baseline, at the left end, centre or right end of the text by its
+        alignment.
+        """
         wide, _, _ = self.get_text_width_height_descent(s, prop, ismath)
         align = "left" if mtext is None else mtext.get_horizontalalignment()
         along = {"left": 0.0, "center": 0.5, "right": 1.0}[align] * wide
@@ -132,7 +136,7 @@ class CommandRenderer(RendererBase):
         self._enter(("t", *at, s, size, _color(gc.get_rgb(), gc), align, round(-angle), int(bold)))
 
     def get_text_width_height_descent(self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
-        """Size of a text in dots, as on a canvas."""
+        """Width, height and descent of a text in dots, as on a canvas."""
         wide, high, deep = self._letters.get_text_width_height_descent(s, prop, ismath)
         return float(wide), float(high), float(deep)
 
@@ -141,21 +145,21 @@ class CommandRenderer(RendererBase):
         return self.width, self.height
 
     def points_to_pixels(self, points: Any) -> Any:
-        """Dots of a length in points."""
+        """Convert lengths in points to dots."""
         return points * DPI / 72
 
     def flipy(self) -> bool:
-        """True: the origin is the upper left."""
+        """Return True: the origin is the upper left."""
         return True
 
     def option_image_nocomposite(self) -> bool:
-        """True: images are not merged."""
+        """Return True: images are not merged."""
         return True
 
     # ------------------------------------------------------------------------------------- pieces
 
     def _path(self, path: Any, transform: Any) -> str:
-        """A path in SVG notation, with relative coordinates."""
+        """Convert a path to SVG notation with relative coordinates."""
         flip = transform + Affine2D().scale(FINE, -FINE).translate(0, FINE * self.height)
         words: list[str] = []
         x = y = 0
@@ -183,13 +187,13 @@ class CommandRenderer(RendererBase):
         return " ".join(f"{self.points_to_pixels(length):.3g}" for length in pattern)
 
     def _clip(self, gc: Any) -> str | None:
-        """The clip path, if it is not the frame of the axes."""
+        """The clip path in SVG notation; None if drawing is clipped by the axes only."""
         path, transform = gc.get_clip_path()
         return None if path is None else self._path(path, transform)
 
 
 def _color(color: Any, gc: Any) -> str | None:
-    """`#rrggbb`, with two more digits for opacity below 1; None if fully transparent."""
+    """Colour as `#rrggbb`, with two more digits if opacity is below 1; None if fully transparent."""
     alpha = gc.get_alpha() if gc.get_forced_alpha() else color[3] if len(color) > 3 else 1.0
     if not alpha:
         return None

@@ -1,4 +1,4 @@
-"""Verdicts on recorded runs by their own specification: monitor, robustness margins, violation events."""
+"""Verdicts on recorded closed-loop runs by their own specification: robustness margins and violations."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ FLASHES = 4
 
 
 def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
-    """The monitor of the specification stored in a trace, or else of `text`.
+    """The monitor of the specification stored in a trace; if the trace has none, of `text`.
 
     Args:
-        trace: the recording.
-        text: specification for a trace without one.
-        system: the system file, which provides external functions.
-        drives: use the stored rules for closed-loop runs, if any, instead of the specification of plans.
+        trace: the recorded trace.
+        text: specification used for a trace without one.
+        system: path of the system file, which supplies external functions.
+        drives: use the separate specification for closed-loop runs, if one is stored, not that of plans.
 
     Raises:
         SpecError: the specification is invalid.
@@ -52,9 +52,9 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, driv
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
-    """Robustness of each judged requirement from each sample on, (traces, samples); NaN where undefined.
+    """Robustness of each requirement from each sample on, (traces, samples); NaN where undefined.
 
-    A requirement judged once has that value at every sample.
+    A requirement that is evaluated once has the same value at every sample.
     """
     found = monitor.requirement_robustness(trace)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
@@ -64,18 +64,18 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Fl
 
 
 def units_of(verdict: Verdict) -> dict[str, str]:
-    """Requirement -> unit of its robustness; without requirements that have none."""
+    """Requirement -> unit of its robustness; requirements without a unit are left out."""
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
 def judged_at_start(verdict: Verdict) -> list[str]:
-    """Names of the requirements judged only at the start of a trace."""
+    """Names of the requirements that are evaluated only at the start of a trace."""
     planned = verdict.subject.horizon is not None
     return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
 
 
 def trace_names(trace: Trace) -> list[str]:
-    """Names of traces: their numbers, with seed and agent if recorded."""
+    """Names of the traces: numbers, with seed and agent if recorded."""
     seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
     if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
         return [f"trace {index}" for index in range(trace.traces)]
@@ -90,14 +90,16 @@ def trace_names(trace: Trace) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class SceneVerdicts:
-    """The runs of a scene's agents (those of the first seed) and the verdicts on them.
+    """The agents of a scene (those of the first seed), their traces, and the verdicts on them.
 
     Attributes:
-        trace: recording of these agents.
+        trace: recorded traces of these agents.
         monitor: monitor of the specification of plans.
         verdict: verdict of that monitor.
-        executed: verdict by the rules for closed-loop runs, if stored; else equal to `verdict`.
-        consistent: mask of the model-consistent samples, (agents, samples); None if not recorded.
+        executed: verdict by the separate specification for closed-loop runs, if one is stored; else
+            `verdict`.
+        consistent: True at samples from which the world behaves as the model, (agents, samples); None if not
+            recorded.
     """
 
     trace: Trace
@@ -108,17 +110,21 @@ class SceneVerdicts:
 
     @property
     def marked(self) -> set[str]:
-        """Requirements whose violations are marked: all rules for runs, else the `@safety` ones."""
+        """Requirements whose violations are marked in the picture.
+
+        These are all requirements of a separate specification for closed-loop runs; without one, the
+        requirements tagged `@safety`, or all if none is tagged.
+        """
         safety = {each.name for each in self.executed if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
         return safety if safety and not ruled else {each.name for each in self.executed}
 
 
 def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
-    """Judge the first `agents` of a trace by its own specification.
+    """Evaluate the traces of the first `agents` agents by the specification stored in the trace.
 
     Raises:
-        StlcError: the trace cannot be judged.
+        StlcError: the trace cannot be evaluated.
     """
     data = {name: values[:agents] for name, values in trace.data.items()}
     monitor, first = monitor_of(trace, system=system), replace(trace, data=data, extras={})
@@ -129,7 +135,7 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
 
 
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
-    """Strip charts of the agents' margins and of the decisions, (frames, agents)."""
+    """Strip charts of the agents' margins and of the sources of the decisions, (frames, agents)."""
     rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
     times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
     if judged.consistent is not None:
@@ -141,10 +147,9 @@ def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Stri
 
 
 def model_consistent(trace: Trace, agents: int) -> Mask | None:
-    """Mask of model-consistent samples: the world follows the model for the length of a plan.
+    """True at samples from which the world behaves as the model for the length of a plan, (agents, samples).
 
-    Returns:
-        (agents, samples), or None if not recorded.
+    None if that was not recorded.
     """
     steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
     if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
@@ -154,7 +159,7 @@ def model_consistent(trace: Trace, agents: int) -> Mask | None:
 
 
 def least(rho: Floats, counts: Mask | bool = True) -> Floats:
-    """Least robustness over the masked agents, (agents, samples) -> (samples,); NaN if unknown for all."""
+    """Least robustness over the agents that count: (agents, samples) -> (samples,); NaN if none is known."""
     known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
     return np.where(np.isfinite(known), known, np.nan)
 
@@ -186,8 +191,8 @@ class Event:
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
     """Violations by the first `agents` traces, in order of time.
 
-    A violation is placed at its cause. The search then continues with windows that begin after that instant,
-    so that each cause is found once, and ends after `most` events of a requirement.
+    The time of a violation is that of its cause. The search then continues with windows that begin later, so
+    that each cause is found once; it ends after `most` violations of a requirement.
     """
     found: list[Event] = []
     for judgement in verdict:
@@ -215,13 +220,13 @@ def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> li
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:
-    """Mask of marked agents in an animation, (frames, agents): during a violation, and blinking after it.
+    """True for agents to be marked in a frame, (frames, agents): during a violation, and blinking after it.
 
     Args:
         events: violations.
         frames: number of instants.
         agents: number of agents.
-        names: requirements whose violations are marked; None for all.
+        names: requirements whose violations are marked; None: all.
     """
     shown = np.zeros((frames, agents), dtype=bool)
     pattern = np.array(FLASH * FLASHES)

@@ -1,4 +1,4 @@
-"""Numbers and names formatted for readers."""
+"""Numbers and names formatted as text for readers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """0.957 as `95.7 %`; "" for None. A share below 1 never rounds to 100 %, one above 0 never to 0 %."""
+    """Format a share: 0.957 is `95.7 %`, None is "". Rounding never gives 100 % below 1, or 0 % above 0."""
     if value is None:
         return ""
     while digits < 4 and 0 < value < 1 and round(100 * value, digits) in (0, 100):
@@ -18,12 +18,12 @@ def share(value: float | None, digits: int = 1) -> str:
 
 
 def interval(ends: Sequence[float] | None) -> str:
-    """(0.951, 0.962) as `95.1 to 96.2 %`."""
+    """Format an interval of shares: (0.951, 0.962) as `95.1 to 96.2 %`."""
     return "" if not ends else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
 
 
 def number(value: float | None, unit: str = "") -> str:
-    """A number with three significant digits, grouped thousands, and its unit."""
+    """Format a number with three significant digits, grouped thousands, and its unit."""
     if value is None:
         return ""
     text = f"{value:,.0f}" if abs(value) >= 1000 or value == round(value) else f"{value:.3g}"
@@ -31,7 +31,7 @@ def number(value: float | None, unit: str = "") -> str:
 
 
 def spread(mean: float, half: float | None) -> tuple[str, str]:
-    """A mean and the half-width of its interval with as many decimals as two digits of the latter need."""
+    """Format a mean and the half-width of its interval, with two significant digits of the half-width."""
     if not half:
         return number(mean), "" if half is None else "0"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{half:.1e}"))))
@@ -39,7 +39,7 @@ def spread(mean: float, half: float | None) -> tuple[str, str]:
 
 
 def seconds(value: float | None) -> str:
-    """A duration: `0.7 ms`, `61 s`, `5 min 12 s`."""
+    """Format a duration: `0.7 ms`, `61 s`, `5 min 12 s`."""
     if value is None:
         return ""
     if value < 1:
@@ -52,7 +52,7 @@ def seconds(value: float | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class GuardWords:
-    """Names of a guard.
+    """Names of a guard in texts.
 
     Attributes:
         title: heading of its column in a table.
@@ -64,12 +64,12 @@ class GuardWords:
 
     @property
     def noun(self) -> str:
-        """Name with its article: `the full guard`, `no guard`."""
+        """Name of the guard with its article: `the full guard`, `no guard`."""
         return f"the {self.title}" if self.option else self.title
 
     @property
     def beside(self) -> str:
-        """Name with its preposition: `with the full guard`, `without a guard`."""
+        """Name of the guard with its preposition: `with the full guard`, `without a guard`."""
         return f"with {self.noun}" if self.option else "without a guard"
 
 
@@ -81,7 +81,7 @@ GUARDS = {
 
 
 def guard_words(name: object) -> GuardWords:
-    """Names of a guard; for an unknown one derived from its name."""
+    """Names of the guard `name`; for an unknown guard, names derived from `name`."""
     return GUARDS.get(str(name)) or GuardWords(f"guard {name}", f"--guard {name}")
 
 
@@ -91,7 +91,7 @@ def labelled(name: str, unit: str) -> str:
 
 
 def count(many: int, what: str) -> str:
-    """`1 trace`, `20 traces`."""
+    """Format a number of things: `1 trace`, `20 traces`."""
     return f"{many:,} {what}{'' if many == 1 else 's'}"
 
 
@@ -104,10 +104,10 @@ def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, An
 
 
 def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
-    """`198 of 200 drives obeyed every rule; without the guard 150`, from the document of a deployment.
+    """Sentence `198 of 200 drives obeyed every rule; without the guard 150`, from `eval/simulate.json`.
 
-    A drive is one agent over one seed. Without a separate specification for drives it is judged by that of
-    plans, from every start. "" for a document without drives.
+    A drive is the closed-loop run of one agent with one seed. Without a separate specification for drives, it
+    is evaluated by the specification of plans, from every start instant. "" for a file without drives.
     """
     each = drives_of(simulation)
     if not each:
@@ -132,7 +132,7 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Sentence on the lost drives, and on the other ones that obeyed; "" if none was lost."""
+    """Sentence on drives lost since no satisfying plan was known, and on the others; "" if none was lost."""
     each = list(drives_of(simulation).values())
     if not each or not each[-1]["lost"]:
         return ""
@@ -151,7 +151,7 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
-    """Reason for which a drive broke a rule, for an entry of `broken`; "" if unknown."""
+    """Reason for which a drive violated a rule, from an entry of `broken`; "" if unknown."""
     cause = broken.get("cause") or {"why": "start" if broken["lost"] else ""}
     if cause["why"] in ("start", ""):
         return "lost from its start" if cause["why"] else ""

@@ -1,1 +1,1 @@
-"""Robustness over any array library."""
+"""Evaluation of robustness on arrays, with any array library."""

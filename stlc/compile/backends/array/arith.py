@@ -1,7 +1,8 @@
-"""Numbers -> arrays: `ir.Num` as a program over any array library.
+"""Numeric expressions (`ir.Num`) as programs over any array library.
 
-A program is built once and called often. For each switch it keeps a tape
-(`stlc.compile.backends.array.tape`) bound to the array library; a call fills registers from top to bottom.
+A program is built once and called often. It records its operations on a tape
+(`stlc.compile.backends.array.tape`), one per treatment of conditions, bound to the array library; a call
+executes the tape from top to bottom.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ _TAKES_FLOATS = frozenset({"pow"})
 
 
 class ArrayProgram:
-    """Executable form of several numbers over one environment.
+    """Program that computes several numeric expressions from arrays.
 
     Args:
-        outputs: name -> number to compute.
-        constants: columns whose value is known when the program is built (`dt`, constants of a system).
+        outputs: name of an output -> expression to compute.
+        constants: signals whose value is known when the program is built (`dt`, constants of a system).
         externs: functions of the system that `ir.Extern` names.
 
-    A call takes an environment of arrays that broadcast, one for each column in `columns` (shifted ones under
+    A call takes a dictionary of arrays that broadcast, one for each name in `columns` (shifted signals under
     the keys of `shifted`), and returns one array per output; a constant output takes the shape of the first
-    array of the environment. Common sub-expressions are computed once.
+    array in the dictionary. Common sub-expressions are computed once.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class ArrayProgram:
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
-        """Return all outputs. `switch` maps conditions to numbers; None is `Hard()`."""
+        """Return all outputs; `switch` determines how conditions become numbers (None: exactly 0 or 1)."""
         switch = switch or Hard()
         like = _first(env)
         key = (ops.name, switch, ops.kind(like))
@@ -73,7 +74,7 @@ class ArrayProgram:
             return bound.run(env, ops)
 
     def operations(self, *, exact: bool = True) -> int:
-        """Number of array operations per call, with exact or with soft conditions."""
+        """Number of array operations per call, with exact (0 or 1) or with soft conditions."""
         tape, outputs = self._tape(exact=exact)
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
@@ -130,7 +131,7 @@ class ArrayProgram:
 
 @dataclass(frozen=True, slots=True)
 class _Bound:
-    """Tape bound to functions of an array library; fills `registers` from top to bottom."""
+    """Tape bound to the functions of an array library; `registers` holds the intermediate results."""
 
     inputs: list[tuple[str, int]]
     code: list[tuple[Callable[..., Any], tuple[int, ...], int]]
@@ -158,7 +159,7 @@ def _first(env: Mapping[str, Array]) -> Array:
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
-    """Registers that the outputs depend on, in order."""
+    """Numbers of the registers that the outputs depend on, in order."""
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
     while stack:
@@ -170,9 +171,10 @@ def _needed(tape: GradientTape, outputs: Any) -> list[int]:
 
 
 class _TapeWriter(NumberEvaluator[Operand]):
-    """Writer of numbers and state formulas to a tape.
+    """Writer of expressions and state formulas (formulas without temporal operators) to a tape.
 
-    With `exact`, conditions are masks; otherwise margins passed to the switch.
+    If `exact`, a condition is a mask; otherwise a margin, which the switch converts to a weight between 0 and
+    1.
     """
 
     def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
@@ -223,7 +225,7 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
 
     def _truth(self, cond: ir.Formula) -> int | bool:
-        """Mask of a state formula; each predicate keeps its own strictness."""
+        """Mask of a state formula (one without temporal operators); `>` and `>=` are distinguished."""
         match cond:
             case ir.Truth(value):
                 return value
@@ -246,7 +248,7 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """Soft indicator of a state formula's margin, settled where predicates differ in strictness."""
+        """Soft weight of a state formula's margin; corrected by its mask if it contains both `>` and `>=`."""
         kinds = _strictness(cond)
         margin = self.margin(cond)
         truth = self._truth(cond) if len(kinds) > 1 else None
@@ -273,12 +275,12 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 
 
 def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
-    """Return the inputs of `program` at the instants `run`, each `(count, batch)`; at least one column.
+    """Return the inputs of `program` at the instants `run`, `(count, batch)` each; at least one input.
 
     Args:
-        program: all samples that it reads at these instants must exist.
-        env: whole columns, `(time, batch)`.
-        run: within the trace.
+        program: program whose inputs are read; all samples that it needs at these instants must exist.
+        env: signal name -> all samples, `(time, batch)`.
+        run: instants within the trace.
         ops: the array library of `env`.
     """
 
@@ -297,7 +299,7 @@ def _rows(column: Array, start: int, count: int) -> Array:
 
 
 def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """Return a shifted column; a clamped one repeats its first and last row beyond the ends of the trace."""
+    """Return a shifted signal; a clamped one repeats its first and last sample outside the trace."""
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
     if not before and not after:

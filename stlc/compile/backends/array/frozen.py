@@ -1,7 +1,7 @@
-"""Evaluation of `freeze`: a formula that refers to signal values at the instant of its evaluation.
+"""Evaluation of `freeze`: a formula that refers to signal values at the instant at which it is evaluated.
 
-Each instant binds its own values, so instants become an axis: columns `(time, batch)` are copied to
-`(time, instants * batch)`. Where the body reads a bounded neighbourhood, only that is copied.
+Each instant binds its own values, so instants become an axis: signals `(time, batch)` are copied to `(time,
+instants * batch)`. If the body reads a bounded neighbourhood of the instant, only that is copied.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _MOST = 1 << 22
 @final
 @dataclass(frozen=True, slots=True)
 class Freezer:
-    """Evaluator of `Freeze` nodes on one trace.
+    """Evaluator of `freeze` formulas on one trace.
 
     Attributes:
-        domain: of the trace.
-        env: columns of the trace, and values frozen by enclosing nodes.
+        domain: length of the trace and treatment of its end.
+        env: signals of the trace, and values bound by enclosing `freeze` formulas.
         ops: array library of `env`.
-        judge: evaluator of formulas.
+        judge: function that evaluates formulas.
     """
 
     domain: TraceDomain
@@ -48,7 +48,7 @@ class Freezer:
     judge: Judge
 
     def values(self, node: ir.Freeze, run: IndexRange) -> Array:
-        """Robustness of the node at the instants `run`, `(count, batch)`."""
+        """Robustness of a `freeze` formula at the instants `run`, `(count, batch)`."""
         bound = within(_combined_reach(node, self.domain), run, self.domain)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
@@ -61,7 +61,10 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Evaluate instants with undefined bound values: their readers are unknown, false on a cut trace."""
+        """Yield values at instants at which some bound value is undefined.
+
+        Predicates that read an undefined value are unknown, or false if windows are clipped to the trace.
+        """
         for missing, instants in groupby(
             range(run.start, run.start + run.count), partial(self._undefined, node)
         ):
@@ -76,7 +79,7 @@ class Freezer:
                 yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
     def _undefined(self, node: ir.Freeze, instant: int) -> frozenset[str]:
-        """Names of the bound values that are undefined at an instant."""
+        """Names of the bound values that are undefined at an instant: they read samples outside the trace."""
         domain, run = self.domain, spanning(instant, 1)
         return frozenset(
             name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
@@ -96,7 +99,7 @@ class Freezer:
             yield from self._whole(node, IndexRange(last + 1, run.last), back, ahead)
 
     def _near(self, node: ir.Freeze, run: IndexRange, back: int, ahead: int) -> Iterator[Array]:
-        """Evaluate instants whose neighbourhood is within the trace, on copies of the neighbourhood."""
+        """Evaluate instants whose neighbourhood lies within the trace, on copies of the neighbourhood."""
         length = back + ahead + 1
         domain = replace(self.domain, samples=length, stop=None)
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
@@ -126,7 +129,7 @@ class Freezer:
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
     def _bound_values(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
-        """Bound values of each instant of `run`, constant along time: `(length, count * batch)`."""
+        """Bound values of each instant in `run`, repeated along time: `(length, count * batch)`."""
         program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
         blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
@@ -134,7 +137,7 @@ class Freezer:
         return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
 
     def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
-        """Columns and enclosing frozen values that the body reads; at least one."""
+        """Signals, and values bound by enclosing `freeze` formulas, that the body reads; at least one."""
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
@@ -154,7 +157,7 @@ def _combined_reach(node: ir.Freeze, domain: TraceDomain) -> Reach:
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
-    """Samples before and after its instant that a formula reads where they exist; inf: all."""
+    """Numbers of samples before and after its instant that a formula reads; inf: all."""
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(depends_on_ends, numbers(body))):
@@ -176,7 +179,7 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 
 
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
-    """Replace predicates that read the undefined frozen values `names` by constants."""
+    """Replace predicates that read one of the undefined values `names` by constants."""
     match body:
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:

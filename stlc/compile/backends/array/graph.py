@@ -1,6 +1,6 @@
-"""Robustness of formulas at requested instants, over any array library.
+"""Robustness of formulas at given instants, over any array library.
 
-Columns are `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute,
+Signals are arrays `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute,
 `stlc.compile.backends.array.steps` computes them.
 """
 
@@ -46,21 +46,21 @@ def evaluate(
     """Return the robustness of several formulas; common sub-formulas are computed once.
 
     Args:
-        formulas: in negation normal form.
-        env: columns, `(time, batch)`.
+        formulas: formulas in negation normal form.
+        env: signal name -> array `(time, batch)`.
         ops: the array library of `env`.
-        semantics: of min and max; None is `Exact()`.
+        semantics: definition of min and max; None is `Exact()`.
         start: first instant.
         count: number of instants.
         end: treatment of instants beyond the last sample.
-        stop: final number of samples where `end` is "lower" or "upper"; None: windows to the end of the trace
-            end with the last known sample.
+        stop: number of samples that the trace will have in the end, if `end` is "lower" or "upper"; None:
+            unbounded windows end with the last known sample.
 
     Returns:
         For each formula an array `(count, batch)`.
 
     Raises:
-        ValueError: a window leaves the trace, and `end` is "strict".
+        ValueError: a window extends beyond the trace, and `end` is "strict".
         TraceError: E306, bounds over all continuations need too many instants beyond the trace.
     """
     windows = Windows(semantics or Exact(), ops)
@@ -79,10 +79,10 @@ def evaluate_parts(
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
     """Yield the exact robustness of a formula and of its sub-formulas at the instants that it needs.
 
-    Where `end` is "lower" or "upper", instants may lie beyond the last sample; `stop` as in `evaluate`.
+    If `end` is "lower" or "upper", instants may lie beyond the last sample; for `stop` see `evaluate`.
 
     Yields:
-        Formula, instants and values `(instants, batch)`, operands first; none from inside a `Freeze`.
+        Formula, instants and values `(instants, batch)`, operands first; nothing from inside a `freeze`.
     """
     windows = Windows(Exact(), ops)
     plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
@@ -99,7 +99,7 @@ def _domain(
 
 @lru_cache(maxsize=512)
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the cached schedule for a trace. Raises ValueError as `evaluate` does."""
+    """Return the cached evaluation plan for traces of one length. Raises ValueError as `evaluate`."""
     samples = domain.samples
     if run.start < 0 or (run.last >= samples and not domain.open):
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
@@ -118,7 +118,7 @@ def robustness_signal(
     semantics: Semantics | None = None,
     end: Boundary = "strict",
 ) -> Array:
-    """Return the robustness at every sample, `(time, batch)`; NaN where undefined under `end` "strict"."""
+    """Return the robustness at every sample, `(time, batch)`; NaN if undefined under `end` "strict"."""
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, "truncate" if end == "strict" else end, windows)
     samples = domain.samples
@@ -129,7 +129,7 @@ def robustness_signal(
 
 
 def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of a plan's roots, each `(count, batch)`.
+    """Execute an evaluation plan; returns the values of its formulas, `(count, batch)` each.
 
     Raises:
         TraceError: E306, bounds over all continuations need too many instants beyond the trace.
@@ -147,7 +147,7 @@ def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> lis
 
 
 def _too_far(plan: ArrayPlan) -> Diagnostic:
-    """Return E306 for a formula whose sub-formulas are needed at too many instants beyond the trace."""
+    """Return finding E306: sub-formulas of a formula are needed at too many instants beyond the trace."""
     step = max(plan.schedule.steps, key=lambda step: step.run.last)
     return Diagnostic(
         "E306",
@@ -161,33 +161,33 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
 
 
 class Weighed(Protocol):
-    """Protocol of a requirement; `stlc.compile.pipeline.CompiledRequirement` implements it."""
+    """Protocol of a requirement with a weight, as `stlc.compile.pipeline.CompiledRequirement` has it."""
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """Formula in steps, simplified by the laws of the semantics."""
+        """Formula with times in steps, simplified by the laws that hold in the semantics."""
 
     @property
     def weight(self) -> float:
-        """Factor of the robustness in the overall minimum."""
+        """Factor of the robustness in the minimum over all requirements."""
 
     @property
     def scale(self) -> float:
-        """Divisor of the robustness in the overall minimum."""
+        """Divisor of the robustness in the minimum over all requirements."""
 
 
 class RobustnessGraph:
-    """Robustness of requirements over trajectories, differentiable, at the first sample.
+    """Differentiable robustness of requirements over trajectories, evaluated at the first sample.
 
     Args:
         rules: the requirements.
-        signature: the columns of a state, in order.
-        semantics: of min and max, or a name in `stlc.compile.semantics.semantics.SEMANTICS`.
+        signature: names of the states, in the order of the last axis of trajectories.
+        semantics: definition of min and max, or a name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
-    `smoothing` overrides the semantics by log-sum-exp with scale k, for one call.
+    `smoothing` replaces the semantics by log-sum-exp with scale k, for one call.
 
     Raises:
-        UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.
+        UsageError: U101, an unknown semantics, or `smoothing` for a semantics without a scale.
     """
 
     def __init__(
@@ -199,21 +199,21 @@ class RobustnessGraph:
         self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
-        """Overall robustness, `(batch,)`: min over requirements of `weight * rho / scale`."""
+        """Overall robustness, `(batch,)`: minimum over the requirements of `weight * rho / scale`."""
         env, ops = self._columns(x)
         return self.columns(env, ops=ops, smoothing=smoothing)
 
     def per_requirement(self, x: Array, smoothing: float | None = None) -> Array:
-        """Robustness of each requirement before weight and scale, `(batch, rules)`."""
+        """Robustness of each requirement without weight and scale, `(batch, rules)`."""
         env, ops = self._columns(x)
         return self.per_requirement_columns(env, ops=ops, smoothing=smoothing)
 
     def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
-        """`robustness` on columns `(time, batch)`; only the columns that the requirements read are needed."""
+        """Overall robustness from the signals that the requirements read, `(time, batch)` by name."""
         return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
 
     def overall(self, each: Array, smoothing: float | None = None) -> Array:
-        """`robustness` from that of `per_requirement`: (batch, rules) -> (batch,); +inf without rules."""
+        """Overall robustness from each requirement's, (batch, rules) -> (batch,); +inf without any."""
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
@@ -226,7 +226,7 @@ class RobustnessGraph:
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None
     ) -> Array:
-        """`per_requirement` on columns `(time, batch)`."""
+        """Robustness of each requirement from signals `(time, batch)` by name: `(batch, rules)`."""
         rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
         if not rows:
             like = next(iter(env.values()))

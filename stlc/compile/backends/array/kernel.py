@@ -1,7 +1,8 @@
 """Sliding extrema and `until` with exact subgradients by a C kernel, for NumPy and torch in any layout.
 
-`windows.c` is built on first use (`stlc.native`), once per dtype and vector width. Where it cannot be built,
-or for other operands, `stlc.compile.backends.array.windows` computes the same with array operations.
+`windows.c` is compiled on first use (`stlc.native`), once per dtype and vector width. If it cannot be
+compiled, or for other operands, `stlc.compile.backends.array.windows` computes the same with array
+operations.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class WindowKernel:
     """Compiled kernel for one kind of extremum and one layout of windows.
 
     Attributes:
-        library: kernel for the dtype of the operands.
+        library: compiled C library for the dtype of the operands.
         pick: "max" for the maximum and `until`; "min" for the minimum and `release`.
         window: layout of the windows.
         traces: length of the batch axis.
@@ -60,12 +61,12 @@ class WindowKernel:
     traces: int
 
     def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Compute values from operands; with `back`, operand gradients from those of the values.
+        """Compute values from operands; with `back`, gradients of the operands from gradients of the values.
 
         Args:
-            arrays: operands, values; with `back` also gradient of the values, gradients of the operands.
+            arrays: operands and values; with `back` also gradients of the values and of the operands.
             operands: 1 for extrema, 2 for `until` and `release`.
-            back: compute gradients.
+            back: whether to compute gradients.
 
         Raises:
             MemoryError: working memory cannot be allocated.
@@ -82,9 +83,10 @@ class WindowKernel:
 
 
 def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sliding) -> WindowKernel | None:
-    """Return the kernel for operands `(time, batch)` of a dtype; None where there is none.
+    """Return the kernel for operands `(time, batch)` of a dtype; None if there is none.
 
-    Working memory grows with the window width; None if it exceeds both `_ROOM` and the size of an operand.
+    Working memory grows with the width of the windows; None if it exceeds both `_ROOM` and the size of an
+    operand.
     """
     if dtype not in _TYPES:
         return None
@@ -102,7 +104,7 @@ def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sl
 
 @cache
 def _library(dtype: str, vector: int) -> ctypes.CDLL | None:
-    """Return the kernel for a dtype and a vector width in bytes; None where it cannot be built or loaded."""
+    """Return the library for a dtype and a vector width in bytes; None if it cannot be compiled or loaded."""
     real, index, _ = _TYPES[dtype]
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n#define CHUNK {_CHUNK}\n"
     return native.load(defined + _SOURCE.read_text(encoding="utf-8"))

@@ -30,7 +30,8 @@ Mask: TypeAlias = Any
 class Sliding:
     """Layout of `count` windows of `width` rows over an array of `rows` rows; window `j` starts at row `j`.
 
-    There is at least one window, and at most one per row. Rows beyond the array are absent.
+    There is at least one window, and at most one per row. A window ends with the last row of the array at the
+    latest.
     """
 
     rows: int
@@ -39,12 +40,12 @@ class Sliding:
 
     @property
     def to_end(self) -> bool:
-        """True if every window reaches the last row."""
+        """True if every window extends to the last row."""
         return self.width >= self.rows
 
 
 class Ops(Protocol):
-    """An array library. Reductions and scans run along axis 0, which is time."""
+    """An array library. Reductions and running extrema work along axis 0, which is time."""
 
     name: str
 
@@ -84,7 +85,7 @@ class Ops(Protocol):
         """Floored modulo: the sign of `b`; gradient 1 in `a`."""
 
     def atan2(self, a: Array | float, b: Array | float) -> Array:
-        """Angle of the point (b, a)."""
+        """Angle of the point (b, a), in radians."""
 
     def axpy(self, a: Array, b: Array, factor: float) -> Array:
         """`a + factor * b`; `a` may be a float."""
@@ -93,10 +94,10 @@ class Ops(Protocol):
         """`a + factor * b * c`; `a` may be a float."""
 
     def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
-        """`x` clamped to [low, high]; None leaves a side open."""
+        """Clamp `x` to [low, high]; None for a bound that is not imposed."""
 
     def norm(self, *components: Array | float) -> Array:
-        """Euclidean length; its gradient at 0 is 0."""
+        """Euclidean norm of a vector given by its components; its gradient at 0 is 0."""
 
     # truth
     def gt(self, a: Array | float, b: Array | float) -> Mask:
@@ -106,38 +107,38 @@ class Ops(Protocol):
         """`a >= b`."""
 
     def both(self, a: Mask, b: Mask) -> Mask:
-        """Conjunction."""
+        """Elementwise conjunction of masks."""
 
     def either(self, a: Mask, b: Mask) -> Mask:
-        """Disjunction."""
+        """Elementwise disjunction of masks."""
 
     def settled(self, weight: Array, mask: Mask) -> Array:
-        """1 where `mask`, else 0, with the gradient of `weight`."""
+        """Array that is 1 where `mask` is True, else 0, with the gradient of `weight`."""
 
     def number(self, mask: Mask, like: Array) -> Array:
-        """1 where `mask`, else 0, in the dtype of `like`."""
+        """Array that is 1 where `mask` is True, else 0, in the dtype of `like`."""
 
     def where(self, mask: Mask, yes: Array | float, no: Array | float) -> Array:
-        """`yes` where `mask`, else `no`; one of them may be a float."""
+        """Elements of `yes` where `mask` is True, else of `no`; one of the two may be a float."""
 
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
-        """`no + weight (yes - no)`, exact where `weight` is 0 or 1; one of the ends may be a float."""
+        """`no + weight (yes - no)`, exact if `weight` is 0 or 1; one of `no` and `yes` may be a float."""
 
     def infinite(self, mask: Mask, like: Array) -> Array:
-        """+inf where `mask`, else -inf, in the dtype of `like`, without gradient."""
+        """Array that is +inf where `mask` is True, else -inf, in the dtype of `like`, without gradient."""
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:
         """1 where `rho` > 0 (>= 0 unless `strict`), else 0; gradient of `(1 + tanh(slope rho)) / 2`."""
 
     # along time
     def amin(self, x: Array) -> Array:
-        """Minimum over axis 0, kept with length 1."""
+        """Minimum over axis 0, which is kept with length 1."""
 
     def amax(self, x: Array) -> Array:
-        """Maximum over axis 0, kept with length 1."""
+        """Maximum over axis 0, which is kept with length 1."""
 
     def sum(self, x: Array) -> Array:
-        """Sum over axis 0, kept with length 1."""
+        """Sum over axis 0, which is kept with length 1."""
 
     def cummin(self, x: Array) -> Array:
         """Running minimum along axis 0."""
@@ -146,59 +147,56 @@ class Ops(Protocol):
         """Running maximum along axis 0."""
 
     def softmax(self, x: Array, k: float) -> Array:
-        """`log(sum(exp(k x))) / k` over axis 0, kept with length 1; stable, also with infinities.
+        """`log(sum(exp(k x))) / k` over axis 0, which is kept with length 1; stable, also with infinities.
 
-        A smooth maximum for `k` > 0, a smooth minimum for `k` < 0.
+        This is a smooth maximum for `k` > 0 and a smooth minimum for `k` < 0.
         """
 
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
-        """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of one shape."""
+        """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of the same shape."""
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
-        """Exact extremum of one or more arrays, elementwise."""
+        """Exact elementwise minimum or maximum of one or more arrays."""
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`.
+        """Exact extrema over sliding windows: `(time, batch)` -> `(count, batch)`.
 
-        None where other methods of the library are faster.
+        None if operations of the array library are faster.
         """
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`.
-
-        None where other methods of the library are faster.
-        """
+        """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch)."""
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
-        """Key of constants: arrays with equal keys may share them."""
+        """Key of arrays that can share converted constants (such as dtype and device)."""
 
     def constant(self, value: float, like: Array) -> Array | float:
-        """A number in the form that is fastest in operations with `like`."""
+        """Convert a number to the form that is fastest in operations with `like`."""
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
-        """A constant array with dtype and device of `like`."""
+        """Array of a constant, with dtype and device of `like`."""
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """`first`, `first + 1`, … along time: (count, batch) with batch, dtype and device of `like`."""
+        """Array `first`, `first + 1`, … along time, (count, batch); batch, dtype and device as `like`."""
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
         """Uninitialized array with dtype and device of `like`."""
 
     def cat(self, parts: Sequence[Array]) -> Array:
-        """Concatenation along axis 0."""
+        """Concatenate arrays along axis 0."""
 
     def stack(self, parts: Sequence[Array]) -> Array:
-        """Arrays stacked along a new axis 0."""
+        """Stack arrays along a new axis 0."""
 
     def flip(self, x: Array) -> Array:
-        """Reversed along axis 0."""
+        """Reverse `x` along axis 0."""
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """`x` with `value` in the rows (axis 0) outside `keep`."""
+        """Copy of `x` with `value` in the rows (axis 0) where `keep` is False."""
 
     def columns(self, x: Array) -> Sequence[Array]:
-        """`(batch, time, dim)` -> for every column an array `(time, batch)`."""
+        """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
 
     def quiet(self) -> AbstractContextManager[object]:
         """Context in which division by zero and invalid operations give inf and NaN without a warning."""

@@ -1,4 +1,4 @@
-"""Array namespace over NumPy, for recorded traces and wherever torch must not be imported."""
+"""Array operations of NumPy, for recorded traces and wherever torch must not be imported."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LARGE_KERNEL = 1 << 16
 
 @final
 class NumpyOps:
-    """`backends.array.namespace.Ops` over NumPy arrays. There are no gradients: straight-through is hard."""
+    """`backends.array.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
 
@@ -63,28 +63,28 @@ class NumpyOps:
         return np.clip(x, low, high)
 
     def norm(self, *components: Array | float) -> Array:
-        """Euclidean length."""
+        """Euclidean norm of a vector given by its components."""
         return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
 
     def settled(self, weight: Array, mask: Mask) -> Array:
-        """1 where `mask`, else 0."""
+        """Array that is 1 where `mask` is True, else 0."""
         return np.broadcast_to(np.asarray(mask, dtype=weight.dtype), weight.shape)
 
     def number(self, mask: Mask, like: Array) -> Array:
-        """1 where `mask`, else 0."""
+        """Array that is 1 where `mask` is True, else 0."""
         return mask.astype(like.dtype)
 
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
-        """`no + weight (yes - no)`, exact at both ends."""
+        """`no + weight (yes - no)`, exact if `weight` is 0 or 1."""
         span = yes - no
         return np.where(weight < 0.5, no + weight * span, yes - span * (1.0 - weight))
 
     def infinite(self, mask: Mask, like: Array) -> Array:
-        """+inf where `mask`, else -inf."""
+        """Array that is +inf where `mask` is True, else -inf."""
         return np.where(mask, np.inf, -np.inf).astype(like.dtype)
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
-        """1 where `rho` > 0 (>= 0 unless `strict`), else 0."""
+        """Array that is 1 if `rho` > 0 (or >= 0 unless `strict`), else 0."""
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:
@@ -108,12 +108,12 @@ class NumpyOps:
         return np.maximum.accumulate(x, axis=0)
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
-        """Exact extremum of one or more arrays."""
+        """Exact elementwise minimum or maximum of one or more arrays."""
         choose = np.minimum if pick == "min" else np.maximum
         return choose(*items) if len(items) == 2 else reduce(choose, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema of sliding windows by the C kernel, for wide rows; else None."""
+        """Exact extrema over sliding windows by the C kernel, for wide rows; else None."""
         wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
         return _by_kernel((x,), pick, window) if wide else None
 
@@ -123,7 +123,7 @@ class NumpyOps:
         return _by_kernel((left, right), pick, window) if wide else None
 
     def softmax(self, x: Array, k: float) -> Array:
-        """Smooth extremum over axis 0, kept with length 1."""
+        """Smooth maximum (`k` > 0) or minimum over axis 0, which is kept with length 1."""
         top = self.amax(x) if k > 0 else self.amin(x)
         finite = np.where(np.isfinite(top), top, 0.0)
         with self.quiet():
@@ -131,7 +131,7 @@ class NumpyOps:
             return top + np.log(total) / k
 
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
-        """Smooth extremum of two arrays."""
+        """Smooth maximum (`k` > 0) or minimum of two arrays."""
         top = np.maximum(a, b) if k > 0 else np.minimum(a, b)
         with self.quiet():
             gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
@@ -142,19 +142,19 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """None: all arrays share constants, since floats take the dtype of the other operand."""
+        """Return None: all arrays can share constants, since floats take the dtype of the other operand."""
         return None
 
     def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
-        """The float itself."""
+        """Return the float itself."""
         return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
-        """A constant array."""
+        """Array of a constant."""
         return np.full(shape, value, dtype=like.dtype)
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """Integers along time."""
+        """Array that counts `first`, `first + 1`, … along time."""
         numbers = np.arange(first, first + count, dtype=like.dtype)
         return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
 
@@ -163,15 +163,15 @@ class NumpyOps:
         return np.empty(shape, dtype=like.dtype)
 
     def flip(self, x: Array) -> Array:
-        """Reversed along axis 0."""
+        """Reverse `x` along axis 0."""
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """`x` with `value` in the rows outside `keep`."""
+        """Copy of `x` with `value` in the rows where `keep` is False."""
         return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
 
     def columns(self, x: Array) -> Sequence[Array]:
-        """One `(time, batch)` array for every column of `(batch, time, dim)`."""
+        """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
 
     def quiet(self) -> AbstractContextManager[object]:

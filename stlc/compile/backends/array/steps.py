@@ -1,6 +1,7 @@
-"""Execution of a schedule over arrays: one program per group of predicates, one function per other step.
+"""Execution of an evaluation schedule over arrays.
 
-Values are `(count, batch)`. Functions of steps are built once per semantics and array library, and cached.
+Predicates at the same instants are computed by one program, every other step by one function. Values are
+`(count, batch)`. Functions are built once per semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _ENDLESS = 1 << 60
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Predicates computed by one program at the same instants, all within the trace."""
+    """Predicates computed by one program at the same instants, which lie within the trace."""
 
     run: IndexRange
     program: ArrayProgram
@@ -55,11 +56,11 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class StepSource:
-    """Source of a predicate's values: an output of a program, or a column.
+    """Source of a predicate's values: an output of a program, or a signal.
 
     Attributes:
-        batch: index of the program; None for a column.
-        name: of the output, or of the column.
+        batch: index of the program in `ArrayPlan.batches`; None for a signal.
+        name: name of the output, or of the signal.
         inside: instants at which the predicate is defined.
     """
 
@@ -70,12 +71,12 @@ class StepSource:
 
 @dataclass(frozen=True, slots=True)
 class ArrayPlan:
-    """A schedule with the programs and functions that compute its steps.
+    """An evaluation schedule with the programs and functions that compute its steps.
 
     Attributes:
-        schedule: the steps.
+        schedule: the steps (a sub-formula at a range of instants each).
         batches: programs of the predicates.
-        predicates: step number -> source of its values; absent where it is nowhere defined.
+        predicates: step number -> source of its values; a predicate that is defined nowhere has none.
         beyond: total number of values beyond the last sample.
         runners: functions by semantics and array library, built on first use.
     """
@@ -88,7 +89,7 @@ class ArrayPlan:
 
 
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the plan for formulas at the instants `run`."""
+    """Return the evaluation plan for formulas at the instants `run`."""
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
@@ -96,7 +97,7 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
 
 
 def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
-    """Group predicates over the same instants into programs; predicates that are columns need none."""
+    """Group predicates over the same instants into programs; a predicate that is just a signal needs none."""
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
     predicates: dict[int, StepSource] = {}
     for index, step in enumerate(steps):
@@ -124,7 +125,7 @@ def _signed(atom: ir.Predicate) -> ir.Num:
 
 
 def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
-    """Merge overlapping and adjacent ranges."""
+    """Merge overlapping and adjacent ranges; returns each merged range with its parts."""
     out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
     for run, index in sorted(ranges, key=lambda item: (item[0].start, item[0].count)):
         if out and run.start <= out[-1][0].last + 1:
@@ -141,11 +142,11 @@ def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list
 @final
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Builder of step functions, for traces of one length.
+    """Builder of the functions that compute steps, for traces of one length.
 
     Attributes:
-        domain: of the traces.
-        windows: window algorithms, with semantics and array library.
+        domain: length of the traces and treatment of their end.
+        windows: algorithms for windows, with semantics and array library.
     """
 
     domain: TraceDomain
@@ -153,16 +154,16 @@ class Machine:
 
     @property
     def unknown(self) -> float:
-        """Value of unknown predicates; one per trace where two traces hold the lower and the upper bound."""
+        """Value of an unknown predicate; with both bounds side by side, one value per trace."""
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])
             return both  # type: ignore[no-any-return]
         return math.inf if self.domain.end == "upper" else -math.inf
 
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
-        """Return the function of a predicate of its signed values at `inside`, or of none if that is empty.
+        """Return the function that extends a predicate's values at the instants `inside` to those of `run`.
 
-        Beyond the trace a predicate is unknown, or false where windows are cut.
+        Beyond the trace a predicate is unknown, or false if windows are clipped.
         """
         outside = self.unknown if self.domain.open else -node.sign * math.inf
         if inside.count <= 0:
@@ -185,7 +186,7 @@ class Machine:
         return kernel
 
     def bind(self, step: Step) -> Kernel:
-        """Return the function of any other node."""
+        """Return the function that computes a step other than a predicate."""
         node, run = step.node, step.run
         operands = len(step.operands)
         match node:
@@ -216,7 +217,7 @@ class Machine:
         return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
 
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Future windows; on an open trace, those "to the end" that start beyond it are unknown."""
+        """Function for future windows; an unbounded window that starts after the known samples is unknown."""
         rows = run.count
         beyond = neutral(pick)
         if self.domain.open and window.hi is None:
@@ -230,7 +231,7 @@ class Machine:
         return lambda parts, like: padded(inner(parts, like), run.count, beyond)
 
     def _past(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Past windows: future windows with time reversed."""
+        """Function for past windows: future windows with time reversed."""
         ops, reduce = self.windows.ops, self.windows.semantics.reduce
         if not operands:
             return self._constant(run.count, neutral(pick))
@@ -240,7 +241,7 @@ class Machine:
         return lambda parts, like: flip(inner([flip(part) for part in parts], like))
 
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
-        """Extrema of one operand, or `until` of two with window [lo, hi]."""
+        """Function for extrema of one operand, or `until` of two, over windows [lo, hi]."""
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
         if operands == 1:
@@ -274,7 +275,7 @@ class Machine:
 
 
 def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps over columns `(time, batch)`."""
+    """Return the values of all steps from signals `(time, batch)`."""
     ops, like = windows.ops, next(iter(env.values()))
     runners = plan.runners.get(windows)
     if runners is None:
@@ -301,7 +302,7 @@ def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
 
 
 def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
-    """Return the function of a predicate over the outputs of its program, or over its column."""
+    """Return the function of a predicate from the outputs of its program, or from its signal."""
     source, domain = plan.predicates.get(step.number), plan.schedule.domain
     if source is None:
         kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))

@@ -1,8 +1,8 @@
-"""Tape of array operations: common sub-expressions shared, constants folded, operations fused.
+"""Tape of array operations: common sub-expressions are shared, constants folded, operations fused.
 
-In training each array operation has microseconds of overhead, so the tape minimizes their number:
-`a * 0.1 + b` is one `axpy`, an added product one `addcmul`, `min` and `max` with literals one `clamp`, an
-indicator as a factor one `where`. Each rule preserves the value up to rounding.
+In training each array operation has microseconds of overhead, so the tape minimizes their number: `a * 0.1 +
+b` becomes one `axpy`, adding a product one `addcmul`, `min` and `max` with constants one `clamp`,
+multiplication by an indicator one `where`. Each rule preserves the value up to rounding.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Instr:
     """Array operation.
 
     Attributes:
-        kernel: a method of `Ops` or of the switch, or `input`, `extern`, `pick`.
-        args: operands.
-        params: further arguments of the kernel, after the operands.
+        kernel: name of the operation: a method of `Ops` or of the switch, or `input`, `extern`, `pick`.
+        args: operands: register numbers or constants.
+        params: further arguments of the operation, after the operands.
     """
 
     kernel: str
@@ -35,14 +35,14 @@ class Instr:
 
 
 class GradientTape:
-    """List of instructions; emitting an existing one returns its register."""
+    """List of instructions, each of which writes one register; equal instructions share a register."""
 
     def __init__(self) -> None:
         self.code: list[Instr] = []
         self._known: dict[tuple[object, ...], int] = {}
 
     def emit(self, kernel: str, *args: Operand, params: tuple[object, ...] = ()) -> int:
-        """Return the register of that instruction, appended if new."""
+        """Return the register of an instruction, which is appended if it is new."""
         key = (kernel, params, *((type(arg), arg) for arg in args))
         register = self._known.get(key)
         if register is None:
@@ -51,7 +51,7 @@ class GradientTape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction that computes `operand`, if it is a `kernel`."""
+        """Operands of the instruction that computes `operand` if that is a `kernel`, else None."""
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
@@ -84,7 +84,7 @@ class GradientTape:
         return self.emit("sub", a, b)
 
     def _plus_product(self, whole: int, part: int, sign: float) -> int | None:
-        """`whole + sign * part` in one operation if `part` is a product."""
+        """`whole + sign * part` in one operation if `part` is a product, else None."""
         factors = self.parts(part, "mul")
         if factors is None:
             return None
@@ -139,7 +139,7 @@ class GradientTape:
         return self.call("div", a, b)
 
     def pow(self, a: Operand, b: Operand) -> Operand:
-        """`a ^ b`; common constant exponents without `pow`."""
+        """`a ^ b`; common constant exponents become multiplications or roots."""
         if isinstance(b, int):
             return self.call("pow", a, b)
         match b:
@@ -159,7 +159,7 @@ class GradientTape:
                 return self.call("pow", a, b)
 
     def call(self, kernel: str, *args: Operand) -> Operand:
-        """Any kernel; folded where all operands are constants."""
+        """Any operation; computed at once if all operands are constants."""
         if all(isinstance(arg, float) for arg in args):
             with NUMPY.quiet():
                 return float(getattr(NUMPY, kernel)(*(np.float64(arg) for arg in args)))
@@ -212,7 +212,7 @@ class GradientTape:
         return self.emit(kernel, margin, 0.0)
 
     def number(self, mask: int) -> int:
-        """1 where `mask`, else 0, in the dtype of the compared operands."""
+        """Number that is 1 where `mask` is True, else 0, in the dtype of the compared operands."""
         return self.emit("number", mask, self._compared(mask))
 
     def _compared(self, mask: int) -> int:

@@ -1,7 +1,8 @@
 """Extrema over time windows: reductions, the C kernel, or running extrema and doubling.
 
-All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; rows beyond the
-array are absent, and a window without rows has the neutral value (+inf for a minimum, -inf for a maximum).
+All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; it ends with the
+last row of the array at the latest. A window without rows has the neutral value (+inf for a minimum, -inf for
+a maximum).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _OVERLAP = 8
 @final
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Windowed extrema under one semantics and array library."""
+    """Extrema over time windows, in one semantics and with one array library."""
 
     semantics: Semantics
     ops: Ops
@@ -59,7 +60,7 @@ class Windows:
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
 
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
-        """Tiles of a long recorded trace: windows, and the rows that they read; empty for one tile."""
+        """Tiles of a long trace: (rows of the windows, rows that they read); empty if one tile suffices."""
         if self.ops.name != "numpy" or not self.semantics.exact:
             return []
         size = max(_TILE // max(math.prod(x.shape[1:]), 1), _OVERLAP * width)
@@ -74,7 +75,7 @@ class Windows:
         return self.ops.flip(running(self.ops.flip(x)))
 
     def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
-        """Extrema of full windows in about log2(width) operations, by merging blocks of 1, 2, 4, … rows."""
+        """Extrema over windows inside the array, in about log2(width) merges of blocks of 1, 2, 4, … rows."""
         if width == 1:
             return x
         piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
@@ -103,16 +104,16 @@ class Windows:
     def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
         """`until` for `pick` "max", its dual `release` for "min".
 
-        Row `j` is the extremum over rows `t` of window `j` of the dual extremum of `right[t]` and of
+        For `until`, row `j` is the maximum over the rows `t` of window `j` of the minimum of `right[t]` and
         `left[j..lo + t]`.
 
         Args:
             left: operand that must hold up to and including `t`; `(time, batch)`.
-            right: operand that must hold at `t`; its row 0 is row `lo` of `left`.
+            right: operand that must hold at `t`; its row 0 belongs to row `lo` of `left`.
             pick: "max" or "min".
             count: number of windows.
-            width: rows of a window.
-            lo: rows of `left` before the window.
+            width: number of rows of a window.
+            lo: number of rows of `left` before the window.
 
         Returns:
             `(count, batch)`
@@ -155,7 +156,7 @@ class Windows:
     ) -> Array:
         """`until` by a loop over the offset of `t`: `lo + width` operations on `count` rows.
 
-        Faster methods need minima that distribute over maxima, which only exact extrema do.
+        Faster methods assume that min distributes over max, which is true of exact extrema only.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -181,7 +182,7 @@ class Windows:
         return semantics.finish(found, pick, ops)
 
     def _from_first(self, x: Array, pick: Pick) -> Array:
-        """Running extremum in about log2(rows) operations."""
+        """Running extremum from the first row on, in about log2(rows) operations."""
         size = 1
         while size < x.shape[0]:
             later = self.semantics.pair(x[size:], x[:-size], pick, self.ops)
@@ -189,7 +190,7 @@ class Windows:
         return x
 
     def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
-        """`until` to the last row, by recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`."""
+        """Unbounded `until`, by the recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`."""
         pair, other = self.semantics.pair, dual(pick)
         row = pair(left[-1:], right[-1:], other, self.ops)
         out = [row]
@@ -203,7 +204,7 @@ class Windows:
     def _until_by_tiles(
         self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
     ) -> Array:
-        """`until` to the end of a long recorded trace, tile by tile backward in time."""
+        """Unbounded `until` on a long recorded trace, tile by tile backward in time."""
         out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
         later = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
         for rows, _ in reversed(tiles):
@@ -217,9 +218,10 @@ class Windows:
         return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
-        """`until` of full windows in about log2(width) compositions of (`left` throughout, met within).
+        """`until` over windows inside the array, in about log2(width) compositions of adjacent blocks.
 
-        `total` covers the first `done` rows of every window, `met` the `size` rows from every row on.
+        A block is a pair: least `left` over the block, and `until` within the block. `total` covers the first
+        `done` rows of every window, `met` the `size` rows from every row on.
         """
         size, done = 1, 0
         total: tuple[Array, Array] | None = None
@@ -234,7 +236,7 @@ class Windows:
             size *= 2
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """Composition of window `a` followed by window `b`: (`left` throughout both, met in one of them)."""
+        """Compose block `a` with the block `b` after it: (`left` throughout both, `until` within both)."""
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)
         later = pair(a[0][:rows], b[1][:rows], other, self.ops)
