@@ -263,9 +263,10 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Return a requirement with `always@[a, b]` and its like, and for training past operators, rewritten.
+        """Return a requirement with its absolute operators, and for training its past operators, rewritten.
 
-        For recorded traces a formula with such operators is evaluated at the first sample.
+        Absolute operators (`always@[a, b]`) count from the start of the mission; for recorded traces that is
+        the first sample.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

@@ -130,7 +130,7 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
 
 
 def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return the condition that the current step of the mission is within `window`."""
+    """Return a formula that holds if the current step of the mission is within `window`."""
     started = at_least(clock, ir.Const(float(window.lo)))
     if window.hi is None:
         return started
@@ -139,7 +139,7 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return the condition that the current step of the mission is at or after the end of `window`."""
+    """Return a formula that holds if the current step of the mission is at or after the end of `window`."""
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
@@ -185,7 +185,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """Return the condition on the current state that the mission before it has not falsified the goal."""
+    """Return a formula over the current state that holds unless the mission up to now falsified the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -196,7 +196,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Return the test of time that the current step of the mission is within `window`."""
+    """Return a test of time that holds if the current step of the mission is within `window`."""
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started
@@ -205,7 +205,7 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
-    """Return the condition that the window of a formula ends beyond the end of the plan."""
+    """Return a test of time that holds if the window of a formula ends beyond the end of the plan."""
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)
@@ -213,7 +213,7 @@ def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
 
 
 def _all_along(body: typed.Formula) -> typed.Formula:
-    """Return the formula that `body` holds at every sample of the plan."""
+    """Return a formula that holds if `body` holds at every sample of the plan."""
     return typed.Temporal(body.span, "always", _plan(body.span), body)
 
 

@@ -219,7 +219,7 @@ class _Writer:
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
 
     def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
-        """Return the past formula of `met` where `what` is the conjunction of `items`."""
+        """Return what `met` returns if `what` is the conjunction of `items`."""
         later = [item for item in items if looks_ahead(item)]
         known = (*when, *(item for item in items if not looks_ahead(item)))
         if len(later) == 1:
@@ -231,7 +231,7 @@ class _Writer:
     def _lasting(
         self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula
     ) -> typed.Formula:
-        """Return the past formula of `met` where `what` is `always[what] body`."""
+        """Return what `met` returns for the formula `always[what] body`."""
         lo, hi = what.lo, what.hi or 0
         late = _ahead(body)
         body = self.delayed(body, late)
@@ -254,7 +254,7 @@ class _Writer:
     def _reached(
         self, window: ir.Window, when: Formulas, inner: ir.Window, left: typed.Formula, right: typed.Formula
     ) -> typed.Formula:
-        """Return the past formula of `met` where `what` is `left until[inner] right`."""
+        """Return what `met` returns for the formula `left until[inner] right`."""
         late = max(_ahead(left), _ahead(right))
         left, right = self.delayed(left, late), self.delayed(right, late)
         begun = self._ago(self._begun(window, when), late) if when else None
@@ -336,14 +336,14 @@ class _Writer:
         return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
 
     def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
-        """Return the formula that all of `when` hold and the current step of the mission is in `window`."""
+        """Return a formula that holds if all of `when` hold and the current mission step is in `window`."""
         if window == ir.Window(0, None):
             return self._and(*when)
         clock = self._table.clock((window.lo if window.hi is None else window.hi) + 1)
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """Return the condition that the current step of the mission is at most `step`; true for None."""
+        """Return a formula that holds if the current step of the mission is at most `step`; true for None."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._table.clock(step + 1), self._span)

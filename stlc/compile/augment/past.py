@@ -72,7 +72,7 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides at the current sample of a plan, extrapolated from the timer at the first sample."""
+        """Both sides of the test at a later sample of a plan, given the timer at the first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:

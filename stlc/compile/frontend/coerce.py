@@ -108,7 +108,7 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value that must be a vector of numbers.
 
     Raises:
-        Failed: it is none (E205).
+        Failed: it is no vector (E205).
     """
     if isinstance(value, VectorValue):
         return value

@@ -35,7 +35,7 @@ from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_d
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
-    """Report E101 for every name in the body of a macro that nothing declares."""
+    """Report E101 for every name in the body of a macro that is not declared."""
     functions = {*callable_names(), *sampler_names()}
     for name, called in _free(entry.body, frozenset(entry.formals)):
         if name.name in scope.entries or (name.name in BUILT_IN and not name.quoted):

@@ -447,7 +447,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> V
 
 @contextmanager
 def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Add the place of the call to the findings of the block, which expands a macro."""
+    """Context in which a macro is expanded: findings also get the place of the call."""
     before = len(scope.sink)
     try:
         yield

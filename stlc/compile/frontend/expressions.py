@@ -32,7 +32,7 @@ from stlc.units import Unit, nearest, same_dims
 
 @contextmanager
 def _raising(scope: Scope) -> Iterator[None]:
-    """Evaluate one expression in the block; if it fails, raise `scope.error` with its errors."""
+    """Context in which one expression is evaluated: `scope.error` is raised with its errors if it fails."""
     before = len(scope.sink)
     try:
         with scope.meter.fresh():

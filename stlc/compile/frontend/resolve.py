@@ -354,7 +354,7 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
     """Return the divisor of the robustness that `@scale` asks for.
 
     Raises:
-        Failed: `@scale(auto)`, and the range of a signal is unknown (E205).
+        Failed: the range of a signal that the divisor depends on is unknown (E205).
     """
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value

@@ -71,7 +71,10 @@ class Meter:
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Measure the evaluations in a block without counting them; the `Cost` is set when the block ends."""
+        """Context that measures the evaluations in a block without counting them.
+
+        The yielded `Cost` is set when the block ends.
+        """
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
         cost = Cost()
@@ -83,7 +86,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Count the evaluations in a block from zero, as those of one declaration."""
+        """Context that counts the evaluations in a block from zero, as those of one declaration."""
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
@@ -314,7 +317,7 @@ def constant_entries(
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
     """Return the ranges that columns never leave, each in the unit of its column.
 
-    These are the ranges of bools and enums, and those that the column declares as a fact.
+    These are the ranges of bools and enums, and those marked as never left (`Column.fact`).
     """
     facts: dict[str, Bounds] = {}
     for column in columns:

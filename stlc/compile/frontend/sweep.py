@@ -183,7 +183,7 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Return the position in [0, 1] along the segment at which it crosses a face.
+        """Return the position in [0, 1] along the segment where the segment crosses a face.
 
         If it crosses none, the position is arbitrary.
         """

@@ -186,7 +186,7 @@ class Windowed(Operator):
 
     @property
     def window_offsets(self) -> Offsets:
-        """The window as offsets from now; those of a past window are negative."""
+        """Window of the operator as offsets from now, which are negative for a window in the past."""
         lo, hi = self.window.lo, self.window.hi
         return Offsets(None if hi is None else -hi, -lo) if self.back else Offsets(lo, hi)
 
@@ -300,8 +300,8 @@ class Shift(Operator):
     """Value of `body` `steps` samples later (negative: earlier).
 
     `outside` is the value where that sample lies outside the trace. None: undefined, like a window that
-    leaves the trace. False: used by `rise` and `fall` at the first sample. If the caller asks that windows be
-    cut at the end of the trace, an undefined value counts as false; as true in a `weak` node, which results
+    leaves the trace. False: used by `rise` and `fall` at the first sample. Where windows are cut at the end
+    of the trace (`truncate`), an undefined value counts as false, or as true in a `weak` node, which results
     from a negation.
     """
 

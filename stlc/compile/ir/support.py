@@ -134,7 +134,7 @@ class _Required(Analysis[_Needs]):
         return 0, 0, 0
 
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
-        """Return what an operator requires: the needs of its operands, shifted by the offsets of the reads.
+        """Return how many samples an operator requires: those of its operands, plus the offsets of the reads.
 
         Of an unbounded window only the near end is required.
         """
@@ -186,7 +186,10 @@ def columns(formula: ir.Formula) -> frozenset[str]:
 
 
 def depends_on_ends(num: ir.Num) -> bool:
-    """True if a number depends on where the trace begins or ends, as a clamped read does."""
+    """True if a number depends on where the trace begins or ends.
+
+    This is so for clamped reads, which repeat the first or last sample.
+    """
     return any(leaf.clamped for leaf in _shifts(num))
 
 
@@ -235,8 +238,8 @@ class _Tail(Analysis[int | None]):
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
         """Return an instant from which an operator is constant, or None.
 
-        From it on all operands are constant wherever they are read, or the window is empty; a window from the
-        start of the trace contains all known samples.
+        From this instant on all operands are constant wherever they are read, or the window is empty; a
+        window from the start of the trace contains all known samples.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

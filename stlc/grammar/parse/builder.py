@@ -142,7 +142,10 @@ BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
 def node(kind: Callable[..., Any]) -> BuildRule:
-    """Return the conversion of a rule to a node of class `kind`, whose fields are its children."""
+    """Return a function that converts the parse-tree nodes of a rule to nodes of class `kind`.
+
+    The converted children are its fields, in order.
+    """
     return lambda _, span, children: kind(span, *children)
 
 

@@ -96,9 +96,10 @@ def _heads(
 
 
 def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
-    """Return the conversion of a declaration of one name, whose further children are the fields `parts`.
+    """Return a function that converts declarations of one name to nodes of class `kind`.
 
-    A child of the grammar rule `sort` is the pair of the fields `type` and `unit`.
+    `parts` names the fields that the further children of a declaration give. A child of the grammar rule
+    `sort` gives the two fields `type` and `unit`.
     """
 
     def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
