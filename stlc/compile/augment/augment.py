@@ -80,7 +80,7 @@ def augment(
 @final
 @dataclass(frozen=True, slots=True)
 class _Goals:
-    """Builder of the goals of one requirement: its absolute formulas, each with its added states."""
+    """Builder of the goals of one requirement: its absolute formulas (`always@[a, b] p`) and their states."""
 
     grid: Grid
     table: TimerTable
