@@ -91,6 +91,7 @@ def kernels(task: Task) -> Mapping[str, str]:
 
 VOLATILE: Mapping[str, str] = {
     "*.stlc": "the version of the program",
+    "train/*.help*": "lists the methods",
     "train/*.result.seconds": "processor time",
     "train.jsonl.*.seconds": "processor time",
     "train.jsonl.*.s_per_step": "processor time",

@@ -23,6 +23,7 @@ from stlc.cli.framework.options import (
     parse_clock,
     parse_count,
     parse_overrides,
+    parse_pairs,
     parse_seconds,
     parse_seeds,
 )
@@ -98,6 +99,16 @@ def train(
             help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
         ),
     ] = None,
+    reward: Annotated[
+        str | None,
+        typer.Option(
+            metavar="task|robustness|accuracy", help="Reward of the methods ppo and sac; robustness."
+        ),
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="NAME=VALUE", help="An option of the method; repeatable."),
+    ] = None,
     resume: Annotated[
         str | None,
         typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
@@ -130,6 +141,7 @@ def train(
         **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
         **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
         **{"--held-out": held_out, "--drives": drives, "--cluster": cluster},
+        **{"--reward": reward, "--option": option},
     }
     _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
     logger = _logger(log)
@@ -156,6 +168,8 @@ def train(
         held_out=held_out or HELD_OUT,
         clock=parse_clock(clock),
         drives=DRIVES if drives is None else drives,
+        reward=reward,
+        options=parse_pairs(option, "--option", "NAME=VALUE", "environments=256"),
     )
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
     drawn = parse_seeds(seeds) if seeds is not None else (seed,)

@@ -95,13 +95,15 @@ class Many:
             "--batch": config.batch,
             "--held-out": config.held_out,
             "--drives": config.drives,
+            "--reward": config.reward,
             "--log": self.log,
             "--runs": launch.root,
         }
         given = [word for key, value in options.items() if value is not None for word in (key, str(value))]
         changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
+        own = [word for key, value in config.options.items() for word in ("--option", f"{key}={value}")]
         drawn = () if self.pictures else ("--no-pictures",)
-        arguments = (operand(str(part.spec)), *given, *changed, *drawn)
+        arguments = (operand(str(part.spec)), *given, *own, *changed, *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
         from stlc.controller.parallel.bundle import input_files

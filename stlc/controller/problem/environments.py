@@ -77,6 +77,12 @@ class Transition:
         return self.done & satisfied(self.rho)
 
 
+def observe(task: Task, states: Tensor, step: int) -> Tensor:
+    """Inputs of the policy at a step, and the elapsed share of the episode: (B, n) -> (B, k)."""
+    seen = task.system.observe(states)
+    return torch.cat((seen, seen.new_full((*seen.shape[:-1], 1), step / task.horizon)), -1)
+
+
 class Environments:
     """Episodes of one task, side by side in one batch; all begin and end together.
 
@@ -124,8 +130,7 @@ class Environments:
 
     def observe(self, states: Tensor, step: int) -> Tensor:
         """Inputs of the policy and the elapsed share of the episode: (B, n) -> (B, k)."""
-        seen = self.task.system.observe(states)
-        return torch.cat((seen, seen.new_full((*seen.shape[:-1], 1), step / self.steps)), -1)
+        return observe(self.task, states, step)
 
     @torch.no_grad()
     def reset(self, states: Tensor | None = None) -> Tensor:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, get_args
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 
+from stlc.controller.problem.environments import Reward
 from stlc.controller.training.budget import Clock, StepSchedule, cores
-from stlc.registry import METHODS, PLANNERS
+from stlc.diagnostics import usage
+from stlc.registry import METHODS, PLANNERS, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -65,6 +67,8 @@ class TrainConfig:
         held_out: number of held-out states.
         drives: maximum closed-loop runs per guard after the training; 0: none.
         planner: the planner of the method `plan`.
+        reward: of a method that learns from rewards; None leaves the choice to the method.
+        options: of the method alone, name -> text.
     """
 
     method: str | None = None
@@ -80,6 +84,8 @@ class TrainConfig:
     clock: Clock = "wall"
     drives: int = DRIVES
     planner: PlannerChoice | None = None
+    reward: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,36 +147,41 @@ class ResolvedConfig:
 
 
 _MOST = {
-    **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
+    **dict.fromkeys(("hidden", "plans", "threads", "ranks", "environments"), 65_536),
     **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples", "drives"), 10**8),
     **dict.fromkeys(("warmup", "average"), 1.0),
     "hold": 0.999,
 }
 """Upper bounds on shares and on options that determine memory use."""
 MOST_TEXT = 1000
-_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
+_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks", "environments")
 
 
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
     """Return the options unchanged. Raises ValueError where one has the wrong type or is too large."""
-    words = {"method": METHODS.names, "clock": get_args(Clock), "planner": PLANNERS.names}
-    for field in fields(config):
-        value = getattr(config, field.name)
-        if field.name in words:
-            if value not in words[field.name]:
-                known = ", ".join(words[field.name])
-                raise ValueError(f"`{field.name}` is {value!r:.40}, none of {known}")
+    words = {
+        "method": METHODS.names,
+        "clock": get_args(Clock),
+        "planner": PLANNERS.names,
+        "reward": get_args(Reward),
+    }
+    for option in fields(config):
+        value = getattr(config, option.name)
+        if option.name in words:
+            if value not in words[option.name]:
+                known = ", ".join(words[option.name])
+                raise ValueError(f"`{option.name}` is {value!r:.40}, none of {known}")
             continue
-        if field.type in ("str", str):
+        if option.type in ("str", str):
             if not isinstance(value, str) or len(value) > MOST_TEXT:
-                raise ValueError(f"`{field.name}` is {value!r:.40}")
+                raise ValueError(f"`{option.name}` is {value!r:.40}")
             continue
-        kinds = (int, float) if field.type in ("float", float) else (int,)
-        most = _MOST.get(field.name, 1e12)
-        each = value if field.name == "hidden" else (value,)
-        least = 1 if field.name in _POSITIVE else 0
+        kinds = (int, float) if option.type in ("float", float) else (int,)
+        most = _MOST.get(option.name, 1e12)
+        each = value if option.name == "hidden" else (value,)
+        least = 1 if option.name in _POSITIVE else 0
         if not all(_is_number(number, kinds) and least <= number <= most for number in each):
-            raise ValueError(f"`{field.name}` is {value!r:.40}")
+            raise ValueError(f"`{option.name}` is {value!r:.40}")
     return config
 
 
@@ -186,7 +197,35 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     """
     name = config.method or task.system.decl.train.method or METHODS.default
     found: ResolvedConfig = METHODS.get(name).resolve(task, config)
-    return replace(found, method=name)
+    return _with_own(replace(found, method=name), config)
+
+
+def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
+    """The options with those of the method alone, as the user gave them."""
+    own = {each.name: each.type for each in fields(found)[len(fields(ResolvedConfig)) :]}
+    texts = dict(config.options)
+    if config.reward is not None:
+        texts["reward"] = config.reward
+    changed: dict[str, Any] = {}
+    for name, text in texts.items():
+        if name not in own:
+            known = f"options: {', '.join(own)}" if own else "it has no options of its own"
+            advice = did_you_mean(name, own, known)
+            raise usage(f"method `{found.method}` has no option `{name}`", *advice)
+        changed[name] = _number(name, text, str(own[name])) if own[name] not in ("str", str) else text
+    try:
+        return checked_config(replace(found, **changed)) if changed else found
+    except ValueError as error:
+        raise usage(f"method `{found.method}`: {error}", "stlc train SPEC --option NAME=VALUE") from None
+
+
+def _number(name: str, text: str, kind: str) -> int | float:
+    """Parse the value of an option that is a whole number (`kind` is `int`) or any number."""
+    try:
+        return int(text) if kind == "int" else float(text)
+    except ValueError:
+        wanted = "whole number" if kind == "int" else "number"
+        raise usage(f"`{name}={text}` is no {wanted}", f"--option {name}=N") from None
 
 
 def base_config(

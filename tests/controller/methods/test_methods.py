@@ -125,7 +125,9 @@ def climbing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_the_default_comes_first_and_parts_of_methods_are_none() -> None:
-    assert METHODS.names == ("guided", "gradient", "plan")
+    assert METHODS.names[0] == "guided"
+    assert list(METHODS.names[1:]) == sorted(METHODS.names[1:])
+    assert {"gradient", "plan", "ppo"} < set(METHODS.names)
     assert all(METHODS.get(name).resolve is not None for name in METHODS)
 
 
@@ -134,14 +136,14 @@ def test_an_unknown_method_is_a_finding_with_a_way_out(car_task: Task) -> None:
         resolve_config(car_task, TrainConfig(method="guide"))
     (finding,) = caught.value.diagnostics
     assert finding.message == "unknown method `guide`"
-    assert finding.help == ("did you mean `guided`?  methods: guided, gradient, plan",)
+    assert finding.help == (f"did you mean `guided`?  methods: {', '.join(METHODS.names)}",)
     with pytest.raises(SystemFileError):
         System.load(CAR, {"train.method": "guide"})
 
 
 @pytest.mark.usefixtures("coasting")
 def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
-    assert METHODS.names == ("guided", "coasting", "gradient", "plan")
+    assert METHODS.names[:3] == ("guided", "coasting", "gradient")
     assert System.load(CAR, {"train.method": "coasting"}).decl.train.method == "coasting"
     options = ["--method", "coasting", "--held-out", "40", "--drives", "4", "--no-pictures", "--json"]
     code = main(["train", SPEC, "--system", CAR, *options])

@@ -1,0 +1,380 @@
+"""Proximal policy optimisation over batched episodes (Schulman et al., arXiv 1707.06347, 2017).
+
+One step of the training is one episode in every environment, followed by several epochs over its transitions:
+the clipped surrogate objective (Eq. 7), advantages by generalised estimation (Schulman et al., arXiv
+1506.02438, Eq. 16), and an entropy bonus. Observations, returns and advantages are normalised.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from stlc.controller.methods import Learner, Method
+from stlc.controller.methods._actor import (
+    ActorConfig,
+    ActorPolicy,
+    below,
+    optimizer_tensors,
+    restore_optimizer,
+)
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.problem.environments import Environments, Reward
+from stlc.controller.training.checkpoint import load_checkpoint, restoring, weights
+from stlc.controller.training.config import base_config
+from stlc.controller.training.run import spec_hash, trained_on
+from stlc.dynamics.model.controls import raw_width, squash
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.rundir import RunDir
+
+VALUE = 0.5
+"""Weight of the error of the critic in the loss."""
+ENVIRONMENTS = 512
+"""Default number of environments."""
+HIDDEN = (64, 64)
+"""Widths of both networks."""
+RATE = 1e-3
+"""Default peak learning rate."""
+EVERY = 10
+"""Steps between validations."""
+LEAST = 0.05
+"""Share of the peak learning rate at the end of the training."""
+MOST = 10.0
+"""Bound on normalised observations."""
+NARROW = 1e-4
+"""Spread below which values are not scaled."""
+
+
+@dataclass(frozen=True, slots=True)
+class PpoConfig(ActorConfig):
+    """Options of PPO.
+
+    Attributes:
+        epochs: passes over the transitions of a step.
+        minibatches: gradient steps of a pass.
+        discount: gamma of the return; 1 since episodes are finite and the elapsed share is observed.
+        trace: lambda of the advantage estimates.
+        ratio: bound on the change of the probability ratio (the paper's epsilon).
+        entropy: weight of the entropy bonus.
+        deviation: initial standard deviation of the controls before squashing.
+        correlation: of the exploration noise of successive steps; white noise leaves hardly any trace in
+            states that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
+    """
+
+    environments: int = ENVIRONMENTS
+    epochs: int = 5
+    minibatches: int = 8
+    discount: float = 1.0
+    trace: float = 0.95
+    ratio: float = 0.2
+    entropy: float = 0.0
+    deviation: float = 1.0
+    correlation: float = 0.8
+
+
+class Moments(nn.Module):
+    """Mean and standard deviation of vectors seen so far, (k,) each; 0 and 1 before the first.
+
+    Attributes:
+        mean: (k,) float32.
+        spread: (k,) float32.
+        sums: numbers, sums and sums of squares, (3, k) float64.
+    """
+
+    mean: Tensor
+    spread: Tensor
+    sums: Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("spread", torch.ones(width))
+        self.register_buffer("sums", torch.zeros(3, width, dtype=torch.float64))
+
+    @torch.no_grad()
+    def add(self, vectors: Tensor, ranks: Ranks) -> None:
+        """Count vectors of all ranks, (B, k)."""
+        found = vectors.double()
+        sums = torch.stack((torch.full_like(found[0], len(found)), found.sum(0), found.square().sum(0)))
+        if ranks.size > 1:
+            means = torch.tensor(ranks.mean(sums.flatten().tolist()), dtype=torch.float64)
+            sums = ranks.size * means.view_as(sums).to(sums)
+        self.sums += sums
+        count, total, squares = self.sums
+        mean = total / count
+        spread = (squares / count - mean.square()).clamp(min=0.0).sqrt()
+        self.mean.copy_(mean)
+        self.spread.copy_(torch.where(spread > NARROW, spread, torch.ones_like(spread)))
+
+
+class ActorCritic(nn.Module):
+    """Gaussian policy before squashing, and value, of a normalised observation: two separate networks.
+
+    Attributes:
+        deviation: logarithm of the standard deviation of each raw control, (w,).
+        observations: their mean and spread so far, (k,).
+        returns: mean and spread of the rewards of whole episodes so far, (1,).
+    """
+
+    def __init__(self, task: Task, config: PpoConfig) -> None:
+        super().__init__()
+        self._task, self._correlation = task, config.correlation
+        width, hidden = task.system.observed_count + 1, config.hidden
+        outputs = raw_width(task.system.decl.controls)
+        self.actor = _network([width, *hidden, outputs], last=0.01)
+        self.critic = _network([width, *hidden, 1], last=1.0)
+        self.deviation = nn.Parameter(torch.full((outputs,), math.log(config.deviation)))
+        self.observations, self.returns = Moments(width), Moments(1)
+
+    def normalised(self, observation: Tensor) -> Tensor:
+        """Observations on a common scale, (B, k)."""
+        seen = self.observations
+        return ((observation - seen.mean) / seen.spread).clamp(-MOST, MOST)
+
+    def controls(self, raw: Tensor) -> Tensor:
+        """Controls in physical units of raw ones: (B, w) -> (B, m)."""
+        return squash(raw, self._task.system.decl.controls)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The most probable controls: (B, k) -> (B, m)."""
+        mean: Tensor = self.actor(self.normalised(observation))
+        return self.controls(mean)
+
+    def judged(self, seen: Tensor, noise: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithm of the probability density of raw controls, and values of the states, (B,) each.
+
+        Args:
+            seen: normalised observations, (B, k).
+            noise: of the step before, in standard deviations, (B, w).
+            raw: controls before squashing, (B, w).
+        """
+        values: Tensor = self.critic(seen)[:, 0]
+        return self.density(self.actor(seen), noise, raw), values
+
+    def drawn(self, noise: Tensor, white: Tensor) -> Tensor:
+        """Noise of a step in standard deviations, from that of the step before and a normal one, (B, w)."""
+        return self._correlation * noise + math.sqrt(1.0 - self._correlation**2) * white
+
+    def density(self, mean: Tensor, noise: Tensor, raw: Tensor) -> Tensor:
+        """Log-density of raw controls, given the noise of the step before: (B, w) each -> (B,)."""
+        innovation = math.sqrt(1.0 - self._correlation**2)
+        distance = (raw - mean) * torch.exp(-self.deviation) - self._correlation * noise
+        whitened = (distance / innovation).square()
+        constant = 0.5 * math.log(2.0 * math.pi) + math.log(innovation)
+        return -(0.5 * whitened + self.deviation + constant).sum(-1)
+
+    @property
+    def entropy(self) -> Tensor:
+        """Entropy of the raw controls, (), up to a constant; the same in every state."""
+        return self.deviation.sum()
+
+
+def _network(widths: Sequence[int], last: float) -> nn.Sequential:
+    """A network with tanh between orthogonal layers; `last` scales the weights of the last one."""
+    layers: list[nn.Module] = []
+    for index, (inputs, outputs) in enumerate(pairwise(widths), start=2):
+        layer = nn.Linear(inputs, outputs)
+        nn.init.orthogonal_(layer.weight, last if index == len(widths) else math.sqrt(2.0))
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """Transitions of one episode in every environment.
+
+    Attributes:
+        seen: observations, (T, N, k).
+        raw: controls before squashing, (T, N, w).
+        noise: of the steps before, in standard deviations, (T, N, w).
+        density: logarithm of the probability density of the controls, (T, N).
+        rewards: (T, N).
+    """
+
+    seen: Tensor
+    raw: Tensor
+    noise: Tensor
+    density: Tensor
+    rewards: Tensor
+
+
+class PpoLearner(Learner):
+    """Training of an actor and a critic. The same seed and steps give the same weights on one machine."""
+
+    config: PpoConfig
+
+    def __init__(
+        self, task: Task, config: PpoConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        super().__init__(task, config, steps=steps, device=device, ranks=ranks)
+        reward: Reward = config.reward  # type: ignore[assignment]
+        self.environments = Environments(task, config.environments, reward=reward, generator=self.generator)
+        self.network = network_of(task, config).to(device)
+        ranks.agree_on(self.network)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.lr, eps=1e-5, fused=True)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """The most probable control of every state."""
+        return ActorPolicy(self.task, self.network)
+
+    @property
+    def rate(self) -> float:
+        """Learning rate of the next step, which falls linearly."""
+        left = 1.0 - self.step / max(self.steps, 1)
+        return self.config.lr * max(left, LEAST)
+
+    def advance(self) -> float:
+        """Play one episode in every environment and learn from it; return the mean loss, or NaN."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate
+        episodes = self._played()
+        with torch.no_grad():
+            network, ranks = self.network, self.ranks
+            seen = network.normalised(episodes.seen)
+            network.returns.add(episodes.rewards.sum(0)[:, None], ranks)
+            advantages, targets = self._estimated(seen, episodes.rewards / network.returns.spread)
+        loss = self._learnt(replace(episodes, seen=seen), advantages.flatten(), targets.flatten())
+        if not math.isfinite(loss):
+            return math.nan
+        network.observations.add(episodes.seen.flatten(0, 1), ranks)
+        self.step += 1
+        self.loss = loss
+        return loss
+
+    @torch.no_grad()
+    def _played(self) -> Episodes:
+        """Play one episode in every environment with random controls."""
+        environments, network = self.environments, self.network
+        seen, means, raws, rewards = [environments.reset().to(self.device)], [], [], []
+        spread, noises = torch.exp(network.deviation), [self._noise()]
+        for _ in range(environments.steps):
+            means.append(network.actor(network.normalised(seen[-1])))
+            noises.append(network.drawn(noises[-1], self._noise()))
+            raws.append(means[-1] + spread * noises[-1])
+            result = environments.step(network.controls(raws[-1]).cpu())
+            rewards.append(result.reward.to(self.device))
+            seen.append(result.observation.to(self.device))
+        raw, noise = torch.stack(raws), torch.stack(noises[:-1])
+        density = network.density(torch.stack(means), noise, raw)
+        return Episodes(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
+
+    def _noise(self) -> Tensor:
+        """Normal random numbers for every environment, (N, w)."""
+        shape = self.config.environments, len(self.network.deviation)
+        return torch.randn(shape, generator=self.generator).to(self.device)
+
+    def _estimated(self, seen: Tensor, rewards: Tensor) -> tuple[Tensor, Tensor]:
+        """Advantages, normalised, and targets of the critic, (T, N) each.
+
+        Args:
+            seen: normalised observations, (T, N, k).
+            rewards: in units of the spread of the returns, (T, N).
+        """
+        config, values = self.config, self.network.critic(seen)[..., 0]
+        after = torch.cat((values[1:], torch.zeros_like(values[:1])))  # an episode ends for good
+        errors = rewards + config.discount * after - values
+        advantages = torch.zeros_like(errors)
+        ahead = torch.zeros_like(errors[0])
+        for step in reversed(range(len(errors))):
+            ahead = errors[step] + config.discount * config.trace * ahead
+            advantages[step] = ahead
+        mean, spread = advantages.mean(), advantages.std()
+        return (advantages - mean) / (spread + 1e-8), advantages + values
+
+    def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
+        """Make all gradient steps; return the mean loss, or NaN before a broken step.
+
+        Args:
+            episodes: with normalised observations.
+            advantages: (T N,).
+            targets: of the critic, (T N,).
+        """
+        config, total = self.config, 0.0
+        seen, raw, noise = (part.flatten(0, 1) for part in (episodes.seen, episodes.raw, episodes.noise))
+        density = episodes.density.flatten()
+        size = -(-len(seen) // config.minibatches)
+        for _ in range(config.epochs):
+            order = torch.randperm(len(seen), generator=self.generator).to(self.device)
+            for rows in torch.split(order, size):
+                now, values = self.network.judged(seen[rows], noise[rows], raw[rows])
+                ratio, gain = torch.exp(now - density[rows]), advantages[rows]
+                clipped = ratio.clamp(1.0 - config.ratio, 1.0 + config.ratio)
+                loss = -torch.minimum(ratio * gain, clipped * gain).mean()
+                loss = loss + VALUE * (values - targets[rows]).square().mean()
+                loss = loss - config.entropy * self.network.entropy
+                self.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                value = self.ranks.learn(self.network.parameters(), loss.detach())
+                length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+                if not bool(torch.isfinite(value + length)):
+                    return math.nan
+                self.optimizer.step()
+                total += float(value)
+        return total / (config.epochs * -(-len(seen) // size))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State for an exact resumption, bit for bit: no episode is under way between two steps."""
+        own = super().tensors()
+        found = dict(own)
+        for index, theirs in enumerate(self.ranks.gather(own), start=1):
+            found |= {f"rank{index}.{name}": value for name, value in theirs.items()}
+        found |= {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        return found | optimizer_tensors(self.optimizer, "adam")
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Restore the state of `tensors` and `facts`."""
+        own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
+        super().restore(tensors | own, facts)
+        self.network.load_state_dict(below(tensors, "network"))
+        restore_optimizer(self.optimizer, below(tensors, "adam"))
+
+
+class Ppo(Method):
+    """Proximal policy optimisation, by 512 episodes side by side."""
+
+    options = PpoConfig
+
+    def resolve(self, task: Task, config: TrainConfig) -> PpoConfig:
+        """Options of PPO; `--batch` is the number of environments."""
+        found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS)
+        assert isinstance(found, PpoConfig)
+        lr = config.lr or task.system.decl.train.lr or RATE
+        return replace(found, hidden=HIDDEN, plans=1, lr=lr, every=EVERY, environments=found.batch)
+
+    def learner(
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
+    ) -> PpoLearner:
+        """Training state before the first step. Raises UsageError (U101): the reward is not declared."""
+        assert isinstance(config, PpoConfig)
+        return PpoLearner(task, config, steps=steps, device=device, ranks=ranks)
+
+    def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:
+        """The actor of a run."""
+        assert isinstance(config, PpoConfig)
+        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        network = network_of(task, config)
+        with restoring(run):
+            network.load_state_dict(weights(saved, "network"))
+        return ActorPolicy(task, network.to(torch.device(device)).eval())
+
+
+def network_of(task: Task, config: PpoConfig) -> ActorCritic:
+    """A network whose initial weights depend on the seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return ActorCritic(task, config)
+
+
+METHOD = Ppo()
