@@ -96,7 +96,7 @@ def train(
         str | None,
         typer.Option(
             metavar="|".join(METHODS),
-            help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
+            help="How to train, see docs/methods.md; guided unless the system file says otherwise.",
         ),
     ] = None,
     reward: Annotated[

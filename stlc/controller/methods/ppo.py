@@ -77,7 +77,7 @@ class PpoConfig(ActorConfig):
     discount: float = 1.0
     trace: float = 0.95
     ratio: float = 0.2
-    entropy: float = 0.0
+    entropy: float = 0.005
     deviation: float = 1.0
     correlation: float = 0.8
 

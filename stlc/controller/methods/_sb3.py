@@ -1,0 +1,277 @@
+"""Soft actor-critic of stable-baselines3 over batched episodes, trained step by step.
+
+The library's own `save` pickles; here networks, optimisers, entropy coefficient, replay buffer and random
+numbers are tensors of the run's checkpoint.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from stlc.controller.methods import Learner
+from stlc.controller.methods._actor import ActorPolicy, below, optimizer_tensors, restore_optimizer
+from stlc.controller.methods.sac import SacActor, SacConfig
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.problem.environments import Environments, Reward
+from stlc.diagnostics import usage
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.diagnostics import StlcError
+
+SAMPLED = 4096
+"""Initial states for the scale of the observations."""
+NARROW = 1e-4
+"""Spread below which observations are not scaled."""
+SEEDS = 2**32
+"""Number of seeds that NumPy takes."""
+CRITICS = [256, 256]
+"""Widths of the critics, the library's default."""
+STORED = ("observations", "next_observations", "actions", "rewards", "dones")
+"""Arrays of the replay buffer, (capacity / N, N, …)."""
+
+
+class EpisodesEnv(VecEnv):  # type: ignore[misc]
+    """Batched episodes as the library's vectorised environment: scaled observations, controls in [-1, 1].
+
+    Args:
+        environments: the episodes.
+        actor: scales of observations and controls.
+    """
+
+    render_mode = None
+
+    def __init__(self, environments: Environments, actor: SacActor) -> None:
+        self.environments, self._actor = environments, actor
+        controls = len(environments.task.system.control_names)
+        seen = Box(-np.inf, np.inf, (environments.width,), np.float32)
+        super().__init__(environments.count, seen, Box(-1.0, 1.0, (controls,), np.float32))
+
+    def reset(self) -> np.ndarray[Any, Any]:
+        """Begin all episodes anew; return observations, (N, k)."""
+        self.environments.reset()
+        return self.observed()
+
+    def observed(self) -> np.ndarray[Any, Any]:
+        """Observations of episodes that begin, (N, k)."""
+        return self._seen(self.environments.observe(self.environments.states, 0))
+
+    def step_async(self, actions: np.ndarray[Any, Any]) -> None:
+        """Keep the controls for `step_wait`, (N, m)."""
+        self._actions = torch.from_numpy(np.asarray(actions, np.float32))
+
+    def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
+        """Advance all episodes by a step: observations (N, k), rewards (N,), ends (N,), and records."""
+        result = self.environments.step(self._actor.controls(self._actions))
+        done = result.done.numpy()
+        records: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if done.any():
+            records = [{"terminal_observation": final} for final in self._seen(result.final)]
+        return self._seen(result.observation), result.reward.float().numpy(), done, records
+
+    def _seen(self, observation: Tensor) -> np.ndarray[Any, Any]:
+        with torch.no_grad():
+            scaled: np.ndarray[Any, Any] = self._actor.normalised(observation.float()).numpy()
+        return scaled
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of every environment: all are this one."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
+        """Set an attribute of all environments."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method for every environment."""
+        return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:  # noqa: ARG002
+        """No environment is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+
+class RandomState:
+    """Random numbers that the library draws from the global generators of torch and NumPy, kept apart.
+
+    Attributes:
+        torch: state of torch's generator.
+        numpy: state of NumPy's.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.torch = torch.Generator().manual_seed(seed).get_state()
+        self.numpy: Any = np.random.RandomState(seed % SEEDS).get_state()
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """Use these random numbers in the context, and leave those of the process as they were."""
+        others = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002 - the library's
+        torch.set_rng_state(self.torch)
+        np.random.set_state(self.numpy)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            self.torch, self.numpy = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+            torch.set_rng_state(others[0])
+            np.random.set_state(others[1])  # noqa: NPY002
+            random.setstate(others[2])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Both states by name."""
+        _, keys, position, *_ = self.numpy
+        return {"torch": self.torch, "numpy": torch.tensor([*keys.tolist(), position])}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore the states of `tensors`."""
+        *keys, position = tensors["numpy"].tolist()
+        self.torch = tensors["torch"]
+        self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
+
+
+class SacLearner(Learner):
+    """Training of SAC. The same seed and steps give the same weights on one machine."""
+
+    config: SacConfig
+
+    def __init__(
+        self, task: Task, config: SacConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        if ranks.size > 1:
+            raise usage("method `sac` trains in one process", "stlc train SPEC --method sac")
+        super().__init__(task, config, steps=steps, device=device, ranks=ranks)
+        reward: Reward = config.reward  # type: ignore[assignment]
+        self.actor = SacActor(task, config.hidden)
+        self.environments = Environments(task, config.environments, reward=reward, generator=self.generator)
+        seen = self.environments.observe(task.sample(SAMPLED, generator=self.generator), 0).float()
+        spread = seen.std(0)
+        seen[:, -1], spread[-1] = 0.5, 0.3  # the elapsed share: mean and spread of an episode
+        self.actor.centre.copy_(seen.mean(0))
+        self.actor.spread.copy_(torch.where(spread > NARROW, spread, torch.ones_like(spread)))
+        self._random = RandomState(config.seed)
+        with self._random.used():
+            self.model = self._made()
+            # a step is an episode, so that none is under way between two steps
+            _, self._callback = self.model._setup_learn(total_timesteps=1, callback=None)
+
+    def _made(self) -> Any:
+        config = self.config
+        return SAC(
+            "MlpPolicy",
+            EpisodesEnv(self.environments, self.actor),
+            learning_rate=config.lr,
+            buffer_size=max(config.capacity, config.environments),
+            learning_starts=config.warmup_transitions,
+            batch_size=config.batch,
+            tau=config.smoothing,
+            gamma=config.discount,
+            gradient_steps=config.updates,
+            policy_kwargs={"net_arch": {"pi": list(config.hidden), "qf": CRITICS}},
+            seed=config.seed % SEEDS,
+            device=self.device,
+        )
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """The most probable control of every state."""
+        theirs = {name: value.detach().cpu() for name, value in self.model.actor.state_dict().items()}
+        own = {name: theirs[name] for name in self.actor.state_dict() if name in theirs}
+        self.actor.load_state_dict(own, strict=False)
+        return ActorPolicy(self.task, self.actor)
+
+    def advance(self) -> float:
+        """Play one episode in every environment, with updates after each of its steps; the critics' loss."""
+        model, losses = self.model, []
+        with self._random.used():
+            for _ in range(self.environments.steps):
+                model.collect_rollouts(
+                    model.env,
+                    train_freq=model.train_freq,
+                    callback=self._callback,
+                    learning_starts=model.learning_starts,
+                    replay_buffer=model.replay_buffer,
+                )
+                if model.num_timesteps > model.learning_starts and self.config.updates:
+                    model.train(gradient_steps=self.config.updates, batch_size=self.config.batch)
+                    losses.append(float(model.logger.name_to_value["train/critic_loss"]))
+                    model.logger.name_to_value.clear()
+        loss = sum(losses) / len(losses) if losses else 0.0
+        if not math.isfinite(loss):
+            return math.nan
+        self.step += 1
+        self.loss = loss
+        return loss
+
+    def diagnose(self) -> tuple[StlcError, bool]:
+        """Cause of a non-finite step; the weights before it are gone, so that the last checkpoint stays."""
+        return super().diagnose()[0], False
+
+    # ------------------------------------------------------------- checkpoints
+
+    def _modules(self) -> dict[str, torch.nn.Module]:
+        model = self.model
+        return {"actor": model.actor, "critic": model.critic, "target": model.critic_target}
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        model = self.model
+        found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+        return {**found, "entropy": model.ent_coef_optimizer}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State for an exact resumption: networks, optimisers, entropy coefficient, replay buffer, random."""
+        found = super().tensors()
+        found |= {f"policy.{name}": value for name, value in self.policy.actor.state_dict().items()}  # type: ignore[attr-defined]
+        for prefix, module in self._modules().items():
+            found |= {f"{prefix}.{name}": value for name, value in module.state_dict().items()}
+        for prefix, optimizer in self._optimizers().items():
+            found |= optimizer_tensors(optimizer, f"adam.{prefix}")
+        buffer = self.model.replay_buffer
+        filled = buffer.buffer_size if buffer.full else buffer.pos
+        found |= {f"replay.{name}": torch.from_numpy(getattr(buffer, name)[:filled]) for name in STORED}
+        found["entropy"] = self.model.log_ent_coef.detach()
+        found["starts"] = self.environments.states
+        return found | {f"random.{name}": value for name, value in self._random.tensors().items()}
+
+    def facts(self) -> dict[str, float | int]:
+        """Scalars stored with `tensors`."""
+        model = self.model
+        return super().facts() | {
+            "transitions": model.num_timesteps,
+            "updates": model._n_updates,
+            "position": model.replay_buffer.pos,
+        }
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Restore the state of `tensors` and `facts`."""
+        super().restore(tensors, facts)
+        model, buffer = self.model, self.model.replay_buffer
+        self.actor.load_state_dict(below(tensors, "policy"))
+        for prefix, module in self._modules().items():
+            module.load_state_dict(below(tensors, prefix))
+        for prefix, optimizer in self._optimizers().items():
+            restore_optimizer(optimizer, below(tensors, f"adam.{prefix}"))
+        with torch.no_grad():
+            model.log_ent_coef.copy_(tensors["entropy"])
+        for name in STORED:
+            stored = tensors[f"replay.{name}"].numpy()
+            getattr(buffer, name)[: len(stored)] = stored
+        buffer.pos = int(facts["position"])
+        buffer.full = len(stored) == buffer.buffer_size
+        model.num_timesteps, model._n_updates = int(facts["transitions"]), int(facts["updates"])
+        self.environments.reset(tensors["starts"])
+        model._last_obs = model.env.observed()
+        self._random.restore(below(tensors, "random"))
