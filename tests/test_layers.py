@@ -59,7 +59,7 @@ HOMES = {
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
-    "gymnasium": ("stlc.gym",),
+    "gymnasium": ("stlc.gym", "stlc.controller.methods"),
     "stable_baselines3": ("stlc.gym", "stlc.controller.methods"),
     "lsprotocol": ("stlc.editor",),
     "PIL": ("stlc.view",),

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stlc.controller.methods import Learner
 from stlc.controller.methods._actor import ActorPolicy, below, optimizer_tensors, restore_optimizer
-from stlc.controller.methods.sac import SacActor, SacConfig
+from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
 from stlc.diagnostics import usage

@@ -5,23 +5,20 @@ The paper's RL_R, RL_S and RL_A are `--reward task`, `robustness` and `accuracy`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
 
 from stlc.controller.methods import Learner, Method
-from stlc.controller.methods._actor import ActorConfig, ActorPolicy
+from stlc.controller.methods._actor import ActorPolicy
+from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.training.checkpoint import load_checkpoint, restoring, weights
 from stlc.controller.training.config import base_config
 from stlc.controller.training.run import spec_hash, trained_on
 from stlc.diagnostics import Diagnostic, MissingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from stlc.controller.parallel.ddp import Ranks
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import ResolvedConfig, TrainConfig
@@ -31,66 +28,6 @@ BATCH, RATE = 256, 3e-4
 """Default transitions of an update, and learning rate: those of the library."""
 EVERY = 10
 """Steps between validations."""
-
-
-@dataclass(frozen=True, slots=True)
-class SacConfig(ActorConfig):
-    """Options of SAC; the paper has 8 environments, 1 update, and 5 to 20 million transitions.
-
-    Attributes:
-        updates: gradient steps after each step of all environments.
-        capacity: of the replay buffer, in transitions.
-        warmup_transitions: transitions with random controls before the first update.
-        discount: gamma of the return.
-        smoothing: share of the new critics in the target critics, per update.
-    """
-
-    updates: int = 4
-    capacity: int = 1_000_000
-    warmup_transitions: int = 100
-    discount: float = 0.99
-    smoothing: float = 0.005
-
-
-class SacActor(nn.Module):
-    """The mean of the library's actor, with the names of its weights; needs no package.
-
-    Attributes:
-        centre: mean of the observations of initial states, (k,).
-        spread: their standard deviation, (k,).
-    """
-
-    centre: Tensor
-    spread: Tensor
-    middle: Tensor
-    extent: Tensor
-
-    def __init__(self, task: Task, hidden: Sequence[int]) -> None:
-        super().__init__()
-        system = task.system
-        width, outputs = system.observed_count + 1, len(system.control_names)
-        layers: list[nn.Module] = []
-        for inputs, wide in pairwise((width, *hidden)):
-            layers += [nn.Linear(inputs, wide), nn.ReLU()]
-        self.latent_pi = nn.Sequential(*layers)
-        self.mu = nn.Linear(hidden[-1], outputs)
-        self.register_buffer("centre", torch.zeros(width))
-        self.register_buffer("spread", torch.ones(width))
-        self.register_buffer("middle", 0.5 * (system.control_low + system.control_high).float())
-        self.register_buffer("extent", 0.5 * (system.control_high - system.control_low).float())
-
-    def normalised(self, observation: Tensor) -> Tensor:
-        """Observations on a common scale, (B, k)."""
-        return (observation - self.centre) / self.spread
-
-    def controls(self, scaled: Tensor) -> Tensor:
-        """Controls in physical units of those in [-1, 1]: (B, m) -> (B, m)."""
-        return self.middle + self.extent * scaled
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """The most probable controls: (B, k) -> (B, m)."""
-        mean: Tensor = self.mu(self.latent_pi(self.normalised(observation)))
-        return self.controls(torch.tanh(mean))
 
 
 class Sac(Method):

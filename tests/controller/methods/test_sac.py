@@ -15,7 +15,7 @@ import torch
 
 from stlc import Run
 from stlc.cli.framework.app import main
-from stlc.controller.methods.sac import SacConfig
+from stlc.controller.methods._sac import SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
