@@ -1,0 +1,1 @@
+"""CasADi back end: dynamics and robustness as symbolic expressions for optimisers."""

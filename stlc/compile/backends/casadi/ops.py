@@ -1,0 +1,309 @@
+"""Array namespace over CasADi expressions (Andersson et al. 2019), for nonlinear programs; extra `stlc[mpc]`.
+
+A column is `(time, 1)`: a program is about one trajectory. Functions with kinks are rounded within `ROUNDING`,
+so that Newton's method applies: `abs`, `min`, `max` and `clip`. Steps (`floor`, `sign`) stay exact: their
+derivative is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any, TypeAlias, cast, final
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.schedule.schedule import Pick
+
+ROUNDING = 1e-3
+"""Width of a rounded kink, in the unit of the operand; the error is half of it."""
+TINY = 1e-12
+"""Added under square roots, whose slope at 0 would be infinite."""
+
+
+@final
+@dataclass(frozen=True, slots=True, eq=False)
+class SymbolicColumn:
+    """A column of expressions.
+
+    Attributes:
+        entries: `casadi.SX`, (time, 1).
+    """
+
+    entries: Any
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(time, 1)."""
+        return (int(self.entries.shape[0]), 1)
+
+    @property
+    def ndim(self) -> int:
+        """2."""
+        return 2
+
+    @property
+    def T(self) -> SymbolicColumn:  # noqa: N802 - as arrays call it
+        """The transpose of a single entry."""
+        assert len(self) == 1
+        return self
+
+    def __len__(self) -> int:
+        return int(self.entries.shape[0])
+
+    def __getitem__(self, rows: slice | int) -> SymbolicColumn:
+        return SymbolicColumn(self.entries[rows, 0])
+
+    def rows(self) -> list[SymbolicColumn]:
+        """Each entry, (1, 1)."""
+        return [self[k] for k in range(len(self))]
+
+    def __add__(self, other: Operand) -> SymbolicColumn:
+        return SymbolicColumn(self.entries + _entries(other))
+
+    def __radd__(self, other: float) -> SymbolicColumn:
+        return self + other
+
+    def __sub__(self, other: Operand) -> SymbolicColumn:
+        return SymbolicColumn(self.entries - _entries(other))
+
+    def __rsub__(self, other: float) -> SymbolicColumn:
+        return SymbolicColumn(other - self.entries)
+
+    def __mul__(self, other: Operand) -> SymbolicColumn:
+        return SymbolicColumn(self.entries * _entries(other))
+
+    def __rmul__(self, other: float) -> SymbolicColumn:
+        return self * other
+
+    def __truediv__(self, other: Operand) -> SymbolicColumn:
+        return SymbolicColumn(self.entries / _entries(other))
+
+    def __rtruediv__(self, other: float) -> SymbolicColumn:
+        return SymbolicColumn(other / self.entries)
+
+    def __neg__(self) -> SymbolicColumn:
+        return SymbolicColumn(-self.entries)
+
+
+Operand: TypeAlias = SymbolicColumn | float
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class StackedColumns:
+    """Columns along a new first axis, for an extremum over it."""
+
+    parts: tuple[SymbolicColumn, ...]
+
+    def __len__(self) -> int:
+        return len(self.parts)
+
+    def __getitem__(self, index: int) -> SymbolicColumn:
+        return self.parts[index]
+
+    def rows(self) -> list[SymbolicColumn]:
+        """The columns."""
+        return list(self.parts)
+
+
+def _entries(operand: Operand) -> Any:
+    return operand.entries if isinstance(operand, SymbolicColumn) else operand
+
+
+def _elementwise(function: Callable[..., Any]) -> Any:
+    """The method of a function of CasADi that works on each entry."""
+
+    def method(_: CasadiOps, *operands: Operand) -> SymbolicColumn:
+        return SymbolicColumn(casadi.SX(function(*map(_entries, operands))))
+
+    return method
+
+
+@final
+class CasadiOps:
+    """`stlc.compile.backends.array.namespace.Ops` over columns of expressions."""
+
+    name = "casadi"
+
+    add, sub, mul, div = map(
+        _elementwise, (lambda a, b: a + b, lambda a, b: a - b, lambda a, b: a * b, lambda a, b: a / b)
+    )
+    exp, expm1, log, log1p = map(_elementwise, (casadi.exp, casadi.expm1, casadi.log, casadi.log1p))
+    sin, cos, tan = map(_elementwise, (casadi.sin, casadi.cos, casadi.tan))
+    asin, acos, atan, atan2 = map(_elementwise, (casadi.asin, casadi.acos, casadi.atan, casadi.atan2))
+    sign, floor, ceil = map(_elementwise, (casadi.sign, casadi.floor, casadi.ceil))
+    round = _elementwise(lambda x: casadi.floor(x + 0.5))
+    gt, ge = map(_elementwise, (lambda a, b: a > b, lambda a, b: a >= b))
+    both, either = map(_elementwise, (casadi.logic_and, casadi.logic_or))
+    where = _elementwise(casadi.if_else)
+    pow = _elementwise(lambda a, b: a**b)
+    mod = _elementwise(lambda a, b: a - b * casadi.floor(a / b))
+    square = _elementwise(lambda x: x * x)
+    sqrt = _elementwise(lambda x: casadi.sqrt(x + TINY))
+    sigmoid = _elementwise(lambda x: 0.5 + 0.5 * casadi.tanh(0.5 * x))
+    abs = _elementwise(lambda x: casadi.sqrt(x * x + ROUNDING**2))
+    maximum = _elementwise(lambda a, b: _rounded(a, b, 1.0))
+    minimum = _elementwise(lambda a, b: _rounded(a, b, -1.0))
+
+    def axpy(self, a: Operand, b: SymbolicColumn, factor: float) -> SymbolicColumn:
+        """`a + factor * b`."""
+        return b * factor + a
+
+    def addcmul(self, a: Operand, b: SymbolicColumn, c: SymbolicColumn, factor: float) -> SymbolicColumn:
+        """`a + factor * b * c`."""
+        return b * c * factor + a
+
+    def clamp(self, x: SymbolicColumn, low: float | None, high: float | None) -> SymbolicColumn:
+        """`x` clamped to [low, high], rounded at both ends."""
+        raised = x if low is None else self.maximum(x, low)
+        held: SymbolicColumn = raised if high is None else self.minimum(raised, high)
+        return held
+
+    def norm(self, *components: Operand) -> SymbolicColumn:
+        """Euclidean length."""
+        total = sum(part * part for part in map(_entries, components))
+        return SymbolicColumn(casadi.sqrt(total + TINY))
+
+    # ------------------------------------------------------------------- truth
+
+    def settled(self, weight: SymbolicColumn, mask: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
+        """The weight itself, which is smooth."""
+        return weight
+
+    def number(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
+        """The mask, which is 0 or 1."""
+        return mask
+
+    def lerp(self, no: Operand, yes: Operand, weight: SymbolicColumn) -> SymbolicColumn:
+        """`no + weight (yes - no)`."""
+        return weight * (yes - no) + no
+
+    def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
+        """+inf where `mask`, else -inf; of known masks, such as time tests."""
+        known = [math.inf if float(each) else -math.inf for each in np.array(casadi.DM(mask.entries)).ravel()]
+        return SymbolicColumn(casadi.SX(known))
+
+    def straight_through(self, rho: SymbolicColumn, strict: bool, slope: float) -> SymbolicColumn:  # noqa: ARG002
+        """`(1 + tanh(slope rho)) / 2`: value and gradient are of one function."""
+        return SymbolicColumn(0.5 + 0.5 * casadi.tanh(slope * rho.entries))
+
+    # -------------------------------------------------------------- along time
+
+    def join(self, items: Sequence[SymbolicColumn], pick: Pick) -> SymbolicColumn:
+        """Extremum of one or more columns, rounded."""
+        return reduce(self.minimum if pick == "min" else self.maximum, items)
+
+    def amin(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Minimum over time, rounded, (1, 1)."""
+        return self.join(x.rows(), "min")
+
+    def amax(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Maximum over time, rounded, (1, 1)."""
+        return self.join(x.rows(), "max")
+
+    def sum(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Sum over time, (1, 1)."""
+        return SymbolicColumn(casadi.sum1(x.entries))
+
+    def cummin(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Running minimum, rounded."""
+        return self.cat([self.amin(x[: k + 1]) for k in range(len(x))])
+
+    def cummax(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Running maximum, rounded."""
+        return self.cat([self.amax(x[: k + 1]) for k in range(len(x))])
+
+    def softmax(self, x: SymbolicColumn | StackedColumns, k: float) -> SymbolicColumn | StackedColumns:
+        """`log(sum(exp(k x))) / k` over the first axis, kept with length 1, by pairs."""
+        parts = x.rows()
+        while len(parts) > 1:
+            pairs = [self.softmax2(a, b, k) for a, b in zip(parts[::2], parts[1::2], strict=False)]
+            parts = [*pairs, *parts[len(parts) - len(parts) % 2 :]]
+        return parts[0] if isinstance(x, SymbolicColumn) else StackedColumns((parts[0],))
+
+    def softmax2(self, a: SymbolicColumn, b: SymbolicColumn, k: float) -> SymbolicColumn:
+        """`log(exp(k a) + exp(k b)) / k` without overflow; neutral constants fall out."""
+        neutral = -math.inf if k > 0.0 else math.inf
+        rows = []
+        for one, other in zip(a.rows(), b.rows(), strict=True):
+            if _is(one, neutral) or _is(other, neutral):
+                rows.append(other if _is(one, neutral) else one)
+                continue
+            top = (casadi.fmax if k > 0.0 else casadi.fmin)(one.entries, other.entries)
+            gap = casadi.fabs(one.entries - other.entries)
+            rows.append(SymbolicColumn(top + casadi.log1p(casadi.exp(-abs(k) * gap)) / k))
+        return self.cat(rows)
+
+    def extrema(self, x: SymbolicColumn, pick: Pick, window: Sliding) -> None:
+        """None: windows are computed by pairwise doubling."""
+
+    def until(self, left: SymbolicColumn, right: SymbolicColumn, pick: Pick, window: Sliding) -> None:
+        """None: `until` is computed by other methods."""
+
+    # ------------------------------------------------------ constants and shapes
+
+    def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
+        """None: constants are floats."""
+        return None
+
+    def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002
+        """The float itself."""
+        return value
+
+    def full(self, shape: tuple[int, ...], value: float, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
+        """A constant column."""
+        return SymbolicColumn(casadi.SX([value] * (shape[0] if shape else 1)))
+
+    def counted(self, first: int, count: int, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
+        """Integers along time."""
+        return SymbolicColumn(casadi.SX([float(k) for k in range(first, first + count)]))
+
+    def empty(self, shape: tuple[int, ...], like: SymbolicColumn) -> SymbolicColumn:
+        """Zeros."""
+        return self.full(shape, 0.0, like)
+
+    def cat(self, parts: Sequence[SymbolicColumn]) -> SymbolicColumn:
+        """Concatenation along time."""
+        return SymbolicColumn(casadi.vertcat(*(part.entries for part in parts)))
+
+    def stack(self, parts: Sequence[SymbolicColumn]) -> StackedColumns:
+        """Columns stacked along a new first axis."""
+        return StackedColumns(tuple(parts))
+
+    def flip(self, x: SymbolicColumn) -> SymbolicColumn:
+        """Reversed in time."""
+        return x[::-1]
+
+    def rows(self, keep: NDArray[np.bool_], x: SymbolicColumn, value: float) -> SymbolicColumn:
+        """`x` with `value` in the rows outside `keep`."""
+        blank = casadi.SX(value)
+        return SymbolicColumn(casadi.vertcat(*(x[k].entries if keep[k] else blank for k in range(len(x)))))
+
+    def columns(self, x: Any) -> Sequence[SymbolicColumn]:
+        """`casadi.SX` (time, dim) -> a column for each dimension."""
+        return [SymbolicColumn(x[:, i]) for i in range(x.shape[1])]
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Empty context: nothing is computed while an expression is built."""
+        return nullcontext()
+
+
+def _rounded(a: Any, b: Any, sign: float) -> Any:
+    """Rounded maximum (`sign` 1) or minimum (-1), without error far from the kink's middle."""
+    return 0.5 * (a + b + sign * casadi.sqrt((a - b) ** 2 + ROUNDING**2))
+
+
+def _is(x: SymbolicColumn, value: float) -> bool:
+    """True for the constant `value`."""
+    return bool(x.entries.is_constant()) and float(x.entries) == value
+
+
+CASADI_OPS = CasadiOps()
+CASADI: Ops = cast("Ops", CASADI_OPS)

@@ -1,0 +1,289 @@
+"""Multiple shooting: the plans of a horizon as a nonlinear program, from dynamics and formulas of the IR.
+
+All states are variables, tied by the dynamics (Bock & Plitt 1984). A clamped state stays within its range by
+its bounds, and a correction in the dynamics, which costs, stands for what the clamp cuts off. Every condition
+that a formula demands by itself is a constraint `value + shortfall >= margin`; the extrema within one are
+log-sum-exp (Pant et al. 2017). Columns that no control reaches are data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias, final
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.casadi.ops import CASADI, SymbolicColumn
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.text import show_number
+from stlc.compile.ir.traverse import leaves, numbers, subexpressions
+from stlc.compile.semantics.kinds.smooth import LogSumExp
+
+STEPS = ("floor", "ceil", "round", "sign", "mod")
+"""Functions that jump."""
+LEAST = 1e3
+"""Greatest robustness that is aimed at, and minus the value of a condition that never holds."""
+EFFORT = 1e-3
+"""Cost of controls at the ends of their ranges, which makes a plan unique."""
+CORRECTION = 10.0
+"""Cost of corrections, per unit of the state, where the shortfall costs 1."""
+
+Vector: TypeAlias = NDArray[np.float64]
+
+
+class NotSmoothError(Exception):
+    """A number that jumps where a control moves it, or that no expression stands for."""
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Eased:
+    """The paper's smooth indicators (Eq. 6), none sharper than `sharpness`."""
+
+    exact: ClassVar[bool] = False
+    sharpness: float
+
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
+        """`(1 + tanh(w rho)) / 2`."""
+        width = self.sharpness if sharpness is None else min(self.sharpness, sharpness)
+        return ops.sigmoid(rho * (2.0 * width))
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
+        """Return `weight` unchanged."""
+        return weight
+
+    def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
+        """`no + weight (yes - no)`."""
+        return ops.lerp(no, yes, weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Dynamics without clamps.
+
+    Attributes:
+        lets: intermediate results of a step, in order.
+        step: moving state -> its value one step later.
+        clamps: state -> its range.
+        bounds: control -> its range.
+        horizon: number of steps.
+    """
+
+    lets: Sequence[tuple[str, ir.Num]]
+    step: Mapping[str, ir.Num]
+    clamps: Mapping[str, tuple[float, float]]
+    bounds: Mapping[str, tuple[float, float]]
+    horizon: int
+
+    def reached(self) -> frozenset[str]:
+        """Columns and intermediate results that controls move."""
+        found, before = set(self.bounds), -1
+        while len(found) > before:
+            before = len(found)
+            found |= {name for name, num in (*self.lets, *self.step.items()) if _names(num) & found}
+        return frozenset(found)
+
+    def needed(self, columns: Iterable[str]) -> frozenset[str]:
+        """Columns and intermediate results on which some columns depend, themselves included."""
+        table: dict[str, set[str]] = {}
+        for name, num in (*self.lets, *self.step.items()):
+            table.setdefault(name, set()).update(_names(num))
+        found, stack = set[str](), list(columns)
+        while stack:
+            name = stack.pop()
+            if name not in found:
+                found.add(name)
+                stack.extend(table.get(name, ()))
+        return frozenset(found)
+
+
+@dataclass(frozen=True, slots=True)
+class ScaledFormula:
+    """A formula to hold at the first sample, and the factor of its robustness."""
+
+    formula: ir.Formula
+    factor: float
+
+
+class Shooting:
+    """The nonlinear program of a motion and of formulas, for all initial states.
+
+    Attributes:
+        program: `x`, `p`, `f`, `g` of CasADi: variables, data, cost, constraints.
+        states: columns that are variables.
+        given: columns that are data.
+    """
+
+    def __init__(
+        self, motion: Motion, demands: Sequence[ScaledFormula], *, smoothing: float, sharpness: float
+    ) -> None:
+        """Write the program.
+
+        Args:
+            motion: dynamics.
+            demands: formulas.
+            smoothing: scale of log-sum-exp.
+            sharpness: greatest slope of indicators.
+
+        Raises:
+            NotSmoothError: a number jumps where a control moves it.
+        """
+        self._motion, self._switch = motion, Eased(sharpness)
+        self._semantics = LogSumExp(smoothing)
+        reached = motion.reached()
+        read = {name for each in demands for num in numbers(each.formula) for name in _names(num)}
+        needed = motion.needed(read)
+        self._lets = [(name, num) for name, num in motion.lets if name in needed]
+        self.states = tuple(name for name in motion.step if name in reached & needed)
+        moving = {*motion.bounds, *self.states, *(name for name, _ in motion.lets), ir.ELAPSED}
+        self.given = tuple(sorted(needed - moving))
+        used = (*(num for _, num in self._lets), *(motion.step[name] for name in self.states))
+        for num in (*used, *(num for each in demands for num in numbers(each.formula))):
+            _require_smooth(num, reached)
+        self._write(demands)
+
+    def _write(self, demands: Sequence[ScaledFormula]) -> None:
+        """Build variables, data, cost and constraints."""
+        motion, steps = self._motion, self._motion.horizon
+        controls = casadi.SX.sym("u", steps, len(motion.bounds))
+        later = casadi.SX.sym("x", steps, len(self.states))
+        self._clamped = tuple(name for name in self.states if name in motion.clamps)
+        raised, cut = (casadi.SX.sym(name, steps, len(self._clamped)) for name in ("raised", "cut"))
+        shortfall, margin = casadi.SX.sym("e"), casadi.SX.sym("margin")
+        first = casadi.SX.sym("first", 1, len(self.states))
+        data = casadi.SX.sym("given", steps + 1, len(self.given))
+        whole = casadi.vertcat(first, later)
+        rows = {name: SymbolicColumn(whole[:, i]) for i, name in enumerate(self.states)}
+        rows |= {name: SymbolicColumn(data[:, i]) for i, name in enumerate(self.given)}
+        inputs = {name: SymbolicColumn(controls[:, i]) for i, name in enumerate(motion.bounds)}
+        moved = self._moved({name: column[:-1] for name, column in rows.items()} | inputs)
+        defects = []
+        for i, name in enumerate(self.states):
+            after = moved[name].entries
+            if name in self._clamped:
+                place = self._clamped.index(name)
+                after = after + raised[:, place] - cut[:, place]
+            defects.append(later[:, i] - after)
+        values = self._values(demands, rows)
+        ends = np.array(list(motion.bounds.values()))
+        effort = casadi.sumsqr(
+            (controls - np.tile(ends.mean(1), (steps, 1))) / np.tile(0.5 * np.ptp(ends, axis=1), (steps, 1))
+        )
+        corrections = casadi.sum1(casadi.vec(raised)) + casadi.sum1(casadi.vec(cut))
+        self.program = {
+            "x": casadi.vertcat(*map(casadi.vec, (controls, later, raised, cut, shortfall))),
+            "p": casadi.vertcat(*map(casadi.vec, (first, data, margin))),
+            "f": shortfall + EFFORT / steps * effort + CORRECTION * corrections,
+            "g": casadi.vertcat(*defects, values + shortfall - margin),
+        }
+        self._equations = steps * len(self.states)
+        self._demands = int(values.shape[0])
+
+    def _moved(self, env: Mapping[str, SymbolicColumn]) -> Mapping[str, SymbolicColumn]:
+        """The states one step later: columns `(steps, 1)` -> columns `(steps, 1)`."""
+        steps = self._motion.horizon
+        known = {**env, ir.ELAPSED: CASADI.counted(0, steps, None)}
+        for name, num in self._lets:
+            known[name] = ArrayProgram({name: num})(known, CASADI, self._switch)[name]
+        step = {name: self._motion.step[name] for name in self.states}
+        if not step:
+            return {}
+        moved = ArrayProgram(step)(known, CASADI, self._switch)
+        return {name: _tall(column, steps) for name, column in moved.items()}
+
+    def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
+        """Values of all conditions that the formulas demand, (d, 1)."""
+        found = []
+        for each in demands:
+            for formula, first, last in _conditions(each.formula, 0, 0, self._motion.horizon):
+                count = last - first + 1
+                (value,) = evaluate(
+                    [formula], rows, ops=CASADI, semantics=self._semantics, start=first, count=count
+                )
+                left = [row.entries for row in value.rows() if not _holds(row)]
+                found += [-LEAST if row.is_constant() else each.factor * row for row in left]
+        return casadi.vertcat(*found) if found else casadi.SX(0, 1)
+
+    # ------------------------------------------------------------------- numbers
+
+    def limits(self, *, maximise: bool) -> dict[str, Vector]:
+        """Bounds `lbx`, `ubx` of the variables and `lbg`, `ubg` of the constraints."""
+        motion, steps = self._motion, self._motion.horizon
+        free = (-math.inf, math.inf)
+        ranges = [*motion.bounds.values(), *(motion.clamps.get(name, free) for name in self.states)]
+        ranges += [(0.0, math.inf)] * (2 * len(self._clamped))
+        low, high = (np.repeat([each[side] for each in ranges], steps) for side in (0, 1))
+        return {
+            "lbx": np.append(low, -LEAST if maximise else 0.0),
+            "ubx": np.append(high, math.inf),
+            "lbg": np.zeros(self._equations + self._demands),
+            "ubg": np.append(np.zeros(self._equations), np.full(self._demands, math.inf)),
+        }
+
+    def guess(self, controls: Vector, columns: Mapping[str, Vector]) -> Vector:
+        """Variables for a plan (T, m) and the columns (T + 1,) that follow from it."""
+        states = [columns[name][1:] for name in self.states]
+        blank = np.zeros(2 * len(self._clamped) * self._motion.horizon + 1)
+        return np.concatenate([controls.T.ravel(), *states, blank])
+
+    def data(self, columns: Mapping[str, Vector], margin: float) -> Vector:
+        """Data of a start: its columns (T + 1,) under any plan, and the margin of all conditions."""
+        first = [columns[name][0] for name in self.states]
+        return np.concatenate([first, *(columns[name] for name in self.given), [margin]])
+
+    def controls(self, values: Vector) -> Vector:
+        """The plan (T, m) of some variables."""
+        steps, count = self._motion.horizon, len(self._motion.bounds)
+        return values[: steps * count].reshape(count, steps).T
+
+
+def _conditions(formula: ir.Formula, first: int, last: int, end: int) -> Iterator[tuple[ir.Formula, int, int]]:
+    """Formulas with the samples, both included, at which `formula` at `first` to `last` demands them."""
+    match formula:
+        case ir.BoolOp("and", items):
+            for item in items:
+                yield from _conditions(item, first, last, end)
+        case ir.AtStart(body):
+            yield from _conditions(body, 0, 0, end)
+        case ir.Temporal("always", window, body) if window.hi is not None or first == last:
+            until = end if window.hi is None else last + window.hi
+            yield from _conditions(body, first + window.lo, until, end)
+        case _:
+            yield formula, first, last
+
+
+def _names(num: ir.Num | ir.Formula) -> set[str]:
+    """Columns that a number reads."""
+    return {leaf.name for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal)}
+
+
+def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
+    """Raise NotSmoothError where a number jumps at a place that depends on controls."""
+    for part in subexpressions(num):
+        match part:
+            case ir.Op(name) if name in STEPS and _names(part) & reached:
+                raise NotSmoothError(show_number(part))
+            case ir.Where(cond) if _names(cond) & reached:
+                raise NotSmoothError(show_number(part))
+            case ir.Extern(function=function):
+                if not isinstance(function, ir.Body):
+                    raise NotSmoothError(f"the function `{part.name}`")
+                for inner in (*(each for _, each in function.lets), *function.outputs):
+                    _require_smooth(inner, reached | _names(inner))
+
+
+def _holds(row: SymbolicColumn) -> bool:
+    """True for a constant that is not negative."""
+    return bool(row.entries.is_constant()) and float(row.entries) >= 0.0
+
+
+def _tall(column: SymbolicColumn, rows: int) -> SymbolicColumn:
+    """A constant repeated over time."""
+    return column if len(column) == rows else CASADI.cat([column] * rows)

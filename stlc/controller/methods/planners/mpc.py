@@ -1,0 +1,131 @@
+"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT; extra `stlc[mpc]`.
+
+For smooth systems: multiple shooting with the smooth robustness of Pant et al. (2017), after a few initial
+guesses. `simulate --method mpc` plans anew in every step: model predictive control (Sadraddini & Belta 2015).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.dynamics.model.step import build_step
+
+if TYPE_CHECKING:
+    from stlc.compile.backends.casadi.shooting import Shooting
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+PIECES = 5
+"""Constant pieces of a drawn guess."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mpc:
+    """One nonlinear program per start, solved from several initial guesses until one reaches the target.
+
+    Attributes:
+        guesses: the first is the given plan, the others are drawn: controls constant over five pieces.
+        iterations: of the interior-point method from each guess.
+        smoothing: scale of log-sum-exp for extrema within conditions.
+        sharpness: greatest slope of indicators, per unit.
+        margin: robustness that is aimed at above the target, for what is rounded.
+    """
+
+    guesses: int = 3
+    iterations: int = 100
+    smoothing: float = 20.0
+    sharpness: float = 20.0
+    margin: float = 0.01
+
+    def prepare(self, task: Task) -> Solver:
+        """Write the nonlinear program of the task.
+
+        Raises:
+            UsageError: U101, the system or the specification jumps; the finding shows the expression.
+            MissingError: R301, CasADi is not installed.
+        """
+        try:
+            import casadi
+        except ModuleNotFoundError:
+            finding = Diagnostic("R301", "planner `mpc` needs casadi", help=("pip install 'stlc[mpc]'",))
+            raise MissingError(finding) from None
+        shooting = self._shooting(task)
+        options = {
+            "print_time": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.max_iter": self.iterations,
+            "ipopt.tol": 1e-3,
+            "ipopt.constr_viol_tol": 1e-4,
+            "ipopt.acceptable_tol": 1e-2,
+            "ipopt.acceptable_iter": 3,
+            "ipopt.mu_strategy": "adaptive",
+        }
+        return partial(self._run, shooting=shooting, solve=casadi.nlpsol("plan", "ipopt", shooting.program, options))
+
+    def _shooting(self, task: Task) -> Shooting:
+        from stlc.compile.backends.casadi.shooting import Motion, NotSmoothError, ScaledFormula, Shooting
+        from stlc.compile.semantics.kinds.smooth import LogSumExp
+
+        system = task.system
+        free = build_step(replace(system.decl, clamps={}), soft=False)
+        bounds = zip(system.control_low.tolist(), system.control_high.tolist(), strict=True)
+        step = {**free.next, **{timer.name: timer.update for timer in system.timers}}
+        named = dict(zip(system.control_names, bounds, strict=True))
+        motion = Motion(free.lets, step, system.decl.clamps, named, system.horizon)
+        rules = [ScaledFormula(rule.under(LogSumExp()), rule.weight / rule.scale) for rule in task.rules]
+        try:
+            return Shooting(motion, rules, smoothing=self.smoothing, sharpness=self.sharpness)
+        except NotSmoothError as what:
+            raise usage(
+                f"planner `mpc` cannot plan through jumps: {what}",
+                "search, cem, cma and gradient plan for any system, milp for piecewise linear ones",
+            ) from None
+
+    def _run(self, search: PlanSearch, shooting: Shooting, solve: Callable[..., Any]) -> None:
+        for row in search.open().tolist():
+            for number in range(self.guesses):
+                if row not in search.open():
+                    break
+                rows = torch.tensor([row])
+                with search.charged(rows):
+                    self._improve(search, rows, self._guess(search, row, number), shooting, solve)
+            search.ended[row] = True
+
+    def _improve(
+        self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
+    ) -> None:
+        """Solve the program from a guess (T, m), and offer the plan."""
+        target = search.budget.target
+        maximise = math.isinf(target)
+        columns = search.task.system.rollout_columns(search.states[rows], guess[None])
+        known = {name: column[:, 0].numpy() for name, column in columns.items()}
+        found = solve(
+            x0=shooting.guess(guess.numpy(), known),
+            p=shooting.data(known, 0.0 if maximise else target + self.margin),
+            **shooting.limits(maximise=maximise),
+        )
+        plan = torch.from_numpy(shooting.controls(np.array(found["x"])[:, 0]).copy())
+        search.offer(rows, torch.nan_to_num(plan)[None])
+
+    def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
+        """The given plan, then drawn ones, (T, m) float64."""
+        if not number:
+            return search.start[row]
+        system = search.task.system
+        low, high = system.control_low.double(), system.control_high.double()
+        held = torch.rand(PIECES, len(low), generator=search.generator).double()
+        length = math.ceil(system.horizon / PIECES)
+        return (low + (high - low) * held).repeat_interleave(length, 0)[: system.horizon]
+
+
+PLANNER = Mpc
