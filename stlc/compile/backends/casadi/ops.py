@@ -1,14 +1,15 @@
-"""Array namespace over CasADi expressions (Andersson et al. 2019), for nonlinear programs; extra `stlc[mpc]`.
+"""Array namespace over CasADi expressions (Andersson et al. 2019), for nonlinear programs.
 
-A column is `(time, 1)`: a program is about one trajectory. Functions with kinks are rounded within `ROUNDING`,
+A column is `(time, 1)`: a program is about one trajectory. Kinks of functions are rounded within `ROUNDING`,
 so that Newton's method applies: `abs`, `min`, `max` and `clip`. Steps (`floor`, `sign`) stay exact: their
-derivative is 0.
+derivative is 0. Extra `stlc[mpc]`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+import operator
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import reduce
@@ -23,6 +24,8 @@ from stlc.compile.schedule.schedule import Pick
 
 ROUNDING = 1e-3
 """Width of a rounded kink, in the unit of the operand; the error is half of it."""
+GREAT = 1e3
+"""Robustness of a time test that depends on data."""
 TINY = 1e-12
 """Added under square roots, whose slope at 0 would be infinite."""
 
@@ -117,7 +120,7 @@ def _entries(operand: Operand) -> Any:
     return operand.entries if isinstance(operand, SymbolicColumn) else operand
 
 
-def _elementwise(function: Callable[..., Any]) -> Any:
+def _elementwise(function: Any) -> Any:
     """The method of a function of CasADi that works on each entry."""
 
     def method(_: CasadiOps, *operands: Operand) -> SymbolicColumn:
@@ -126,24 +129,25 @@ def _elementwise(function: Callable[..., Any]) -> Any:
     return method
 
 
+def _each(*functions: Any) -> list[Any]:
+    """The methods of some functions."""
+    return [_elementwise(function) for function in functions]
+
+
 @final
 class CasadiOps:
     """`stlc.compile.backends.array.namespace.Ops` over columns of expressions."""
 
     name = "casadi"
 
-    add, sub, mul, div = map(
-        _elementwise, (lambda a, b: a + b, lambda a, b: a - b, lambda a, b: a * b, lambda a, b: a / b)
-    )
-    exp, expm1, log, log1p = map(_elementwise, (casadi.exp, casadi.expm1, casadi.log, casadi.log1p))
-    sin, cos, tan = map(_elementwise, (casadi.sin, casadi.cos, casadi.tan))
-    asin, acos, atan, atan2 = map(_elementwise, (casadi.asin, casadi.acos, casadi.atan, casadi.atan2))
-    sign, floor, ceil = map(_elementwise, (casadi.sign, casadi.floor, casadi.ceil))
+    add, sub, mul, div = _each(operator.add, operator.sub, operator.mul, operator.truediv)
+    exp, expm1, log, log1p = _each(casadi.exp, casadi.expm1, casadi.log, casadi.log1p)
+    sin, cos, tan = _each(casadi.sin, casadi.cos, casadi.tan)
+    asin, acos, atan, atan2 = _each(casadi.asin, casadi.acos, casadi.atan, casadi.atan2)
+    sign, floor, ceil = _each(casadi.sign, casadi.floor, casadi.ceil)
+    gt, ge, pow, where = _each(operator.gt, operator.ge, operator.pow, casadi.if_else)
+    both, either = _each(casadi.logic_and, casadi.logic_or)
     round = _elementwise(lambda x: casadi.floor(x + 0.5))
-    gt, ge = map(_elementwise, (lambda a, b: a > b, lambda a, b: a >= b))
-    both, either = map(_elementwise, (casadi.logic_and, casadi.logic_or))
-    where = _elementwise(casadi.if_else)
-    pow = _elementwise(lambda a, b: a**b)
     mod = _elementwise(lambda a, b: a - b * casadi.floor(a / b))
     square = _elementwise(lambda x: x * x)
     sqrt = _elementwise(lambda x: casadi.sqrt(x + TINY))
@@ -186,9 +190,12 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask`, else -inf; of known masks, such as time tests."""
-        known = [math.inf if float(each) else -math.inf for each in np.array(casadi.DM(mask.entries)).ravel()]
-        return SymbolicColumn(casadi.SX(known))
+        """+inf where `mask`, else -inf; plus or minus `GREAT` where the mask depends on data."""
+        rows = []
+        for each in mask.rows():
+            size = math.inf if each.entries.is_constant() else GREAT
+            rows.append(SymbolicColumn(casadi.if_else(each.entries, size, -size)))
+        return self.cat(rows)
 
     def straight_through(self, rho: SymbolicColumn, strict: bool, slope: float) -> SymbolicColumn:  # noqa: ARG002
         """`(1 + tanh(slope rho)) / 2`: value and gradient are of one function."""
@@ -229,12 +236,15 @@ class CasadiOps:
         return parts[0] if isinstance(x, SymbolicColumn) else StackedColumns((parts[0],))
 
     def softmax2(self, a: SymbolicColumn, b: SymbolicColumn, k: float) -> SymbolicColumn:
-        """`log(exp(k a) + exp(k b)) / k` without overflow; neutral constants fall out."""
+        """`log(exp(k a) + exp(k b)) / k` without overflow; infinite constants fall out or decide."""
         neutral = -math.inf if k > 0.0 else math.inf
         rows = []
         for one, other in zip(a.rows(), b.rows(), strict=True):
-            if _is(one, neutral) or _is(other, neutral):
-                rows.append(other if _is(one, neutral) else one)
+            if _is(one, neutral) or _is(other, -neutral):
+                rows.append(other)
+                continue
+            if _is(other, neutral) or _is(one, -neutral):
+                rows.append(one)
                 continue
             top = (casadi.fmax if k > 0.0 else casadi.fmin)(one.entries, other.entries)
             gap = casadi.fabs(one.entries - other.entries)

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.namespace import Array, Ops
-from stlc.compile.backends.casadi.ops import CASADI, SymbolicColumn
+from stlc.compile.backends.casadi.ops import CASADI, GREAT, SymbolicColumn
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_number
-from stlc.compile.ir.traverse import leaves, numbers, subexpressions
+from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 
 STEPS = ("floor", "ceil", "round", "sign", "mod")
 """Functions that jump."""
-LEAST = 1e3
+LEAST = GREAT
 """Greatest robustness that is aimed at, and minus the value of a condition that never holds."""
 EFFORT = 1e-3
 """Cost of controls at the ends of their ranges, which makes a plan unique."""
@@ -143,10 +143,17 @@ class Shooting:
         self._lets = [(name, num) for name, num in motion.lets if name in needed]
         self.states = tuple(name for name in motion.step if name in reached & needed)
         moving = {*motion.bounds, *self.states, *(name for name, _ in motion.lets), ir.ELAPSED}
-        self.given = tuple(sorted(needed - moving))
+        initial = {name for each in demands for num in numbers(each.formula) for name in _initial(num)}
+        self.given = tuple(sorted((needed | initial) - moving))
         used = (*(num for _, num in self._lets), *(motion.step[name] for name in self.states))
         for num in (*used, *(num for each in demands for num in numbers(each.formula))):
             _require_smooth(num, reached)
+        for each in demands:
+            for node in nodes(each.formula):
+                if isinstance(node, ir.Freeze):
+                    raise NotSmoothError("`freeze`")
+                if isinstance(node, ir.Predicate) and node.guard and _names(node.num) & reached:
+                    raise NotSmoothError(f"the time test `{show_number(node.num)}`")
         self._write(demands)
 
     def _write(self, demands: Sequence[ScaledFormula]) -> None:
@@ -244,7 +251,9 @@ class Shooting:
         return values[: steps * count].reshape(count, steps).T
 
 
-def _conditions(formula: ir.Formula, first: int, last: int, end: int) -> Iterator[tuple[ir.Formula, int, int]]:
+def _conditions(
+    formula: ir.Formula, first: int, last: int, end: int
+) -> Iterator[tuple[ir.Formula, int, int]]:
     """Formulas with the samples, both included, at which `formula` at `first` to `last` demands them."""
     match formula:
         case ir.BoolOp("and", items):
@@ -260,8 +269,15 @@ def _conditions(formula: ir.Formula, first: int, last: int, end: int) -> Iterato
 
 
 def _names(num: ir.Num | ir.Formula) -> set[str]:
-    """Columns that a number reads."""
-    return {leaf.name for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal)}
+    """Columns that a number reads, but for what it reads of the initial state at any instant."""
+    read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal))
+    return {leaf.name for leaf in read if leaf != ir.at_first(ir.Signal(leaf.name))}
+
+
+def _initial(num: ir.Num) -> set[str]:
+    """Columns of which a number reads the initial value at any instant."""
+    read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
+    return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 
 
 def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:

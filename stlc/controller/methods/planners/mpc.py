@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 PIECES = 5
 """Constant pieces of a drawn guess."""
+ROUNDS = 2
+"""Programs of a guess: the second has a margin for what the verdict on the first plan lacked."""
+NEARLY = 0.1
+"""Greatest shortfall of a first solution that a greater margin may mend."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ class Mpc:
 
     guesses: int = 3
     iterations: int = 100
-    smoothing: float = 20.0
+    smoothing: float = 50.0
     sharpness: float = 20.0
     margin: float = 0.01
 
@@ -59,7 +63,7 @@ class Mpc:
             finding = Diagnostic("R301", "planner `mpc` needs casadi", help=("pip install 'stlc[mpc]'",))
             raise MissingError(finding) from None
         shooting = self._shooting(task)
-        options = {
+        options: dict[str, Any] = {
             "print_time": False,
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
@@ -70,7 +74,8 @@ class Mpc:
             "ipopt.acceptable_iter": 3,
             "ipopt.mu_strategy": "adaptive",
         }
-        return partial(self._run, shooting=shooting, solve=casadi.nlpsol("plan", "ipopt", shooting.program, options))
+        solver = casadi.nlpsol("plan", "ipopt", shooting.program, options)
+        return partial(self._run, shooting=shooting, solve=solver)
 
     def _shooting(self, task: Task) -> Shooting:
         from stlc.compile.backends.casadi.shooting import Motion, NotSmoothError, ScaledFormula, Shooting
@@ -104,18 +109,21 @@ class Mpc:
     def _improve(
         self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
     ) -> None:
-        """Solve the program from a guess (T, m), and offer the plan."""
+        """Solve the program from a guess (T, m), offer the plan; once more with what its verdict lacked."""
         target = search.budget.target
         maximise = math.isinf(target)
-        columns = search.task.system.rollout_columns(search.states[rows], guess[None])
-        known = {name: column[:, 0].numpy() for name, column in columns.items()}
-        found = solve(
-            x0=shooting.guess(guess.numpy(), known),
-            p=shooting.data(known, 0.0 if maximise else target + self.margin),
-            **shooting.limits(maximise=maximise),
-        )
-        plan = torch.from_numpy(shooting.controls(np.array(found["x"])[:, 0]).copy())
-        search.offer(rows, torch.nan_to_num(plan)[None])
+        limits = shooting.limits(maximise=maximise)
+        margin = 0.0 if maximise else target + self.margin
+        for _ in range(ROUNDS):
+            moved = search.task.system.rollout_columns(search.states[rows], guess[None])
+            known = {name: column[:, 0].numpy() for name, column in moved.items()}
+            found = solve(x0=shooting.guess(guess.numpy(), known), p=shooting.data(known, margin), **limits)
+            values = np.array(found["x"])[:, 0]
+            guess = torch.nan_to_num(torch.from_numpy(shooting.controls(values).copy()))
+            rho = float(search.offer(rows, guess[None])[0])
+            if maximise or rho >= target or values[-1] > NEARLY:
+                return
+            margin += self.margin + target - rho
 
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
         """The given plan, then drawn ones, (T, m) float64."""
