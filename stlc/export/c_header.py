@@ -1,7 +1,7 @@
-"""A controller as one C header: policy, model, monitor and the paper's backup policy; for C99 and C++11.
+"""Export of a controller as one C header, for C99 and C++11: policy, model, monitor, and the paper's guard.
 
-The passes are those of the native kernel, whose functions have short names such as `roll` and `check`. These
-could collide with names of the program that includes the header, so every name gets a prefix.
+The code is that of the native kernel, whose functions have short names such as `roll` and `check`. These
+could collide with names in the program that includes the header, so every name gets a prefix.
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ _CLOSING = """
 
 
 def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
-    """Return the texts of the header files, with every name prefixed, as valid C99 and C++11.
+    """Return the texts of the header files as valid C99 and C++11, with every declared name prefixed.
 
     Args:
-        texts: name of a file -> its text; names that one declares are prefixed in all.
-        guard: the include guard, a macro; it is named in an `#endif` in the last line of a text.
+        texts: file name -> text; a name declared in one file is prefixed in all files.
+        guard: name of the include guard, a macro; it also stands at the `#endif` in the last line of a text.
     """
     names = dict(found for text in texts.values() for found in _renamed(text))
     names |= {"restrict": "STLC_RESTRICT", guard: guard}
@@ -104,7 +104,7 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
 
 
 def _renamed(text: str) -> Iterator[tuple[str, str]]:
-    """The names that a text declares, with their new names."""
+    """Yield the names that a text declares, with their new names."""
     for pattern in _DECLARED:
         yield from ((name, PREFIX + name) for name in pattern.findall(text) if not name.startswith(OWN))
     for name in _DEFINED.findall(text):
@@ -130,7 +130,10 @@ def _framed(text: str, guard: str) -> str:
 
 
 def weights(network: PlanNetwork) -> str:
-    """Return a network as C: `centre` and `spread` of inputs, `weight_i` (in, out) and `bias_i` of layers."""
+    """Return the weights of a network as C arrays.
+
+    These are `centre` and `spread` of the inputs, and `weight_i` (in, out) and `bias_i` of each layer.
+    """
     lines = ["/* float32, row by row; generated */"]
     lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
     lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
@@ -144,7 +147,7 @@ def weights(network: PlanNetwork) -> str:
 
 
 def forward(network: PlanNetwork) -> list[str]:
-    """Statements that compute `raw` (float) from `seen` (double), through the buffers `h0`, `h1`."""
+    """C statements of the network: from observation `seen` (double) to `raw` (float), via `h0` and `h1`."""
     layers = list(_layers(network))
     lines = [
         f"for (int i = 0; i < {layers[0].in_features}; ++i) h0[i] = ((float)seen[i] - centre[i]) / spread[i];"
@@ -160,7 +163,7 @@ def forward(network: PlanNetwork) -> list[str]:
 
 
 def widest(network: PlanNetwork) -> int:
-    """Greatest number of inputs of a layer."""
+    """Greatest number of inputs among the network's layers."""
     return max(layer.in_features for layer in _layers(network))
 
 
@@ -173,7 +176,7 @@ def _row(values: Tensor) -> str:
 
 
 def _float(value: float) -> str:
-    """A float32 as C text that is read back bit for bit."""
+    """A float32 as C text that reads back bit for bit."""
     text = f"{value:.9g}"
     return f"{text}f" if any(mark in text for mark in ".en") else f"{text}.0f"
 
@@ -182,7 +185,7 @@ def _float(value: float) -> str:
 
 
 def squashed(task: Task) -> list[str]:
-    """Statements that fill `u` from the network's output for one step, `raw`."""
+    """C statements that compute the control `u` of one step from the network's output `raw` for it."""
     lines, at = [], 0
     for i, each in enumerate(task.system.decl.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
@@ -199,7 +202,7 @@ def squashed(task: Task) -> list[str]:
 
 
 def command(task: Task) -> list[str]:
-    """Statements that fill `command` from the state `x` and the first action `u` of a plan."""
+    """C statements for the actuator command `command`, from the state `x` and a plan's first control `u`."""
     names, given = task.system.control_names, commands(task.system.decl)
     places = {name: f"x[{i}]" for i, name in enumerate(task.system.names)}
     places |= {name: f"u[{i}]" for i, name in enumerate(names)}
@@ -221,10 +224,10 @@ def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
 
 
 def cost(task: Task) -> list[str]:
-    """Statements that add the cost of a plan to `cost`, of lane `j` with robustness `rho`.
+    """C statements that add the cost of a plan to `cost`, given its states and its robustness `rho`.
 
     Raises:
-        Untranslatable: a goal has no margin at one sample.
+        Untranslatable: the margin of a goal is not defined at a single sample.
     """
     at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.system.names)}
     at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.system.names)}
@@ -261,10 +264,10 @@ def _term(term: CostTerm, at: Mapping[str, str]) -> list[str]:
 
 
 def header(task: Task, network: PlanNetwork) -> str:
-    """The text of `stlc_controller.h`, which includes `stlc_weights.h`.
+    """Return the text of `stlc_controller.h`, which includes `stlc_weights.h`.
 
     Raises:
-        Untranslatable: a part of the task has no C form.
+        Untranslatable: a part of the task cannot be expressed in C.
     """
     motion = motion_of(task.system)
     judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
@@ -278,12 +281,12 @@ def header(task: Task, network: PlanNetwork) -> str:
 
 
 def main_of(task: Task) -> str:
-    """An example program: states from standard input, decisions to standard output."""
+    """Return the C source of an example program: it reads states and writes decisions."""
     return _template("main.c.txt").substitute({"SYSTEM": c_comment(task.system.decl.name)})
 
 
 def makefile() -> str:
-    """Makefile of the example."""
+    """Return the Makefile of the example."""
     return _template("Makefile.txt").substitute()
 
 
@@ -296,7 +299,7 @@ class _Template(Template):
 
 
 def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
-    """Sizes, constants and straight-line code."""
+    """Sizes, constants and generated code for the placeholders of the header's template."""
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
@@ -351,7 +354,7 @@ def _in_its_unit(text: str, column: Column) -> str:
 
 
 def _added(task: Task) -> dict[str, object]:
-    """The states that the specification adds: contents, initial values and updates."""
+    """C text for the states that the specification adds: their meaning, initial values and updates."""
     system, first = task.system, len(task.system.decl.signature.names)
     measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]
     tables = [
@@ -376,7 +379,7 @@ def _added(task: Task) -> dict[str, object]:
 
 
 def _description(timer: Timer) -> str:
-    """Description of a state that the specification adds."""
+    """Description, for the header, of a state that the specification adds."""
     match timer.kind:
         case "status":
             about = timer.about.removeprefix("open | true | false").strip()
@@ -398,7 +401,7 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
-    """Statements that lower `least` to the weighted robustness of some requirements."""
+    """C statements that lower `least` to the weighted robustness of each of the requirements `rules`."""
     names = [rule.name for rule in among]
     return [
         f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"
@@ -407,6 +410,9 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 
 
 def _falling(motion: Motion, plan: Plan) -> list[str]:
-    """C function `fall`: robustness of phi_safe on a prefix, beyond whose end column STATES is positive."""
+    """C function `fall`: robustness of the safety requirements on a prefix of a trajectory.
+
+    The column with index STATES is positive beyond the end of the prefix.
+    """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

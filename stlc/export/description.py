@@ -1,4 +1,4 @@
-"""Parts of a controller as numbers of the IR, which the C header and the ONNX graphs print."""
+"""Parts of a controller as expressions of the IR, from which the C header and the ONNX graphs are made."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ REDUCED, MARGIN = ir.Signal("#reduced"), ir.Signal("#margin")
 
 
 def observation(task: Task) -> list[ir.Num]:
-    """Return the observation of the network, as numbers of the states."""
+    """Return the observation of the network, as expressions of the states."""
     system = task.system
     observed = system.decl.policy.observe or [ir.Signal(name) for name in system.decl.signature.names]
     return [*observed, *(ir.Signal(column.name) for column in system.added)]
 
 
 def state_images(task: Task) -> dict[str, ir.Num]:
-    """Return the mirror images of states, by name; states without an image are absent."""
+    """Return the mirror image of each state by name, as an expression; states without an image are absent."""
     names = set(task.system.names)
     return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
 
 
 def control_images(task: Task) -> dict[str, ir.Num]:
-    """Return the mirror image of every control, by name; angles stay within a turn of their range."""
+    """Return the mirror image of every control, by name; angles are wrapped into their range."""
     images = {each.name: each.value for each in task.system.decl.policy.mirror}
     found: dict[str, ir.Num] = {}
     for each in task.system.decl.controls:
@@ -47,16 +47,16 @@ def control_images(task: Task) -> dict[str, ir.Num]:
 
 @dataclass(frozen=True, slots=True)
 class CostTerm:
-    """Summand of a plan's cost: a number, reduced over samples.
+    """Summand of a plan's cost: an expression, averaged or maximized over samples.
 
     Attributes:
-        number: at each sample, of the states, of the controls where there are `horizon` samples, of states at
-            the first sample (`START`), `k`, `t`, `sat`, `rho` and `MARGIN`.
+        number: expression at each sample, of the states, of the controls if there are `horizon` samples, of
+            the states at the first sample (`START`), and of `k`, `t`, `sat`, `rho` and `MARGIN`.
         samples: number of samples, from the first on.
-        greatest: whether the greatest number is `REDUCED`; otherwise their mean.
+        greatest: True if `REDUCED` is the maximum over the samples, False if it is the mean.
         goal: formula whose robustness at each sample is `MARGIN`.
-        value: the summand, of `REDUCED`.
-        condition: of states at the first sample; where it is false the summand is 0.
+        value: the summand, an expression of `REDUCED`.
+        condition: condition on the states at the first sample; if it is false, the summand is 0.
     """
 
     number: ir.Num
@@ -68,7 +68,7 @@ class CostTerm:
 
 
 def cost_terms(task: Task) -> Iterator[CostTerm]:
-    """Yield the terms of `Task.cost`."""
+    """Yield the summands of `Task.cost`."""
     states, controlled = task.system.objective
     compiled, samples, goals = task.compiled, task.horizon + 1, task.pending_goals
     gamma = ir.Const(task.system.decl.objective.gamma)

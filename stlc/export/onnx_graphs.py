@@ -1,6 +1,7 @@
-"""The graphs of a controller as ONNX: rollout, policy, verdicts, and the length of safe prefixes.
+"""ONNX graphs of a controller: rollout, policy, verdicts on plans, and length of safe prefixes.
 
-The paper's backup policy and the previous plans are handled between the graphs, in `stlc.runtime`.
+`stlc.runtime` runs the graphs; it also contains the search of the paper's guard and stores the previous
+plans.
 """
 
 from __future__ import annotations
@@ -52,14 +53,14 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
     Args:
         step: one step of the system.
-        start: states, (1, batch) each.
-        controls: (steps, batch) each.
+        start: state name -> initial value, (1, batch).
+        controls: control name -> values, (steps, batch).
 
     Returns:
-        The states, (steps + 1, batch) each.
+        State name -> values, (steps + 1, batch).
 
     Raises:
-        Untranslatable: the step calls a function of Python.
+        Untranslatable: the step calls a Python function.
     """
     require_numbers([*(num for _, num in step.lets), *step.next.values()])
     steps = len(next(iter(controls.values())))
@@ -71,7 +72,10 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
 
 class _Rollout:
-    """Values of a rollout: states that change, and numbers, (steps, batch) or, if constant, (1, batch)."""
+    """Values computed by now in a rollout: states and intermediate variables, (steps, batch).
+
+    A value that is constant in time is (1, batch).
+    """
 
     def __init__(
         self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
@@ -83,7 +87,7 @@ class _Rollout:
         self.now |= controls
 
     def run(self, stage: RolloutStage) -> None:
-        """Execute a stage whose inputs are known."""
+        """Compute a stage: states and variables that depend only on earlier stages and on one another."""
         if stage.early:
             self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
         for state, source in stage.follows.items():
@@ -105,7 +109,7 @@ class _Rollout:
         return value.expand(self.steps, value.shape[1])
 
     def _loop(self, stage: RolloutStage) -> None:
-        """Execute a stage with feedback, step by step."""
+        """Compute the states of a stage that depend on one another, step by step."""
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         outside = sorted(read - inside)
@@ -138,10 +142,10 @@ class _Rollout:
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
-    """Evaluate numbers on columns: name -> value, of a shape that broadcasts with the columns.
+    """Evaluate expressions on signals: name -> value, of a shape that broadcasts with the signals.
 
     Raises:
-        Untranslatable: one calls a function of Python.
+        Untranslatable: an expression calls a Python function.
     """
     require_numbers(list(numbers.values()))
     return ArrayProgram(dict(numbers))(columns, ONNX) if numbers else {}
@@ -151,18 +155,18 @@ def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Col
 
 
 def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:
-    """All plans of a network.
+    """Return all plans that a network proposes.
 
     Args:
-        task: for which it was trained.
-        network: in float32, as it was trained.
-        state: (1, batch) each.
+        task: the task that the network was trained for.
+        network: the network, in float32 as in training.
+        state: state name -> value, (1, batch).
 
     Returns:
         (batch, plans, T, m) float64.
 
     Raises:
-        Untranslatable: an observation or a mirror image calls a function of Python.
+        Untranslatable: an observation or a mirror image calls a Python function.
     """
     folded, swapped = _folded(task, network, state)
     raw = _layers(network, _observed(task, folded))
@@ -190,7 +194,7 @@ def _folded(
 
 
 def _observed(task: Task, state: Mapping[str, Value]) -> Value:
-    """Observation of the network, (batch, k) float32."""
+    """Observations of the network, (batch, k) float32."""
     numbers = observation(task)
     seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
     like = next(iter(state.values()))
@@ -215,7 +219,7 @@ def _weights(like: Value, tensor: Tensor) -> Value:
 
 
 def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
-    """One control in physical units, from one or two columns of the network's output."""
+    """Values of one control in physical units, from one or two columns of the network's output."""
     first = next(columns)
     match control.squash:
         case "tanh":
@@ -239,11 +243,11 @@ class Verdicts:
     """Verdicts on a batch of plans.
 
     Attributes:
-        rho: (1, batch), -inf where a plan or a value computed from it is not a number.
-        safe: robustness of phi_safe, likewise.
+        rho: robustness, (1, batch); -inf if the plan or a value computed from it is not a number.
+        safe: robustness of the safety requirements alone, likewise.
         each: robustness of every requirement, in order, likewise.
-        cost: (1, batch).
-        states: (T + 1, batch) each.
+        cost: cost of the plans, (1, batch).
+        states: state name -> values under the plans, (T + 1, batch).
     """
 
     rho: Value
@@ -254,12 +258,12 @@ class Verdicts:
 
 
 def columns_of(state: Value, names: Sequence[str]) -> dict[str, Value]:
-    """Split (batch, n) into columns (1, batch)."""
+    """Split states (batch, n) into one value (1, batch) per name."""
     return dict(zip(names, state.T.rows(), strict=True))
 
 
 def inputs_of(plans: Value, task: Task) -> dict[str, Value]:
-    """Split (batch, T, m) into columns (T, batch)."""
+    """Split plans (batch, T, m) into one value (T, batch) per control."""
     rows = plans.transposed(2, 1, 0).rows()
     return {
         name: row.reshaped(task.horizon, BATCH)
@@ -268,7 +272,7 @@ def inputs_of(plans: Value, task: Task) -> dict[str, Value]:
 
 
 def judged(task: Task, start: States, plans: Value) -> Verdicts:
-    """`Task.judge` and `Task.cost` of plans (batch, T, m) from states (1, batch) each.
+    """Evaluate plans (batch, T, m) from states (1, batch) as `Task.judge` and `Task.cost` do.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -287,7 +291,7 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
 
 
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
-    """The weighted minimum, (1, batch); +inf without rules."""
+    """Weighted minimum of the robustness of `rules`, (1, batch); +inf without requirements."""
     if not rules:
         return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
     weighed = [
@@ -299,7 +303,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
 
 
 def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
-    """True if a plan holds a number that is not finite, or a value computed from it is NaN, (1, batch)."""
+    """True if a plan contains a number that is not finite or leads to NaN, (1, batch)."""
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
@@ -310,14 +314,14 @@ def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) 
 
 
 def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
-    """A reduction that keeps its axes."""
+    """Reduce `x` over `axes`, which are kept with length 1."""
     shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
     (out,) = x.sheet.emit(op, (x, x.sheet.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
     return out
 
 
 def rank(found: Verdicts) -> Value:
-    """`stlc.controller.problem.task.rank`, (1, batch)."""
+    """Rank of plans, as by `stlc.controller.problem.task.rank`, (1, batch)."""
     rho, cost = found.rho, found.cost
     unknown = cost.apply("IsNaN", kind="bool")
     paid = ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None)
@@ -334,7 +338,7 @@ def rank(found: Verdicts) -> Value:
 
 
 def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
-    """The performance terms as if every plan were satisfying, (1, batch)."""
+    """Cost of the performance terms, (1, batch), computed as if every plan satisfied the specification."""
     moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
     once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
     once |= {name + START: column[:1] for name, column in states.items()}
@@ -358,7 +362,10 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
 
 
 def deepened(task: Task, states: States) -> Value:
-    """`PendingGoals.deepened` of a task with at least one goal, (1, batch) booleans."""
+    """True if a plan increases the margin of a pending goal, as by `PendingGoals.deepened`, (1, batch).
+
+    The task must have at least one goal.
+    """
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
     for margin in written([each.body for each in task.pending_goals.items], soon, count=2):
@@ -372,9 +379,10 @@ def deepened(task: Task, states: States) -> Value:
 
 
 def falls(task: Task, start: States, plans: Value) -> Value:
-    """`stlc.controller.guard.safe_prefix.prefix_robustness`, (T + 1, batch).
+    """Robustness of the safety requirements on every prefix of each plan: (T + 1, batch).
 
-    Every prefix is a separate trajectory: columns are (T + 1, prefixes * batch).
+    It equals `stlc.controller.guard.safe_prefix.prefix_robustness`. Every prefix is treated as a separate
+    trajectory: values are (T + 1, prefixes * batch).
     """
     rows = task.horizon + 1
     states = rolled(task.system.exact_step, start, inputs_of(plans, task))
@@ -402,8 +410,8 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
 
-    `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), `requirements` (batch, R); where the
-    specification adds states, `added` (batch, k), their values one step later.
+    Outputs are `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), and `requirements` (batch, R); if the
+    specification adds states, also `added` (batch, k), their values one step later.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -417,9 +425,9 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """Graph from `state` and `begun`, the rest of the previous plan, to the plan that `Guard` chooses.
 
-    The outputs are those of `deciding`, for `begun` where `kept` (batch,) says that it is continued: it
-    satisfies the specification, and either the policy's plan ranks no higher, or `begun` increases the
-    margin of a goal that is being met. `policy_plan` and `policy_rho` are those of the policy.
+    The outputs are those of `deciding`, for the chosen plan. `kept` (batch,) tells that this is `begun`: it
+    satisfies the specification, and either the policy's plan ranks no higher, or `begun` increases the margin
+    of a goal that is being met. `policy_plan` and `policy_rho` belong to the policy's own plan.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -442,7 +450,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
-    """`rank`, `plan` and verdicts of several plans (batch, count, T, m) of every agent: (batch, count, …)."""
+    """Rank, plan and verdicts of several plans (batch, count, T, m) per agent, by name: (batch, count, …)."""
     names = task.system.names
     count, steps, controls = plans.shape[1:]
     each = state.T.reshaped(len(names), BATCH, 1).expand(len(names), BATCH, count, like=state.T)
@@ -457,13 +465,13 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
 
 
 def _best(score: Value) -> Value:
-    """Index of the plan of highest rank, (batch, 1)."""
+    """Index of the plan with the highest rank for each agent, (batch, 1)."""
     (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
     return best
 
 
 def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
-    """The row `index` (batch, 1) of each agent's table: (batch, count, …) -> (batch, …)."""
+    """Select plan number `index` (batch, 1) of each agent: (batch, count, …) -> (batch, …)."""
     outputs = {}
     for name, values in table.items():
         shape = (BATCH, *values.shape[2:])
@@ -478,7 +486,7 @@ def _shown(picked: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _one(values: Value, place: int) -> Value:
-    """Row `place` of every agent: (batch, count, …) -> (batch, …)."""
+    """Select plan number `place` of every agent: (batch, count, …) -> (batch, …)."""
     shape = (BATCH, *values.shape[2:])
     index = values.sheet.constant(place, "int64")
     (out,) = values.sheet.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
@@ -486,7 +494,7 @@ def _one(values: Value, place: int) -> Value:
 
 
 def _added(task: Task, state: Value) -> dict[str, Value]:
-    """Parameters and timers one step later."""
+    """Output `added`: states that the specification adds (parameters and timers) one step later; or empty."""
     if not task.system.added:
         return {}
     now = columns_of(state, task.system.names)
@@ -497,9 +505,9 @@ def _added(task: Task, state: Value) -> dict[str, Value]:
 
 
 def judging(task: Task) -> dict[str, Value]:
-    """Graph from `state` (batch, n) and `plan` (batch, T, m) to verdicts, and the states under the plan.
+    """Graph from `state` (batch, n) and `plan` (batch, T, m) to verdicts, and to the states under the plan.
 
-    `rho`, `safe` and `cost` (batch,), `requirements` (batch, R), `states` (batch, T + 1, n).
+    Outputs are `rho`, `safe` and `cost` (batch,), `requirements` (batch, R), and `states` (batch, T + 1, n).
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -518,7 +526,7 @@ def judging(task: Task) -> dict[str, Value]:
 
 
 def falling(task: Task) -> dict[str, Value]:
-    """Graph from `state` and `plan` to `falls` (batch, T + 1): phi_safe's robustness on every prefix.
+    """Graph from `state` and `plan` to `falls` (batch, T + 1), the safety robustness on every prefix.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.

@@ -1,4 +1,4 @@
-"""ONNX files of a controller, and `controller.json` with its description."""
+"""ONNX files of a controller, and `controller.json`, which describes it."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ def require_onnx() -> None:
 
 
 def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) -> bytes:
-    """The ONNX file of a graph; its inputs are those of its values.
+    """Return the content of an ONNX file with the graph that computes `outputs`.
 
     Args:
-        name: of the graph.
+        name: name of the graph.
         outputs: name -> value, in order.
-        facts: key -> text, the metadata of the file.
+        facts: metadata of the file, key -> text.
     """
     from onnx import checker, helper
 
@@ -76,7 +76,7 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 
 
 def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
-    """Graph of the nodes on which the outputs depend; outputs have their public names."""
+    """Graph of the nodes on which `outputs` depend; the outputs get their public names."""
     from onnx import helper, numpy_helper
 
     shown = list(outputs)
@@ -122,14 +122,16 @@ TIMED = 200
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Milliseconds per decision of one agent on one thread: from a state alone, and with a previous plan."""
+    """Decision time of one agent on one thread in milliseconds: median and 99th percentile."""
 
     median: float
     p99: float
 
 
 def write_onnx(run: Run, folder: Path) -> None:
-    """Write `decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and with phi_safe `fall.onnx`.
+    """Write `decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and maybe `fall.onnx`.
+
+    `fall.onnx` is written if the specification has safety requirements.
 
     Raises:
         UsageError: U101, a part of the task has no ONNX form.
@@ -158,7 +160,7 @@ def write_onnx(run: Run, folder: Path) -> None:
 
 
 def _facts(run: Run) -> dict[str, object]:
-    """Names, units, ranges, hashes, and the grid of the backup policy."""
+    """Content of `controller.json`: names, units, ranges, hashes, and the grid of the backup policy."""
     task, grid = run.task, backup.grid_of(run.task)
     feedback = task.system.decl.feedback
     return {
@@ -197,7 +199,7 @@ def _states(task: Task) -> list[ControllerQuantity]:
 
 
 def timed(task: Task, folder: Path) -> Latency:
-    """Decision times of the runtime in random states, after a warm-up."""
+    """Measure decision times of the runtime in random states, after a warm-up."""
     controller = Controller.load(folder)
     times = []
     for state in task.sample(TIMED, seed=8, dtype=torch.float64).numpy():

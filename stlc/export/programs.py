@@ -1,8 +1,8 @@
-"""A controller and the paper's backup policy as modules that can be exported for any number of agents.
+"""Torch modules of a controller and of the paper's guard, for export with any number of agents.
 
-`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. An exported
-program has no such branches: it tries every T0, costs what its longest prefixes cost, and gives the same
-plans.
+`stlc.controller.guard.shooting` tries a longer prefix length T0 only if no plan was found with a shorter one.
+An exported program has no such branches: it tries every T0, costs as much as the longest prefixes do, and
+gives the same plans.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 
 
 class Deciding(nn.Module):
-    """Module from states (B, n) to plan (B, T, m), rho and safe (B,), requirements (B, R); all float64."""
+    """Module from states (B, n) to plan (B, T, m), rho and safe (B,), requirements (B, R); all float64.
+
+    `rho` is the robustness of the plan, `safe` that of the safety requirements alone.
+    """
 
     def __init__(self, task: Task, network: PlanNetwork) -> None:
         super().__init__()
@@ -38,7 +41,7 @@ class Deciding(nn.Module):
         self._task = task
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The policy's plan and its verdict, as `BestOfKPolicy.plan_judged` gives them."""
+        """Return the policy's plan and its verdict, as `BestOfKPolicy.plan_judged`."""
         plans = self.network(x).to(x.dtype)
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
@@ -52,7 +55,7 @@ class Deciding(nn.Module):
 
 
 def judged_by_torch(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
-    """`Task.judge` in torch operations only, which can be exported."""
+    """Evaluate plans as `Task.judge`, with torch operations only, so that it can be exported."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
     names = [rule.name for rule in task.rules]
@@ -73,7 +76,7 @@ def without_deprecations() -> Iterator[None]:
 
 
 def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """The controller as an exported program for any number of agents; states are float64."""
+    """Return the controller as an exported torch program for any number of agents; states are float64."""
     return _exported(Deciding(task, network), task.sample(3, seed=0, dtype=torch.float64))
 
 
@@ -97,7 +100,10 @@ _NOTHING: tuple[Tensor, ...] = ()
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans of one prefix length T0 and verdicts, (states, choices, …) each; `falls` only for the last T0."""
+    """Plans with one prefix length T0, and their verdicts, (states, choices, …) each.
+
+    `falls`, the safety robustness on every prefix, is computed for the last T0 only.
+    """
 
     plans: Tensor
     rho: Tensor
@@ -108,11 +114,11 @@ class _Tried:
 
 
 class Guarding(nn.Module):
-    """Module that maps states (B, n) and the policy's plans (B, T, m) to the backup policy's plans; float64.
+    """Module from states (B, n) and the policy's plans (B, T, m) to the plans of the paper's guard; float64.
 
-    The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1: the plan
-    satisfies phi or phi_safe, 2: it has the longest safe prefix) and t0 (B,), the length of its prefix, as
-    `stlc.controller.guard.candidates.Candidates`.
+    The outputs are plan (B, T, m), rho and safe (B,), and requirements (B, R); as int64, source (1: the plan
+    satisfies the specification or the safety requirements, 2: it has the longest safe prefix) and t0 (B,),
+    the length of its prefix, as in `stlc.controller.guard.candidates.Candidates`.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
@@ -124,7 +130,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose a plan as the stages of the paper's guard do in the absence of a previous plan."""
+        """Choose a plan as the paper's guard does without a previous plan."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
@@ -147,7 +153,7 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans of one T0 with verdicts; the first begins as the policy's own plan does."""
+        """All plans with one prefix length, and verdicts; the first plan begins as the policy's own plan."""
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
         pieces = [self._finished(x, some, falls=falls) for some in torch.split(heads, size, 1)]
@@ -156,7 +162,7 @@ class Guarding(nn.Module):
         return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
-        """Plans that begin with `heads` (B, C, L, m) and continue with the policy; their verdicts."""
+        """Plans that begin with controls `heads` (B, C, L, m) and continue by the policy; their verdicts."""
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         head = heads.reshape(-1, *heads.shape[2:])
@@ -180,13 +186,13 @@ def _safest(tried: _Tried, falls: Tensor) -> Tensor:
 
 
 def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
-    """The picked entry of every row: (rows, choices, …) each, (rows,) -> (rows, …) each."""
+    """Select entry `pick` (rows,) of every row: (rows, choices, …) -> (rows, …)."""
     rows = torch.arange(len(pick))
     return [value[rows, pick] for value in values]
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Results of shorter prefixes where they are decided, elsewhere the results `here`."""
+    """Results of shorter prefixes for states that these have decided; results `here` for other states."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)
@@ -194,7 +200,7 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
 
 
 def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """The backup policy as an exported program for any number of states; they and the plans are float64."""
+    """Return the paper's guard as an exported torch program for any number of states; all float64."""
     x = task.sample(2, seed=0, dtype=torch.float64)
     plan = torch.zeros(2, task.horizon, len(task.system.decl.controls), dtype=torch.float64)
     return _exported(Guarding(task, network), x, plan)

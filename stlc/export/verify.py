@@ -1,4 +1,4 @@
-"""Verification of an export against its run, on random states."""
+"""Comparison of an exported controller with the run that it was exported from, in random states."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Agreement:
 
     Attributes:
         states: number of random states.
-        plan: largest distance of a control, as a share of its range, where the same plan was chosen.
-        rho: largest distance of a robustness from the exact monitor's.
-        ties: states in which another plan of the same rank was chosen.
+        plan: greatest difference of a control, as a share of its range, where the same plan was chosen.
+        rho: greatest difference of a robustness from that of the exact monitor.
+        ties: number of states in which another plan of the same rank was chosen.
     """
 
     states: int
@@ -50,7 +50,7 @@ class Agreement:
     ties: int
 
     def worst(self, other: Agreement, *distances: float) -> Agreement:
-        """Return the worst of two agreements, and of further distances of a robustness."""
+        """Return the worse values of two agreements; `distances` are further differences of robustness."""
         rho = max(self.rho, other.rho, *distances)
         return Agreement(self.states, max(self.plan, other.plan), rho, self.ties + other.ties)
 
@@ -59,13 +59,13 @@ def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int
     """Compare an export with its policy in random states.
 
     Args:
-        policy: the original.
-        decide: function of the export, of states (B, n) float64.
+        policy: the policy that was exported.
+        decide: decisions of the export, a function of states (B, n) float64.
         states: number of random states.
-        seed: of the states.
+        seed: seed of the random states.
 
     Raises:
-        RunError: R105, they disagree.
+        RunError: R105, policy and export disagree.
     """
     x = policy.task.sample(states, seed=seed, dtype=torch.float64)
     with torch.no_grad():
@@ -73,7 +73,11 @@ def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int
 
 
 def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer) -> Agreement:
-    """Agreement of the export's `answer` with the `plan` (B, T, m) of the policy in states (B, n)."""
+    """Compare the export's `answer` with the policy's `plan` (B, T, m) in states (B, n).
+
+    Raises:
+        RunError: R105, they disagree.
+    """
     exported, rho, safe, each = answer
     judged = task.judge(x, plan)
     width = (task.system.control_high - task.system.control_low).double()
@@ -101,12 +105,12 @@ def _disagreement(how: str) -> Diagnostic:
 
 
 def _distance(a: Tensor, b: Tensor) -> float:
-    """Largest distance of two tensors; the distance of equal infinities is 0."""
+    """Greatest absolute difference of two tensors; the difference of equal infinities is 0."""
     return float(torch.where(a == b, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
 
 
 def by_torch(path: Path) -> Callable[[Tensor], Answer]:
-    """Return the decisions of a torch program."""
+    """Load an exported torch program; returns its decisions as a function of states."""
     with without_deprecations():
         module = torch.export.load(path).module()
 
@@ -118,7 +122,7 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
 
 
 def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11) -> Agreement:
-    """Compare the backup policy and the program in a file in random states, whether they need it or not.
+    """Compare the guard with its exported program at `path` in random states, even where no guard is needed.
 
     Raises:
         RunError: R105, they disagree.
@@ -137,7 +141,7 @@ def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11)
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
-    """Return the decisions of graphs, as the runtime evaluates them."""
+    """Decisions of ONNX graphs, evaluated by the runtime, as a function of states."""
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
@@ -147,7 +151,7 @@ def _answer(judged: JudgedPlans) -> Answer:
 
 
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Compare the graphs with the policy one step later, given the previous plans.
+    """Compare the graphs with the policy one step later, when there are previous plans.
 
     Raises:
         RunError: R105, they disagree.
@@ -162,10 +166,10 @@ def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed
 
 
 def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:
-    """Return the largest distance of verdicts on random plans: robustness, cost, states, prefixes.
+    """Return the greatest difference of verdicts on random plans: robustness, cost, states, prefixes.
 
     Raises:
-        RunError: R105, they disagree.
+        RunError: R105, the difference is too large.
     """
     x = task.sample(states, seed=seed, dtype=torch.float64)
     low, high = task.system.control_low.double(), task.system.control_high.double()
@@ -192,7 +196,7 @@ def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> 
 
 
 class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
-    """An export could not be verified; `why` follows "not checked: "."""
+    """The export could not be verified; `why` completes the message "not checked: "."""
 
     def __init__(self, why: str) -> None:
         super().__init__(why)
@@ -200,11 +204,11 @@ class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
 
 
 def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
-    """Return the decisions of the example program of a folder, compiled to `built`.
+    """Compile the example program of `folder` to `built`; returns its decisions as a function of states.
 
     Raises:
         Unchecked: there is no working compiler.
-        RunError: R105, it cannot be compiled.
+        RunError: R105, the program cannot be compiled.
     """
     using = toolchain.compiler()
     if using is None:
@@ -231,10 +235,10 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Output of the example program for states: source, t0, rho, safe, requirements, plan.
+    """Run the example program; per state it gives source, t0, rho, safe, requirements, plan.
 
     Raises:
-        RunError: R105, it fails or does not end.
+        RunError: R105, the program fails or does not end.
     """
     asked = "\n".join(" ".join(map(repr, state)) for state in states)
     try:

@@ -1,4 +1,4 @@
-"""Export of a run to a self-contained folder, verified against the run."""
+"""Export of a run to a self-contained folder; the export is verified against the run."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class Exported:
     """Result of an export.
 
     Attributes:
-        folder: of the files.
-        files: their names.
-        agreement: with the run; None where there is no compiler to verify it with.
-        latency: of a decision in the Python runtime, where it was measured.
+        folder: folder of the written files.
+        files: names of the files.
+        agreement: comparison with the run; None if there is no compiler for it.
+        latency: decision time of the Python runtime, if it was measured.
         unchecked: reason why there is no agreement.
     """
 
@@ -61,7 +61,7 @@ class Exported:
 
 
 def target_of(word: str) -> Target:
-    """The target of name `word`. Raises UsageError (U101) for an unknown name."""
+    """Return the export target called `word`. Raises UsageError (U101) for an unknown name."""
     for target in TARGETS:
         if target == word:
             return target
@@ -74,14 +74,14 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
     """Export the controller of a run, and verify it.
 
     Args:
-        run: with a checkpoint.
+        run: a run with a checkpoint.
         target: the form of the export.
-        folder: destination; files of the same names are replaced.
+        folder: destination; existing files of the same names are replaced.
 
     Raises:
         RunError: R105, the export disagrees with the run; nothing is written.
         MissingError: R301, the target needs packages that are not installed.
-        UsageError: U101, the task has no form for the target.
+        UsageError: U101, the task cannot be expressed in the form of the target.
     """
     with tempfile.TemporaryDirectory() as name:
         beside = Path(name)
@@ -101,7 +101,7 @@ Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
 def _torch(run: Run, folder: Path) -> Checked:
-    """Write `decide.pt2`, `backup.pt2`, and `controller.json` with their inputs and outputs."""
+    """Write `decide.pt2`, `backup.pt2`, and `controller.json`, which describes their inputs and outputs."""
     path, backup = folder / "decide.pt2", folder / "backup.pt2"
     torch.export.save(recorded(run.task, run.network), path)
     torch.export.save(recorded_guard(run.task, run.network), backup)
@@ -144,7 +144,7 @@ _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c
 
 
 def _facts(run: Run) -> dict[str, object]:
-    """Names and sizes of inputs and outputs."""
+    """Content of `controller.json`: names and sizes of inputs and outputs."""
     task = run.task
     feedback = task.system.decl.feedback
     return {

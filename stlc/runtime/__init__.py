@@ -1,4 +1,4 @@
-"""Runtime of an exported controller, with NumPy and onnxruntime alone.
+"""Runtime of an exported controller; it needs only NumPy and onnxruntime.
 
 from stlc.runtime import Controller
 

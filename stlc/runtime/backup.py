@@ -1,4 +1,4 @@
-"""The paper's backup policy over the graphs of a controller; the counterpart of `guard.stages` in torch."""
+"""The search of the paper's guard, on the graphs of an exported controller; as `guard.stages` in torch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POLICY, BACKUP, SAFEST = range(3)
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Plan for one state: `source` is the rule that chose it, `t0` the length of its prefix."""
+    """Plan found for one state: `source` is the rule that chose it, `t0` the length of its prefix."""
 
     judged: JudgedPlans
     source: int
@@ -26,15 +26,16 @@ class Found:
 
 
 def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
-    """Search a plan for a state in which the plan of the policy is violated.
+    """Search a plan for a state in which the policy's plan violates the specification.
 
-    T0 grows until a plan satisfies phi, or else phi_safe; if none does, the longest safe prefix decides.
+    The prefix length T0 grows until a plan satisfies the specification or at least its safety requirements;
+    if none does, the plan with the longest safe prefix is returned.
 
     Args:
-        graphs: of the controller.
-        x: (n,).
-        plan: (T, m), of the policy; entries that are not finite are replaced.
-        rest: (T, m), remainder of the previous plan.
+        graphs: graphs of the controller.
+        x: state, (n,).
+        plan: plan of the policy, (T, m); entries that are not finite are replaced.
+        rest: remainder of the previous plan, (T, m).
 
     Returns:
         The plan found, as one row.
@@ -57,7 +58,7 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 
 
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
-    """All plans of one T0 with verdicts; the first begins as the policy's own plan does."""
+    """All plans with one prefix length, and verdicts; the first plan begins as the policy's own plan."""
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))
     parts = []
@@ -88,7 +89,7 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
 
 
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """Index of the allowed choice that is best by the keys, in lexicographic order."""
+    """Index of the best choice among the allowed ones; `keys` are compared in lexicographic order."""
     for key in keys:
         value = np.where(allowed & ~np.isnan(key), key, -np.inf)
         allowed = allowed & (value >= value.max() - TOLERANCE)
@@ -96,6 +97,6 @@ def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
 
 
 def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:
-    """Plans (…, m) with every entry that is not finite replaced by the control's value nearest to 0."""
+    """Replace every entry of plans (…, m) that is not finite by the value of the control nearest to 0."""
     rest = [min(max(0.0, each.low or 0.0), each.high or 0.0) for each in controls]
     return np.where(np.isfinite(plans), plans, rest)

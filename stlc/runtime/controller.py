@@ -1,4 +1,4 @@
-"""Closed-loop decisions of an exported controller, as in `stlc simulate`, without torch."""
+"""Closed-loop decisions of an exported controller, as in `stlc simulate`, but without torch."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ KEPT = "kept"
 
 @dataclass(frozen=True, slots=True)
 class ControlDecision:
-    """The decision for one agent, or for a batch with a leading axis of agents.
+    """The decision for one agent, or for several with a leading axis of agents.
 
     Attributes:
-        control: (m,), physical units.
-        rule: "policy", "kept" (the previous plan is continued), "backup" or "safest".
-        plan: (T, m), whose first action is the control.
-        rho: robustness of the plan; satisfied if >= -1e-6.
+        control: control to apply now, (m,), in physical units.
+        rule: rule that chose the plan: "policy", "kept" (the previous plan is continued), "backup" or
+            "safest".
+        plan: plan, (T, m), whose first step gives the control.
+        rho: robustness of the plan; the specification is satisfied if it is at least -1e-6.
         safe: robustness of the safety requirements alone.
         robustness: robustness of each requirement, by name.
-        source: `rule` by which the plan was first chosen.
-        t0: length of the backup's prefix; 0 for the policy's own plan.
-        policy_rho: robustness of the policy's plan; -inf where that is not a number.
+        source: the rule by which the plan was first chosen.
+        t0: length of the prefix that the backup policy chose; 0 for the policy's own plan.
+        policy_rho: robustness of the policy's plan; -inf if it is not a number.
     """
 
     control: Numbers
@@ -50,7 +51,7 @@ class ControlDecision:
 
 @dataclass(slots=True)
 class _ChosenPlans:
-    """Chosen plans: verdicts, sources, prefix lengths, and the mask of continued plans."""
+    """Chosen plans: verdicts, sources, prefix lengths, and whether each is a continued previous plan."""
 
     judged: JudgedPlans
     source: NDArray[np.int64]
@@ -58,7 +59,7 @@ class _ChosenPlans:
     kept: NDArray[np.bool_]
 
     def put(self, row: int, found: Found) -> None:
-        """Replace the plan of one agent by the backup's plan."""
+        """Replace the plan of agent `row` by the plan that the search found."""
         for name in ("plan", "rho", "safe", "cost", "each"):
             getattr(self.judged, name)[row] = getattr(found.judged, name)[0]
         self.source[row], self.t0[row], self.kept[row] = found.source, found.t0, False
@@ -67,11 +68,11 @@ class _ChosenPlans:
 class Controller:
     """Policy, model, monitor and backup policy of a run, exported with `stlc export RUN --to onnx`.
 
-    It stores the previous plans, and the states that the specification adds: `reset` clears both.
+    The controller stores the previous plans, and the states that the specification adds; `reset` clears both.
 
     Attributes:
-        facts: names, units, ranges, hashes.
-        guard: "paper" calls the paper's backup policy where a plan is violated; "none" only reports it.
+        facts: description of the controller: names, units, ranges, hashes.
+        guard: "paper" searches another plan if the chosen one violates the specification; "none" does not.
     """
 
     def __init__(
@@ -102,24 +103,24 @@ class Controller:
         parameters: Mapping[str, float] | None = None,
         threads: int = 1,
     ) -> Controller:
-        """Load a controller from its folder, or a file in it.
+        """Load a controller from its folder, or from a file in it.
 
         Args:
-            where: output of `stlc export RUN --to onnx`.
+            where: folder that `stlc export RUN --to onnx` wrote.
             guard: "paper" or "none".
-            parameters: values of the specification's parameters, where states come without them.
-            threads: limit for one decision.
+            parameters: values of the specification's parameters, if the states are given without them.
+            threads: number of threads for one decision.
 
         Raises:
-            UsageError: U102, there is nothing; U101, there is no such guard.
-            RunError: R106, something is missing, damaged, or of another export.
+            UsageError: U102, the folder does not exist; U101, there is no such guard.
+            RunError: R106, a file is missing, damaged, or of another export.
             MissingError: R301, `onnxruntime` is not installed.
         """
         return cls(read_facts(where), guard, parameters=parameters, threads=threads)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the columns of a state; those that the specification adds are last and may be left out."""
+        """Names of the states in order; those that the specification adds come last and may be left out."""
         return tuple(each.name for each in self.facts.states)
 
     @property
@@ -135,17 +136,17 @@ class Controller:
         """Return the decision for a state.
 
         Args:
-            state: (n,), or (agents, n) for a batch, or columns by name; in the units of `facts`. Ranges
-                of states are nominal: the monitor evaluates states beyond them, too.
-            elapsed: steps since the previous decision.
+            state: (n,), or (agents, n) for several agents, or values by state name; in the units of `facts`.
+                Ranges of states are nominal: states beyond them are evaluated, too.
+            elapsed: number of steps since the previous decision.
 
         Returns:
             The decision. A previous plan that still satisfies the specification is continued unless the new
-            one is better.
+            plan is better.
 
         Raises:
-            RunError: R107, the state does not fit or is not a number; R402, without a guard, the policy's
-                plan is not a number.
+            RunError: R107, the state has a wrong shape or is not a number; R402, without a guard, the
+                policy's plan is not a number.
         """
         x, single = self._read(state, elapsed)
         if self._previous is not None and len(self._previous.source) != len(x):
@@ -172,7 +173,7 @@ class Controller:
     # ---------------------------------------------------------------------- states
 
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
-        """The states (agents, n), and whether it is one agent."""
+        """States as an array (agents, n), and whether a single agent was given."""
         if elapsed < 0:
             raise _invalid(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
         named = self._named(state) if isinstance(state, Mapping) else None
@@ -226,7 +227,7 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
-        """The policy's plans, or remainders of the previous ones, and the graph's other outputs."""
+        """The policy's plans, or rests of previous ones that are continued, and all outputs of the graph."""
         previous = self._previous
         if previous is None:
             judged, outputs = self._graphs.decided(x)
@@ -261,7 +262,7 @@ class Controller:
 
 
 def _continued(plans: Numbers, steps: int) -> Numbers:
-    """Remainder of plans after `steps` steps, extended by their last actions."""
+    """Rest of each plan after `steps` steps, extended to the full length by repeating the last control."""
     last = plans.shape[1] - 1
     return np.ascontiguousarray(plans[:, np.minimum(np.arange(last + 1) + steps, last)])
 

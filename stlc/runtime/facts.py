@@ -26,10 +26,10 @@ class ControllerQuantity:
     """A state or a control.
 
     Attributes:
-        name: as in the system file.
-        unit: of its values; "" if dimensionless.
-        low: lower end of its range, nominal for states; None without a range.
-        high: upper end.
+        name: name in the system file.
+        unit: unit of its values; "" if dimensionless.
+        low: lower end of its range, which is nominal for states; None without a range.
+        high: upper end of its range.
         added: "parameter" or "timer" for a state that the specification adds, else "".
         initial: value of a timer at the start of a mission.
     """
@@ -44,15 +44,15 @@ class ControllerQuantity:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackGains:
-    """Feedback law around the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+    """Feedback law around the plans: the actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
     Attributes:
         gain: K, (m, n), without states that the specification adds.
         state: x0, (n,).
         control: u0, (m,).
         low: lower ends of the actuators' ranges, (m,).
-        high: upper ends, (m,).
-        authority: a, (m,).
+        high: upper ends of the actuators' ranges, (m,).
+        authority: greatest correction a, (m,).
     """
 
     gain: Numbers
@@ -63,7 +63,7 @@ class FeedbackGains:
     authority: Numbers
 
     def __call__(self, x: Numbers, planned: Numbers) -> Numbers:
-        """Actuator commands: (rows, n), (rows, m) -> (rows, m)."""
+        """Return actuator commands (rows, m) from states (rows, n) and planned controls (rows, m)."""
         back = (self.state - x[:, : len(self.state)]) @ self.gain.T
         total = self.control + planned + np.clip(back, -self.authority, self.authority)
         return np.clip(total, self.low, self.high)
@@ -71,19 +71,19 @@ class FeedbackGains:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Description of a controller.
+    """Description of an exported controller.
 
     Attributes:
         spec: name and hash of the specification.
         system: name and hash of the system.
-        states: in order; states that the specification adds are last.
-        controls: in order.
-        requirements: names, in order.
-        dt: seconds per step.
-        horizon: steps per plan.
-        grid: of the backup policy.
-        graphs: name of a file -> its bytes.
-        feedback: around the plans; None where actuators get the planned controls.
+        states: states in order; those that the specification adds come last.
+        controls: controls in order.
+        requirements: names of the requirements in order.
+        dt: time step in seconds.
+        horizon: number of steps of a plan.
+        grid: prefixes of controls that the backup policy tries.
+        graphs: file name -> content in bytes.
+        feedback: feedback law around the plans; None if the actuators get the planned controls.
     """
 
     spec: Mapping[str, str]
@@ -107,11 +107,11 @@ def read_facts(where: Path | str) -> Facts:
     """Read the description of a controller.
 
     Args:
-        where: its folder, or a file in it.
+        where: folder of the controller, or a file in it.
 
     Raises:
-        UsageError: U102, there is nothing.
-        RunError: R106, something is missing, damaged, or of another export.
+        UsageError: U102, the folder does not exist.
+        RunError: R106, a file is missing, damaged, or of another export.
     """
     path = Path(where)
     if not path.exists():

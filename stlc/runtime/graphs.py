@@ -1,4 +1,4 @@
-"""The graphs of a controller, run by onnxruntime."""
+"""The ONNX graphs of an exported controller, run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Numbers: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class JudgedPlans:
-    """Plans and their verdicts, a row each.
+    """Plans and their verdicts, one per row.
 
     Attributes:
-        plan: (rows, T, m), physical units.
-        rho: robustness of the specification, (rows,); -inf where a plan is not a number.
-        safe: robustness of the safety requirements alone; +inf where there are none.
-        cost: performance terms.
-        each: (rows, R), robustness per requirement.
+        plan: controls, (rows, T, m), in physical units.
+        rho: robustness of the specification, (rows,); -inf if the plan is not a number.
+        safe: robustness of the safety requirements alone, (rows,); +inf if there are none.
+        cost: cost of the plan, (rows,).
+        each: robustness of each requirement, (rows, R).
     """
 
     plan: Numbers
@@ -35,7 +35,7 @@ class JudgedPlans:
     each: Numbers
 
     def of(self, rows: Any) -> JudgedPlans:
-        """Return the rows of an index or a mask."""
+        """Return the rows that an index or a mask selects."""
         return JudgedPlans(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
@@ -47,11 +47,11 @@ def joined(parts: list[JudgedPlans]) -> JudgedPlans:
 
 
 class Graphs:
-    """The graphs of a controller; states (rows, n) and plans (rows, T, m) are float64.
+    """The ONNX graphs of a controller; states (rows, n) and plans (rows, T, m) are float64.
 
     Args:
-        facts: of the controller.
-        threads: limit for one call.
+        facts: description of the controller.
+        threads: number of threads for one call.
 
     Raises:
         MissingError: R301, `onnxruntime` is not installed.
@@ -67,7 +67,7 @@ class Graphs:
         _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """The best of the policy's plans, and all outputs of the graph."""
+        """Return the best of the policy's plans in states `x`, and all outputs of the graph."""
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
 
@@ -77,7 +77,7 @@ class Graphs:
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Verdicts of plans, and all outputs of the graph, among them `states` (rows, T + 1, n)."""
+        """Return verdicts on plans, and all outputs of the graph, among them `states` (rows, T + 1, n)."""
         found = _run(self._judge, {"state": x, "plan": plans})
         return _judged(plans, found), found
 

@@ -1,10 +1,10 @@
-"""Prefixes of actions for the backup policy: all of a grid, or a sample where those are too many.
+"""Prefixes of controls for the backup policy: all of a grid, or a sample if these are too many.
 
-A sample is made of 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. Entry d
-of the k-th word of a lattice is k sqrt(p_d) mod 1 with the d-th prime, in fixed point: Richtmyer's sequence,
-of low discrepancy (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS 84,
-1978). Random words are a hash of their index: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom
-number generators", OOPSLA 2014).
+Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. A
+"lattice" is Richtmyer's sequence of low discrepancy: entry d of point k is k sqrt(p_d) mod 1 with the d-th
+prime, in fixed point (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS 84,
+1978). "random" is a hash of the index: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom number
+generators", OOPSLA 2014).
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _WORD = 1 << 64
 
 @dataclass(frozen=True, slots=True)
 class PrefixGrid:
-    """Grid of action prefixes.
+    """Grid of control prefixes.
 
     Attributes:
-        values: of each control.
-        lengths: of prefixes, T0, in the order in which they are tried.
-        batch: trajectories at a time.
-        samples: greatest number of prefixes of one length.
-        sampling: sampling sequence, where the grid has more.
+        values: values of each control.
+        lengths: lengths T0 of the prefixes, in the order in which they are tried.
+        batch: number of trajectories evaluated at a time.
+        samples: greatest number of prefixes of one length that are tried.
+        sampling: sampling sequence, used if the grid has more prefixes.
     """
 
     values: tuple[tuple[float, ...], ...]
@@ -44,15 +44,15 @@ class PrefixGrid:
     sampling: Sampling = "lattice"
 
     def size(self, length: int) -> int:
-        """Number of prefixes of the grid, M = L^(m T0)."""
+        """Number of prefixes of one length in the grid, M = L^(m T0)."""
         return int(prod(len(values) for values in self.values) ** length)
 
     def count(self, length: int) -> int:
-        """Number of prefixes that are tried."""
+        """Number of prefixes of one length that are tried."""
         return min(self.size(length), self.samples)
 
     def prefixes(self, length: int) -> NDArray[np.float64]:
-        """The prefixes that are tried, (M, length, m)."""
+        """Return the prefixes of one length that are tried, (M, length, m)."""
         if self.size(length) > self.samples:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
@@ -68,7 +68,7 @@ class PrefixGrid:
 
 
 def generators(dims: int) -> tuple[int, ...]:
-    """The fractional parts of the square roots of the first primes, in units of 2^-64."""
+    """Fractional parts of the square roots of the first `dims` primes, in units of 2^-64."""
     primes: list[int] = []
     number = 2
     while len(primes) < dims:
@@ -79,7 +79,7 @@ def generators(dims: int) -> tuple[int, ...]:
 
 
 def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
-    """The first `count` points of a sequence in so many dimensions, (count, dims), in units of 2^-64."""
+    """The first `count` points of a sampling sequence, (count, dims), in units of 2^-64."""
     if sampling == "lattice":
         steps = np.array(generators(dims), dtype=np.uint64)
         return np.arange(1, count + 1, dtype=np.uint64)[:, None] * steps
@@ -91,5 +91,5 @@ def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
 
 
 def below(word: NDArray[np.uint64], bounds: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Words mapped to whole numbers from 0 up to `bounds`, exclusive, which are less than 2^32."""
+    """Map 64-bit words to integers from 0 to `bounds` - 1; the bounds must be less than 2^32."""
     return (((word >> np.uint64(32)) * bounds) >> np.uint64(32)).astype(np.int64)

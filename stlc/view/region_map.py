@@ -206,7 +206,7 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Grid position (row, column) of a label: deep in its region and, if possible, outside the others."""
+    """Grid position (row, column) for a region's label: deep inside it and, if possible, outside others."""
     free = np.minimum.reduce([depth, *(-other for other in others)])
     row, column = np.unravel_index(np.argmax(free if (free >= 0).any() else depth), depth.shape)
     return int(row), int(column)

@@ -96,7 +96,7 @@ def count(many: int, what: str) -> str:
 
 
 def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
-    """Guard -> results of its runs, from the document of a deployment; empty for an older document."""
+    """Guard -> results of its closed-loop runs, from `eval/simulate.json`; empty if the file is too old."""
     guards = (simulation or {}).get("guards")
     each = guards.items() if isinstance(guards, Mapping) else ()
     found = {name: guard.get("drives") for name, guard in each if isinstance(guard, Mapping)}

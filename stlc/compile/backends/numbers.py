@@ -1,4 +1,4 @@
-"""Evaluation of numbers, common to the back ends: traversal, sharing, and inlining of functions."""
+"""Evaluation of numeric expressions, common to the back ends: traversal, sharing, inlining of functions."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ V = TypeVar("V")
 
 
 class NumberEvaluator(ABC, Generic[V]):
-    """Evaluator of numbers to registers of a tape or names in C; back ends define the abstract methods.
+    """Evaluator of numeric expressions; the back end decides what a value is (a tape register, a name in C).
 
     Attributes:
-        bound: name of a signal -> its value, which replaces the column of that name.
+        bound: name of a signal -> value that replaces it.
     """
 
     def __init__(self) -> None:
@@ -31,14 +31,14 @@ class NumberEvaluator(ABC, Generic[V]):
         self._calls: dict[tuple[Any, ...], Self] = {}
 
     def number(self, num: ir.Num) -> V:
-        """Return the value of a number, evaluated once."""
+        """Return the value of an expression; each expression is evaluated once."""
         seen = self._seen.get(id(num))
         if seen is None:
             seen = self._seen[id(num)] = num, self._number(num)  # holds `num`, so that its id stays unique
         return seen[1]
 
     def margin(self, cond: ir.Formula) -> V:
-        """Return the exact robustness of a state formula."""
+        """Return the exact robustness of a state formula (a formula without temporal operators)."""
         return self.number(margin_of(cond))
 
     def _number(self, num: ir.Num) -> V:
@@ -55,7 +55,7 @@ class NumberEvaluator(ABC, Generic[V]):
                 return self._leaf(leaf)
 
     def inlined(self, body: ir.Body, args: Sequence[V]) -> Self:
-        """Return the evaluator inside a function given as straight-line code, with its assignments bound."""
+        """Return an evaluator for the body of a function, with its arguments and variables bound."""
         key = (id(body), *map(repr, args))
         inner = self._calls.get(key)
         if inner is None:
@@ -82,10 +82,12 @@ class NumberEvaluator(ABC, Generic[V]):
 
 
 def margin_of(formula: ir.Formula) -> ir.Num:
-    """Return the robustness of a state formula as a number, with guards as ordinary predicates.
+    """Return the robustness of a state formula (one without temporal operators) as an expression.
+
+    Guards (predicates that count as +-inf) become ordinary predicates.
 
     Raises:
-        Untranslatable: the formula is no state formula.
+        Untranslatable: the formula has a temporal operator.
     """
     match formula:
         case ir.Predicate(num, sign):

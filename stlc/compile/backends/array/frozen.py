@@ -167,7 +167,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Largest chunk c >= 1 with c (c + width) <= `most`; for infinite width, c * samples <= `most`."""
+    """Largest number c >= 1 with c (c + width) <= `most`; for infinite width, with c * samples <= `most`."""
     if math.isinf(width):
         return max(most // samples, 1)
     return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)

@@ -128,7 +128,10 @@ class Ops(Protocol):
         """Array that is +inf where `mask` is True, else -inf, in the dtype of `like`, without gradient."""
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:
-        """1 where `rho` > 0 (>= 0 unless `strict`), else 0; gradient of `(1 + tanh(slope rho)) / 2`."""
+        """Array that is 1 if `rho` > 0 (>= 0 unless `strict`), else 0, with the gradient of a smooth step.
+
+        The smooth step is `(1 + tanh(slope rho)) / 2`.
+        """
 
     # along time
     def amin(self, x: Array) -> Array:

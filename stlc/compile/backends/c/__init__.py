@@ -1,1 +1,1 @@
-"""C back end: dynamics and requirements, forward pass and adjoint."""
+"""C back end: rollout of the dynamics, robustness of the requirements, and gradients (adjoint)."""

@@ -1,7 +1,7 @@
-"""C code for the gradient of robustness and states with respect to plans.
+"""C code for the gradient of robustness and states with respect to plans (control sequences).
 
-Reverse mode through exact minima and maxima (the first of equal operands gets the gradient) and through the
-steps of the system, sixteen trajectories at a time. The forward pass is that of `emit`.
+The code is the reverse mode of exact minima and maxima (the first of equal operands gets the gradient) and of
+the steps of the system, for sixteen trajectories at a time. The forward pass is that of `emit`.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ static inline double bump(double z, double slope) {
 
 
 def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Collection[str] = ()) -> str:
-    """Return the C source of `pull`; see `stlc.native` for its signature.
+    """Return the C source of `pull`, which computes the gradient; see `stlc.native` for its signature.
 
     Args:
         motion: one step of the system.
         formulas: the requirements.
-        fixed: states whose update carries no gradient.
+        fixed: states whose update has no gradient.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
@@ -73,7 +73,11 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
 
 
 def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
-    """Adjoint of a step for one lane: from the gradient at sample k + 1 to sample k and the controls."""
+    """C code that propagates the gradient from the states at sample k + 1 to those at k and the controls.
+
+    It treats one lane, one of the trajectories that are computed side by side. States in `fixed` have no
+    gradient.
+    """
     index = state_index(motion)
     writer = SlopeWriter(place_in_step(motion), soft=True)
     for name, num in motion.lets:

@@ -1,7 +1,7 @@
-"""Local search over plans in C: per generation a batch of perturbed plans, of which the best is kept.
+"""Local search over plans in C: each generation perturbs the best plan and keeps the best of a batch.
 
-Appended to the source of `emit`; `roll` and `check` are those of the task. Each row has its own random
-stream, so the result does not depend on the number of threads.
+The code is appended to the source of `emit` and calls `roll` and `check` of the task. Each row has its own
+random stream, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""C translation unit of dynamics and requirements: rollout, exact robustness, performance.
+"""C code of dynamics and requirements: rollout, exact robustness, and NaN check.
 
-The same IR as the torch graph, exact switching, double precision, `LANES` trajectories at a time.
+It is made from the same IR as the torch graph, with exact switching, in double precision, for `LANES`
+trajectories at a time.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ static inline double floored_mod(double a, double b) {{
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One step of a system as straight-line code over states, controls and earlier assignments.
+    """One step of a system as straight-line code over states, controls and intermediate variables.
 
     Attributes:
-        states: names of the state columns, in order.
-        controls: names of the inputs, in order.
-        lets: (name, number), in order.
-        next: state name -> its value one step later; states that do not change are absent.
+        states: names of the states, in order.
+        controls: names of the controls, in order.
+        lets: intermediate variables as (name, expression), in order.
+        next: state name -> expression of its value one step later; states that do not change are absent.
         steps: number of steps of a plan.
         dt: time step in seconds.
     """
@@ -96,12 +97,12 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
 
 
 def state_index(motion: Motion) -> dict[str, int]:
-    """Return the index of each state among the columns."""
+    """Return state name -> index of the state in the array of trajectories."""
     return {name: i for i, name in enumerate(motion.states)}
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
-    """Return the forward passes: `roll` fills the states, `check` gives each requirement's robustness."""
+    """Return the C functions `roll`, which fills the states, and `check`, which computes the robustness."""
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
@@ -117,14 +118,14 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 
 
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
-    """Return statements that fill the buffers of a plan and output the robustness of each formula."""
+    """Return C statements that compute all sub-formulas, and then output the robustness of each formula."""
     printer = StepPrinter(plan, index)
     roots = along_roots(plan, "LANE out[{i}][j] = {value};")
     return [*(printer.forward([step]) for step in plan.schedule.steps), roots]
 
 
 def along_roots(plan: Plan, form: str) -> list[str]:
-    """Return a statement per requirement, with its index `{i}` and the place `{value}` of its robustness."""
+    """Return a C statement per requirement: `form` with its index `{i}` and its robustness `{value}`."""
     lines = []
     for first, root, rows in _side_by_side(plan):
         if rows == 1:
@@ -136,7 +137,7 @@ def along_roots(plan: Plan, form: str) -> list[str]:
 
 
 def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
-    """Requirements with values in consecutive rows: index of the first, its place, and their number."""
+    """Requirements whose robustness is in consecutive rows: index of the first, its row, and their number."""
     runs: list[tuple[int, Storage, int]] = []
     for i, root in enumerate(plan.roots):
         if runs and root == Storage(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
@@ -158,7 +159,7 @@ CHECK = Frame(
 
 
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
-    """Return the C expressions of states and inputs in a step, of lane `j`."""
+    """Return the function that gives the C expression of a state or control in a step, for trajectory `j`."""
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
@@ -172,7 +173,7 @@ def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
 
 
 def _step(motion: Motion) -> list[str]:
-    """Body of a step for one lane: from sample k to sample k + 1."""
+    """C code of a step of one trajectory: from sample k to sample k + 1."""
     index = state_index(motion)
     writer = NumberWriter(place_in_step(motion))
     for name, num in motion.lets:

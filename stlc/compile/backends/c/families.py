@@ -1,7 +1,7 @@
-"""Families of formulas of equal shape, as one shape and a table of parameters: obstacles are data.
+"""Families of formulas that differ in parameters only: common code and a table of parameters.
 
-A hundred boxes become one loop over a hundred rows, not a hundred copies of the same code. Constants and
-column names may differ; operators, windows and function calls are part of the shape.
+A hundred box-shaped obstacles become one loop over a hundred rows, not a hundred copies of the same code.
+Constants and signal names may differ within a family; operators, windows and function calls may not.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ N = TypeVar("N", bound=Any)
 
 @dataclass(frozen=True, slots=True)
 class FamilyTable:
-    """Constants and columns that distinguish the members of a family, one row per member.
+    """Table of the constants and signals by which the members of a family differ, one row per member.
 
     Attributes:
         rows: number of members.
         constants: C name -> constant of each row.
-        columns: C name -> column of each row.
+        columns: C name -> signal of each row.
     """
 
     rows: int
@@ -37,13 +37,13 @@ class FamilyTable:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of the table's entries in the shape, as frozen values and columns."""
+        """Names that stand for table entries in the common formula: those of constants and of signals."""
         return frozenset(f"{LISTED}{name}" for name in (*self.constants, *self.columns))
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """Formulas that differ in constants and columns.
+    """Formulas that differ in constants and signals only.
 
     Attributes:
         members: indices of the formulas.
@@ -60,8 +60,8 @@ def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
     """Return the families of at least `LEAST` members.
 
     Args:
-        formulas: candidates.
-        first: number of the first table, part of the names in it; further tables count on.
+        formulas: formulas to group.
+        first: number of the first table, which is part of the names in it; further tables count on from it.
     """
     if len(formulas) < LEAST:
         return []
@@ -100,7 +100,7 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 
 
 def _entries(formula: ir.Formula) -> list[Entry]:
-    """Leaves that may differ among formulas of one shape, in the order of `_changed`."""
+    """Constants and signals of a formula that may differ within a family, in the order of `_changed`."""
     found: list[Entry] = []
 
     def note(leaf: Entry) -> ir.Num:
@@ -112,7 +112,7 @@ def _entries(formula: ir.Formula) -> list[Entry]:
 
 
 def _changed(node: N, change: Callable[[Entry], ir.Num]) -> N:
-    """Return a formula or a number with each leaf that may differ replaced by `change(leaf)`."""
+    """Replace each constant or signal that may differ within a family by `change(leaf)`."""
     if isinstance(node, (ir.Freeze, ir.Extern)):
         return node  # names of frozen values are unique; a call is computed once for its columns
     if isinstance(node, (ir.Const, ir.Signal, ir.ShiftedSignal)):

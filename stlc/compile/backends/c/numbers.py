@@ -1,4 +1,4 @@
-"""Numbers and state formulas of the IR as C expressions, with common sub-expressions shared.
+"""Numeric expressions and state formulas of the IR as C expressions; common sub-expressions are shared.
 
 A writer turns `ir.Num` into branch-free scalar statements `const double r7 = …;`, so that the compiler can
 vectorize the enclosing loop over trajectories.
@@ -19,11 +19,11 @@ LISTED = "\0"
 
 
 class NumberWriter(NumberEvaluator[str]):
-    """Writer of numbers as C statements; equal expressions share a register.
+    """Writer of numeric expressions as C statements; equal expressions share a register (C variable).
 
     Args:
-        place: C expression of a column, a frozen value or an available function result; None for a function
-            that must be inlined.
+        place: returns the C expression of a signal, a frozen value or an available function result; None for
+            a function that must be inlined.
 
     Attributes:
         lines: the statements.
@@ -36,7 +36,7 @@ class NumberWriter(NumberEvaluator[str]):
         self._texts: dict[str, str] = {}
 
     def truth(self, cond: ir.Formula) -> str:
-        """Exact truth of a condition as a C expression, 0 or 1; each predicate keeps its own strictness."""
+        """C expression of a condition's exact truth value, 0 or 1; `>` and `>=` are distinguished."""
         match cond:
             case ir.Truth(value):
                 return "1" if value else "0"
@@ -83,7 +83,7 @@ class NumberWriter(NumberEvaluator[str]):
         return self._apply(name, args)
 
     def _apply(self, name: str, args: list[str]) -> str:
-        """Write one function of the table into a register; extrema take two arguments at a time."""
+        """Write a function call into a register; min and max are applied to two arguments at a time."""
         form = FUNCTIONS[name].c
         if form is None:
             raise Untranslatable(name)

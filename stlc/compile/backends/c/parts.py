@@ -1,4 +1,4 @@
-"""Split of statements into C functions of moderate size: compile time grows fast with function length."""
+"""Splitting of long C functions into parts, since compile time grows fast with the length of a function."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _NAME = re.compile(r"\bg?b\d+\b")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Function that is split into parts.
+    """C function that is split into parts.
 
     Attributes:
-        name: of the function; its parts are numbered.
+        name: name of the function; its parts are numbered.
         formals: C declarations of its arguments.
         locals: statements at the start of every part.
     """
@@ -30,11 +30,11 @@ class Frame:
 
 
 def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str, str]) -> list[str]:
-    """Return the parts, then the function that calls them.
+    """Return the C functions of the parts, then the function that calls them.
 
     Args:
-        frame: name, arguments and local statements.
-        blocks: groups of statements that stay together.
+        frame: name, arguments and local statements of the function.
+        blocks: groups of statements that must stay together.
         buffers: C name of a buffer -> its declaration, written into the parts that use it.
     """
     lines, calls = [], []
@@ -62,7 +62,7 @@ def _parts(blocks: Sequence[Sequence[str]]) -> Iterator[list[str]]:
 
 
 def declared(plan: Plan, *, room: str = "room", prefix: str = "") -> dict[str, str]:
-    """Return C name -> declaration for the buffers of a plan."""
+    """Return the C declarations of a plan's buffers by their names."""
     return {
         f"{prefix}{buffer.name}": f"double (*restrict {prefix}{buffer.name})[LANES] ="
         f" (double (*)[LANES])({room} + {buffer.place} * LANES);"

@@ -1,7 +1,8 @@
-"""Schedule of formulas with buffers, from which the forward and adjoint C code is printed.
+"""Evaluation schedule of formulas with memory for all values, from which the C code is printed.
 
-`freeze` is a loop over its instants; sub-formulas without frozen values are hoisted out of it. Operands and
-requirements of equal shape are a loop over a table (`families`). Functions of columns are computed once.
+A `freeze` is a loop over its instants; sub-formulas that do not read frozen values are moved out of the loop.
+Operands and requirements that differ in parameters only are a loop over a table (`families`). A function of
+signals is computed once.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Buffer:
-    """Buffer for the values of a sub-formula at consecutive instants, `LANES` trajectories each.
+    """Memory for the values of a sub-formula at consecutive instants, for `LANES` trajectories side by side.
 
     Attributes:
-        name: of the C array.
+        name: name of the C array.
         origin: instant of the first row.
         rows: number of instants.
-        place: offset in the working memory, in doubles per lane.
+        place: offset in the working memory, in doubles per trajectory.
     """
 
     name: str
@@ -52,20 +53,20 @@ class Buffer:
     place: int
 
     def __getitem__(self, instant: Instant | str) -> str:
-        """Return the C expression of the value at an instant, of lane `j`."""
+        """Return the C expression of the value at an instant, for trajectory `j`."""
         offset = f" - {self.origin}" if self.origin > 0 else f" + {-self.origin}" if self.origin else ""
         return f"{self.name}[{instant}{offset}][j]"
 
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """Step that computes all components of a function of columns at all samples, numbered consecutively."""
+    """Step that evaluates a function of signals at all samples; its components get consecutive numbers."""
 
     function: ir.Extern
 
     @property
     def components(self) -> list[ir.Extern]:
-        """The components as numbers."""
+        """The components of the function's result, as expressions."""
         assert isinstance(self.function.function, ir.Body)
         outputs = range(len(self.function.function.outputs))
         return [replace(self.function, output=output) for output in outputs]
@@ -73,11 +74,11 @@ class Called:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """Loop body.
+    """Body of a C loop.
 
     Attributes:
-        index: C name of the index.
-        steps: recomputed in every iteration.
+        index: C name of the loop index.
+        steps: steps that are computed in every iteration.
         own: step numbers of all values in the loop, in order of allocation.
         root: step number of an iteration's result.
     """
@@ -90,10 +91,10 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Frozen:
-    """Step of a `freeze`: a loop over its instants.
+    """Step that evaluates a `freeze`: a loop over its instants.
 
     Attributes:
-        node: the formula.
+        node: the `freeze` formula.
         bound: step numbers of the frozen values, in the order of their bindings.
         loop: body of the loop.
     """
@@ -105,11 +106,11 @@ class Frozen:
 
 @dataclass(frozen=True, slots=True)
 class Tabled:
-    """Step of a family of formulas: a loop over the rows of its table.
+    """Step that evaluates a family of formulas (which differ in parameters only): a loop over its table.
 
     Attributes:
         table: parameters of each row.
-        pick: extremum over the rows at each instant; None: the first value of each row is kept.
+        pick: minimum or maximum over the rows at each instant; None: the first value of each row is kept.
         loop: body of the loop.
     """
 
@@ -128,14 +129,14 @@ class Storage:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Schedule with the buffers of its steps.
+    """Evaluation schedule with the memory of its steps.
 
     Attributes:
-        schedule: steps; its roots are formulas at the first sample.
+        schedule: steps; its roots are the formulas at the first sample.
         roots: location of each formula's robustness.
-        buffers: by step number.
-        size: working memory in doubles per lane.
-        calls: function call on columns -> step number of its first component.
+        buffers: memory of each step, by step number.
+        size: working memory in doubles per trajectory.
+        calls: function call on signals -> step number of its first component.
     """
 
     schedule: Schedule
@@ -146,15 +147,15 @@ class Plan:
 
     @property
     def samples(self) -> int:
-        """Samples of a trajectory, T + 1."""
+        """Number of samples of a trajectory, T + 1."""
         return self.schedule.domain.samples
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
-    """Return the plan that evaluates formulas at the first sample.
+    """Return the schedule that evaluates formulas at the first sample of a trajectory.
 
     Raises:
-        Untranslatable: a window leaves the trajectory.
+        Untranslatable: a window extends beyond the trajectory.
     """
     planner = _Planner(TraceDomain(samples))
     places = planner.roots(formulas)
@@ -166,7 +167,7 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 
 @dataclass(slots=True)
 class _Scope(StepScope):
-    """Scope of steps: the whole plan, the body of a `freeze`, or the body of a loop over a table."""
+    """Scope of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table."""
 
     read: frozenset[str] = frozenset()
     table: bool = False
@@ -187,7 +188,7 @@ class _Planner(Scheduler):
         self._loops = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the step number of a formula, hoisted out of loops on which it does not depend."""
+        """Return the step number of a formula, which is placed outside of loops that do not affect it."""
         node = _split(node)
         depth = self._depth(node)
         around = self.scopes[depth + 1 :]
@@ -198,7 +199,7 @@ class _Planner(Scheduler):
             return self.place(node, run.settled if frozen else run)
 
     def number(self, run: IndexRange) -> int:
-        """Return the next step number and allocate its buffer."""
+        """Return the next step number and reserve memory for its values."""
         buffer = Buffer(f"b{len(self.buffers)}", earliest(run.start), run.count, self.size)
         self.buffers.append(buffer)
         self.size += buffer.rows
@@ -207,7 +208,7 @@ class _Planner(Scheduler):
 
     @contextmanager
     def _inside(self, scopes: list[_Scope]) -> Iterator[_Scope]:
-        """Context in which steps go to other scopes."""
+        """Context in which new steps are added to the innermost of other scopes."""
         before = self.scopes
         self.scopes, self.scope = scopes, scopes[-1]
         try:
@@ -216,7 +217,7 @@ class _Planner(Scheduler):
             self.scopes, self.scope = before, before[-1]
 
     def _depth(self, formula: ir.Formula) -> int:
-        """Depth of the innermost enclosing loop on which a formula depends."""
+        """Depth of the innermost enclosing loop that affects a formula's value."""
         if len(self.scopes) == 1:
             return 0
         read = _frozen_names(formula)
@@ -241,7 +242,7 @@ class _Planner(Scheduler):
         return super().scheduled(node, run)
 
     def roots(self, formulas: Sequence[ir.Formula]) -> list[tuple[int, int]]:
-        """Return step number and row of formulas at the first sample; a family has consecutive rows."""
+        """Return step number and row of each formula at the first sample; a family has consecutive rows."""
         places: dict[int, tuple[int, int]] = {}
         for family in self._families(list(map(_split, formulas))):
             number = self._tabled(family, _FIRST, None)
@@ -257,7 +258,7 @@ class _Planner(Scheduler):
         return number
 
     def _join(self, node: ir.BoolOp, pick: Pick, items: Sequence[ir.Formula], run: IndexRange) -> int:
-        """Add the extremum of formulas, with each family as one operand."""
+        """Add the minimum or maximum of formulas; each family of alike formulas is one operand."""
         found = self._families(items)
         loops = {family.members[0]: family for family in found}
         taken = {member for family in found for member in family.members[1:]}
@@ -295,7 +296,11 @@ class _Planner(Scheduler):
         return self.add(Step(Frozen(node, bound, loop), run, (), number))
 
     def _check(self, num: ir.Num, run: IndexRange) -> None:
-        """Schedule the calls of a number. Raises Untranslatable for samples outside of the plan."""
+        """Schedule the function calls in an expression.
+
+        Raises:
+            Untranslatable: the expression needs samples outside of the trajectory.
+        """
         past, future = reach_of(num)
         if earliest(run.start) < past or latest(run.last) + future >= self.domain.samples:
             raise Untranslatable("a sample outside of the plan")
@@ -313,7 +318,7 @@ class _Planner(Scheduler):
 
 
 def call_of(num: ir.Num) -> CallKey | None:
-    """Key of a function call on columns, which is computed once at all samples; None for other numbers."""
+    """Key of a function call on signals, which is computed once for all samples; None for others."""
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
     leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
@@ -327,7 +332,7 @@ def _offset(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
-    """Free frozen values and columns of a formula."""
+    """Names of the frozen values and signals that a formula reads and does not bind itself."""
     match formula:
         case ir.Predicate(num):
             return frozen_in(num) | columns_of(num)
@@ -361,7 +366,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
 
 
 def _distributed(num: ir.Op) -> ir.Op:
-    """Distribute a sum over an extremum, bit for bit the same, since rounding is monotone."""
+    """Distribute a sum over a minimum or maximum; the result is equal bit for bit: rounding is monotone."""
     if num.name not in ("add", "sub") or len(num.args) != 2:
         return num
     for i, part in enumerate(num.args):
@@ -380,7 +385,7 @@ def _distributed(num: ir.Op) -> ir.Op:
 
 
 def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
-    """Operands of an `and` or `or`, with nested ones of the same kind flattened."""
+    """Operands of an `and` or `or`; nested ones of the same operator are flattened."""
     found: list[ir.Formula] = []
     for item in map(_split, items):
         found += _operands(op, item.items) if isinstance(item, ir.BoolOp) and item.op == op else [item]

@@ -1,9 +1,10 @@
-"""C code of a schedule's steps, forward and adjoint, over columns filled by a rollout.
+"""C code of the steps of a schedule, forward and adjoint, on trajectories filled by a rollout.
 
 A class per kind of step (`FORMS`) prints both. The innermost loop runs over trajectories and is vectorized.
-`gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to the columns. The gradient of an
-extremum goes to the first of equal operands. Loop bodies are recomputed in the adjoint, only for iterations
-with a nonzero gradient. Windows that all end or all begin with the trace are computed by one recursion.
+`gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to the states. The gradient of a
+minimum or maximum goes to the first of equal operands. The adjoint recomputes loop bodies, only for
+iterations with a nonzero gradient. Windows that all end with the trace, or all begin with it, are computed by
+one recursion.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ HeldBuffers: TypeAlias = Mapping[str, Buffer]
 
 @dataclass(frozen=True, slots=True)
 class StepPrinter:
-    """Printer of steps.
+    """Printer of the C code of steps.
 
     Attributes:
-        plan: that the steps belong to.
-        index: index of each state among the columns.
-        held: buffers of the frozen values.
+        plan: schedule and memory of the steps.
+        index: state name -> index in the array of trajectories.
+        held: name of a frozen value -> its buffer.
     """
 
     plan: Plan
@@ -48,11 +49,11 @@ class StepPrinter:
     held: HeldBuffers = field(default_factory=dict)
 
     def forward(self, steps: Sequence[Step]) -> list[str]:
-        """Return statements that fill the buffers of all steps."""
+        """Return C statements that compute the values of all steps."""
         return [line for step in steps for line in self._form(step).forward()]
 
     def backward(self, steps: Sequence[Step]) -> list[str]:
-        """Return statements that propagate the gradient back through all steps."""
+        """Return C statements that propagate the gradient back through all steps."""
         return [line for step in reversed(steps) for line in self._form(step).backward()]
 
     def _form(self, step: Step) -> StepForm:
@@ -60,7 +61,7 @@ class StepPrinter:
 
 
 class StepForm(ABC):
-    """C code of one step of a plan, forward and adjoint."""
+    """C code of one step of a schedule, forward and adjoint."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         self.printer, self.plan, self.step = printer, printer.plan, step
@@ -72,19 +73,19 @@ class StepForm(ABC):
 
     @abstractmethod
     def forward(self) -> list[str]:
-        """Return statements that compute the values."""
+        """Return C statements that compute the values."""
 
     @abstractmethod
     def backward(self) -> list[str]:
-        """Return statements that propagate the gradient of the values to the operands."""
+        """Return C statements that propagate the gradient of the values to the operands."""
 
     def filled(self, value: float) -> list[str]:
-        """Return statements that give all instants one value."""
+        """Return C statements that set the step to `value` at all instants."""
         return [f"{loop(self.run)} LANE {self.out['k']} = {literal(value)};"]
 
 
 def loop(run: IndexRange, *, back: bool = False) -> str:
-    """Return the head of a loop over instants `k`."""
+    """Return the head of a C loop over instants `k`, backward in time with `back`."""
     if back:
         return f"for (int k = {run.last}; k >= {run.start}; --k)"
     return f"for (int k = {run.start}; k <= {run.last}; ++k)"
@@ -99,11 +100,11 @@ def _indented(lines: Iterable[str], by: int = 2) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class LeafReader:
-    """C expressions of a number's leaves at sample `k`, in lane `j`.
+    """C expressions of the leaves (signals, calls, frozen values) of an expression at sample `k`.
 
     Attributes:
-        printer: of the step that holds the number.
-        indices: C name of a clamped sample index -> its C expression; independent of the lane.
+        printer: printer of the step that contains the expression.
+        indices: C name of a clamped sample index -> its C expression, the same for all trajectories.
     """
 
     printer: StepPrinter
@@ -121,7 +122,7 @@ class LeafReader:
         )
 
     def _instant(self, leaf: ir.Num) -> str:
-        """Index of the sample at which a column is read; a clamped one stays within the plan."""
+        """C expression of the sample number at which a signal is read, clamped if the signal is."""
         if not isinstance(leaf, ir.ShiftedSignal):
             return "k"
         steps, last = leaf.steps, self.printer.plan.samples - 1
@@ -133,14 +134,14 @@ class LeafReader:
         return name
 
     def heads(self) -> str:
-        """Declarations of the clamped indices."""
+        """C declarations of the clamped indices."""
         return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
 def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
-    """Statements that propagate the gradient of a number at sample `k` to its leaves.
+    """C statements that propagate the gradient of an expression at sample `k` to its leaves (signals, calls).
 
-    Leaves may alias one sample: they are accumulated apart from the computing loop, which is vectorized.
+    Several leaves may read the same sample, so gradients are added to them outside of the vectorized loop.
     """
     writer = SlopeWriter(reader, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
@@ -157,7 +158,7 @@ def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
 
 
 def column(index: Mapping[str, int], name: str, k: str) -> str:
-    """Return the C expression of a state at a sample, of lane `j`; the state may be a table entry."""
+    """Return the C expression of a state at sample `k`, for trajectory `j`; it may be a table entry."""
     if name == ir.ELAPSED:
         return f"(double)({k})"
     where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
@@ -165,7 +166,7 @@ def column(index: Mapping[str, int], name: str, k: str) -> str:
 
 
 class _Margin(StepForm):
-    """Predicate."""
+    """C code of a predicate."""
 
     def forward(self) -> list[str]:
         node, reader = self.node, LeafReader(self.printer)
@@ -178,7 +179,7 @@ class _Margin(StepForm):
         return [f"{loop(self.run)} {{ {reader.heads()} LANE {{ {body} }} }}"]
 
     def backward(self) -> list[str]:
-        """Propagate the gradient, which is 0 where a number depends only on the sample count."""
+        """Propagate the gradient; guards, and predicates on the elapsed time, have none."""
         num, sign = self.node.num, "" if self.node.sign > 0 else "-"
         counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
         if self.node.guard or counted:
@@ -189,7 +190,7 @@ class _Margin(StepForm):
 
 
 class _Call(StepForm):
-    """All components of a function of columns, at all samples."""
+    """C code of a function of signals: all its components, at all samples."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -197,7 +198,7 @@ class _Call(StepForm):
         self.outs = self.plan.buffers[step.number : step.number + len(self.parts)]
 
     def _place(self, leaf: Leaf) -> str | None:
-        """C expression of a column at sample `k`; None for other leaves, which are inlined."""
+        """C expression of a signal at sample `k`; None for other leaves, which are inlined."""
         return column(self.printer.index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
 
     def forward(self) -> list[str]:
@@ -218,7 +219,7 @@ class _Call(StepForm):
 
 
 class _Constant(StepForm):
-    """Truth constant."""
+    """C code of the constant `true` or `false`."""
 
     def forward(self) -> list[str]:
         return self.filled(math.inf if self.node.value else -math.inf)
@@ -228,7 +229,7 @@ class _Constant(StepForm):
 
 
 class _Extremum(StepForm):
-    """`and` or `or`; one operand per statement, since nested macros double in length."""
+    """C code of `and` or `or`, one operand per statement, since nested macros double in length."""
 
     def forward(self) -> list[str]:
         pick, (first, *others) = _MACRO[PICKS[self.node.op]], self.args
@@ -246,7 +247,7 @@ class _Extremum(StepForm):
 
 
 class _AtStart(StepForm):
-    """Value at the first sample."""
+    """C code of the value at the first sample."""
 
     def forward(self) -> list[str]:
         return [f"{loop(self.run)} LANE {self.out['k']} = {self.args[0][0]};"]
@@ -256,7 +257,7 @@ class _AtStart(StepForm):
 
 
 class _Shifted(StepForm):
-    """Value some samples later or earlier."""
+    """C code of a formula's value some samples later or earlier."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -284,10 +285,10 @@ class _Shifted(StepForm):
 
 
 class _Windowed(StepForm):
-    """Extremum over a window, or `until` and its dual and mirrors.
+    """C code of a temporal operator: an extremum over a window, `until`, `release`, or a past operator.
 
-    The value at an instant is a loop over its window (`_scan`). Windows to the end or from the start of the
-    trace are computed by a recursion, with the value at the preceding instant (`_step`).
+    The value at an instant is a loop over its window (`_scan`). Windows that extend to the end or to the
+    start of the trace are computed by a recursion on the value at the adjacent instant (`_step`).
     """
 
     lanes = ""
@@ -333,18 +334,18 @@ class _Windowed(StepForm):
         return [*head, "  else LANE {", *_indented(self._step_back(), 4), "  }", "}"]
 
     def _recursion(self, lines: list[str], *, reverse: bool = False) -> list[str]:
-        """Head of the recursion, with statements for its first instant; `reverse`: in opposite direction."""
+        """Head of the recursion's loop, with statements for its first instant; `reverse`: for the adjoint."""
         first = self.run.start if self.back else self.run.last
         head = loop(self.run, back=self.back if reverse else not self.back)
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
 
     def _empty(self, statement: str) -> list[str]:
-        """The branch of instants whose past window is before the trace."""
+        """Branch for instants whose past window lies before the trace."""
         late = self.back and earliest(self.run.start) < self.window.lo
         return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
 
     def _ends(self) -> tuple[str, str]:
-        """C expressions of the first and last sample of the window of `k`."""
+        """C expressions of the first and last sample of the window at instant `k`."""
         lo, hi = self.window.lo, self.window.hi
         if self.back:
             return "0" if hi is None else f"LATER(k - {hi}, 0)", f"k - {lo}"
@@ -352,7 +353,7 @@ class _Windowed(StepForm):
 
 
 class _WindowExtremum(_Windowed):
-    """Extremum of one operand over a window."""
+    """C code of the minimum or maximum of one operand over a window."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -389,7 +390,7 @@ class _WindowExtremum(_Windowed):
 
 
 class _Until(_Windowed):
-    """`until` for MAX, `release` for MIN, and their mirrors in the past."""
+    """C code of `until` (maximum), `release` (minimum), and their past counterparts."""
 
     lanes = " LANE"
 
@@ -399,7 +400,7 @@ class _Until(_Windowed):
         self.recursive = self.recursive and not self.window.lo
 
     def _outwards(self) -> tuple[str, str]:
-        """Loop heads from `k` to the near end of the window, and on to its far end."""
+        """Two C loop heads: from `k` to the near end of the window, and from there to its far end."""
         first, stop = self._ends()
         if self.back:
             return f"for (int i = k; i > LATER({stop}, -1); --i)", f"for (int i = {stop}; i >= {first}; --i)"
@@ -420,7 +421,7 @@ class _Until(_Windowed):
         ]
 
     def _step(self) -> str:
-        """`u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual."""
+        """C expression `u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual."""
         reached = f"{self.pick}({self.args[1]['k']}, {self.before})"
         return f"{self.dual}({self.args[0]['k']}, {reached})"
 
@@ -458,7 +459,7 @@ class _Until(_Windowed):
 
 
 class _Repeated(StepForm):
-    """Step whose body is a loop of other steps."""
+    """C code of a step that is a loop over other steps."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -466,13 +467,13 @@ class _Repeated(StepForm):
         self.root = self.plan.buffers[self.loop.root]
 
     def _blank(self) -> list[str]:
-        """Statements that zero the gradients of buffers that each iteration recomputes."""
+        """Statements that set the gradients of values recomputed in each iteration to zero."""
         own = (self.plan.buffers[number] for number in self.loop.own)
         return [f"memset(g{each.name}, 0, sizeof(double) * {each.rows} * LANES);" for each in own]
 
 
 class _FreezeLoop(_Repeated):
-    """`freeze`: an iteration per instant binds the frozen values, then runs the steps."""
+    """C code of a `freeze`: each iteration binds the values at one instant, then computes the body."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -522,10 +523,10 @@ class _FreezeLoop(_Repeated):
 
 
 class _TableLoop(_Repeated):
-    """Family of formulas: an iteration per row of its table."""
+    """C code of a family of formulas: one iteration per row of its table."""
 
     def _head(self) -> list[str]:
-        """The table and the head of the loop over its rows, closed by two braces."""
+        """The table, and the head of the loop over its rows, which two braces close."""
         table, row, index = self.node.table, self.loop.index, self.printer.index
         constants = {name: map(literal, values) for name, values in table.constants.items()}
         columns = {name: [str(index[state]) for state in states] for name, states in table.columns.items()}
@@ -550,7 +551,7 @@ class _TableLoop(_Repeated):
         return [*self._head(), *self.printer.forward(self.loop.steps), *gathered, "}}"]
 
     def backward(self) -> list[str]:
-        """Row by row: recompute, then propagate for lanes whose extremum the row attains."""
+        """For each row: recompute its value, then propagate where the row is the extremum."""
         if self.node.pick is None:
             own, body = self.out[self.loop.index], self.root[0]
             seeds = f"LANE {{ g{body} += g{own}; matters[j] += fabs(g{own}); }}"
@@ -574,7 +575,7 @@ class _TableLoop(_Repeated):
 
 
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
-    """Table entries of one type as a C array, one row per line."""
+    """Entries of a table of one type as a C array, one row per line."""
     if not entries:
         return []
     rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]

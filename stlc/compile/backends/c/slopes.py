@@ -1,7 +1,7 @@
-"""Derivatives of numbers as C statements: reverse mode over the registers of a `NumberWriter`.
+"""Derivatives of expressions as C statements: reverse mode over the registers of a `NumberWriter`.
 
-Derivatives equal those of `backends.torch.ops`, at ties and kinks too. Conditions are 0 or 1, with the slope
-of `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
+The derivatives equal those of `backends.torch.ops`, also at ties and kinks. Conditions have the value 0 or 1
+and the slope of `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ LESS = {"min": "<", "max": ">"}
 
 
 class SlopeWriter(NumberWriter):
-    """Number writer that records the partial derivatives of each register.
+    """Writer of expressions that records the partial derivatives of each register (C variable).
 
     Args:
-        place: C expression of a leaf.
+        place: returns the C expression of a leaf (signal, call, or frozen value).
         soft: whether conditions have a slope; otherwise only the taken branch has a gradient.
     """
 
@@ -38,14 +38,14 @@ class SlopeWriter(NumberWriter):
         self._constants: set[str] = set()
 
     def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
-        """Return statements that propagate gradients from registers to columns.
+        """Return C statements that propagate gradients from registers to leaves (signals, calls).
 
         Args:
             seeds: register -> C expression of the derivative of the output with respect to it.
 
         Returns:
-            The statements, and accumulator of a leaf's derivative (`gx[…]` for `x[…]`) -> register that
-            holds it.
+            The statements, and C expression of a leaf's gradient (`gx[…]` for `x[…]`) -> register that holds
+            the value to add to it.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
@@ -55,10 +55,10 @@ class SlopeWriter(NumberWriter):
         return lines, gathered
 
     def gradients(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
-        """Return statements that compute numbers and add the gradients of their columns.
+        """Return C statements that compute expressions and add up the gradients of the signals in them.
 
         Args:
-            outputs: each number, with the C expression of the derivative of the output with respect to it.
+            outputs: each expression, with the C expression of the output's derivative with respect to it.
         """
         seeds: dict[str, str] = {}
         for num, own in outputs:
@@ -102,7 +102,10 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
-        """Derivatives of an extremum by its operands: equal operands share it, constants are left out."""
+        """Derivatives of a minimum or maximum by its two operands.
+
+        Equal operands share the derivative; a constant operand gets none.
+        """
         sign = LESS[name]
         if not self._varies(second):
             return f"(double)!({second} {sign} {first})", "0.0"
@@ -112,11 +115,11 @@ class SlopeWriter(NumberWriter):
         return f"(({first} {sign} {second}) + {equal})", f"(({second} {sign} {first}) + {equal})"
 
     def _varies(self, operand: str) -> bool:
-        """True if an operand depends on a column; literals and functions of literals do not."""
+        """True if an operand depends on a signal; constants and functions of constants do not."""
         return operand in self._texts.values() and operand not in self._constants
 
     def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
-        """Derivatives of `min(max(x, low), high)`."""
+        """Derivatives of `min(max(x, low), high)` by its operands."""
         raised = super()._apply("max", [x, low])
         of_x, of_low = self._shares("max", x, low)
         of_raised, of_high = self._shares("min", raised, high)

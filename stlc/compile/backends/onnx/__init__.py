@@ -1,1 +1,1 @@
-"""ONNX back end: the computation as a graph."""
+"""ONNX back end: rollout and robustness as an ONNX graph."""

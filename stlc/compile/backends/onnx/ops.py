@@ -1,7 +1,7 @@
-"""Array namespace over symbolic values, and robustness: operations are recorded as an ONNX graph.
+"""Array operations on symbolic values, and robustness: operations are recorded as an ONNX graph.
 
-It supports exact switching and exact robustness; gradients and smooth extrema are not needed. Numbers are
-float64. Where the runtime has a function in float32 only (`atan`), one Newton step gives full precision.
+Switching and robustness are exact; gradients and smooth extrema are not supported. Numbers are float64. If
+the runtime has a function in float32 only (`atan`), one Newton step gives full precision.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
 
 @final
 class OnnxOps:
-    """`stlc.compile.backends.array.namespace.Ops` over symbolic values. Extrema propagate NaN."""
+    """`stlc.compile.backends.array.namespace.Ops` for symbolic values; min and max propagate NaN."""
 
     name = "onnx"
 
@@ -75,7 +75,7 @@ class OnnxOps:
         return x * x
 
     def mod(self, a: Number, b: Number) -> Value:
-        """Floored modulo: the sign of `b`."""
+        """Floored modulo: the result has the sign of `b`."""
         like = _like(a, b)
         divisor = like.beside(b)
         dividend = like.beside(a)
@@ -85,7 +85,7 @@ class OnnxOps:
         return self.where(other, rest + divisor, rest)
 
     def norm(self, *components: Number) -> Value:
-        """Euclidean length."""
+        """Euclidean norm of a vector given by its components."""
         first, *rest = components
         total = self.mul(first, first) if isinstance(first, Value) else first * first
         for part in rest:
@@ -127,21 +127,21 @@ class OnnxOps:
     # ------------------------------------------------------------------- truth
 
     def number(self, mask: Value, like: Value) -> Value:
-        """1 where `mask`, else 0."""
+        """Array that is 1 where `mask` is True, else 0."""
         return mask.cast(like.kind)
 
     def where(self, mask: Value, yes: Number, no: Number) -> Value:
-        """`yes` where `mask`, else `no`."""
+        """Elements of `yes` where `mask` is True, else of `no`."""
         kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
         parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
     def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
-        """+inf where `mask`, else -inf."""
+        """Array that is +inf where `mask` is True, else -inf."""
         return self.where(mask, math.inf, -math.inf)
 
     def clamp(self, x: Value, low: float | None, high: float | None) -> Value:
-        """`x` clamped to [low, high]."""
+        """Clamp `x` to [low, high]."""
         if low is not None and high is not None:
             return x.apply("Clip", low, high)
         x = x if low is None else x.apply("Max", low)
@@ -150,16 +150,16 @@ class OnnxOps:
     # -------------------------------------------------------------- along time
 
     def join(self, items: Sequence[Value], pick: Pick) -> Value:
-        """Exact extremum of one or more arrays."""
+        """Exact elementwise minimum or maximum of one or more arrays."""
         first, *rest = items
         return first.apply("Min" if pick == "min" else "Max", *rest) if rest else first
 
     def amin(self, x: Value) -> Value:
-        """Minimum over axis 0, kept with length 1."""
+        """Minimum over axis 0, which is kept with length 1."""
         return self.join(x.rows(), "min")
 
     def amax(self, x: Value) -> Value:
-        """Maximum over axis 0, kept with length 1."""
+        """Maximum over axis 0, which is kept with length 1."""
         return self.join(x.rows(), "max")
 
     def cummin(self, x: Value) -> Value:
@@ -171,52 +171,52 @@ class OnnxOps:
         return _running(x, "Max")
 
     def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
-        """None: windows are computed by pairwise doubling."""
+        """Return None: there is no special method for windows."""
 
     def until(self, left: Value, right: Value, pick: Pick, window: Sliding) -> None:
-        """None: `until` is computed by pairwise doubling."""
+        """Return None: there is no special method for `until`."""
 
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: Value) -> Hashable:
-        """Element type: floats become graph constants where they are used."""
+        """Return the element type: a float becomes a constant of this type in the graph."""
         return like.kind
 
     def constant(self, value: float, like: Value) -> float:  # noqa: ARG002
-        """The float itself."""
+        """Return the float itself."""
         return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
-        """A constant array; an unknown batch size is 1, which broadcasts."""
+        """Array of a constant; an unknown batch size becomes 1, which broadcasts."""
         known = like.sheet.constant(value, like.kind)
         return known.expand(*(1 if length == BATCH else length for length in shape))
 
     def counted(self, first: int, count: int, like: Value) -> Value:
-        """Integers along time; an unknown batch size is 1, which broadcasts."""
+        """Array that counts `first`, `first + 1`, … along time; an unknown batch size becomes 1."""
         numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
         return numbers.expand(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 
     def cat(self, parts: Sequence[Value]) -> Value:
-        """Concatenation along axis 0."""
+        """Concatenate arrays along axis 0."""
         widest = max(parts, key=lambda part: part.shape[-1])
         return joined([part.expand(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
 
     def flip(self, x: Value) -> Value:
-        """Reversed along axis 0."""
+        """Reverse `x` along axis 0."""
         return x[::-1] if x.shape[0] > 1 else x
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Empty context: nothing is computed while recording."""
+        """Empty context, since nothing is computed while a graph is recorded."""
         return nullcontext()
 
 
 def _negative(x: Value) -> Value:
-    """Mask of the sign bit, set for -0 too."""
+    """Mask of negative numbers, -0 included."""
     return ONNX_OPS.where(x.apply("Equal", 0.0, kind="bool"), 1.0 / x, x).apply("Less", 0.0, kind="bool")
 
 
 def _flat(slope: Value) -> Value:
-    """Arc tangent of a slope in [0, 1]: in float32, then one Newton step."""
+    """Arc tangent of a slope in [0, 1]: computed in float32, then improved by one Newton step."""
     near = slope.cast("float32").apply("Atan").cast(slope.kind)
     if slope.kind == "float32":
         return near
@@ -225,7 +225,7 @@ def _flat(slope: Value) -> Value:
 
 
 def _running(x: Value, op: str) -> Value:
-    """Running extremum in about log2(rows) operations."""
+    """Running minimum or maximum (`op`) in about log2(rows) operations."""
     size = 1
     while size < x.shape[0]:
         x = joined([x[:size], x[size:].apply(op, x[:-size])])
@@ -246,15 +246,15 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
     """Return the exact robustness at the first `count` samples.
 
     Args:
-        formulas: in negation normal form.
-        columns: `(samples, batch)` each.
+        formulas: formulas in negation normal form.
+        columns: signal name -> value, `(samples, batch)`.
         count: number of samples, from the first on.
 
     Returns:
-        For each formula a value (count, batch), or (count, 1) where it is a constant.
+        For each formula a value (count, batch), or (count, 1) if it is constant.
 
     Raises:
-        Untranslatable: a formula needs samples beyond the last, or calls a Python function.
+        Untranslatable: a formula needs samples beyond the last one, or calls a Python function.
     """
     env = dict(columns)
     samples = len(next(iter(env.values())))
@@ -268,7 +268,7 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
 
 
 def require_numbers(nums: Iterable[ir.Num]) -> None:
-    """Raise Untranslatable where a number calls a function that is known in Python only."""
+    """Raise Untranslatable if an expression calls a function that is known in Python only."""
     for num in nums:
         for part in subexpressions(num):
             if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
@@ -276,7 +276,7 @@ def require_numbers(nums: Iterable[ir.Num]) -> None:
 
 
 def _without_freeze(formula: ir.Formula, env: Columns) -> ir.Formula:
-    """Return the formula with each `freeze` replaced by a new column of `env`."""
+    """Return the formula with each `freeze` replaced by a new signal, which is added to `env`."""
     if isinstance(formula, ir.Freeze):
         name = f"#frozen{len(env)}"
         env[name] = _frozen(formula, env)
@@ -285,7 +285,7 @@ def _without_freeze(formula: ir.Formula, env: Columns) -> ir.Formula:
 
 
 def _frozen(node: ir.Freeze, env: Columns) -> Value:
-    """Robustness of a `freeze` at all samples, `(samples, batch)`; NaN where undefined."""
+    """Robustness of a `freeze` formula at all samples, `(samples, batch)`; NaN where undefined."""
     like = next(iter(env.values()))
     program, samples = ArrayProgram(dict(node.bindings)), len(like)
     rows = []

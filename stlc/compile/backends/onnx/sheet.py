@@ -1,8 +1,8 @@
-"""Recorder of ONNX graphs: symbolic arrays and the nodes between them.
+"""Recorder of ONNX graphs: symbolic arrays and the operations between them.
 
 A `Value` behaves like an array in the evaluators: shape, slicing along time, arithmetic. Each operation
-becomes a node of its sheet; equal ones are shared. `stlc.export.onnx_file` writes sheets to files; this
-module does not import ONNX.
+becomes a node of the graph that the value belongs to; equal nodes are shared. `stlc.export.onnx_file` writes
+graphs to files; this module does not import ONNX.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ class GraphNode:
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names that the node depends on, including those of the outer graph that its body reads."""
+        """Names that the node depends on, including those of the enclosing graph that its loop body reads."""
         bodies = (value for _, value in self.attributes if isinstance(value, GraphBody))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphBody:
-    """Loop body: a graph inside a node.
+    """Body of a loop: a graph inside a node.
 
     Attributes:
-        sheet: its graph; `sheet.inputs` are the inputs of an iteration.
-        outputs: of an iteration.
+        sheet: graph of an iteration; `sheet.inputs` are its inputs.
+        outputs: values that an iteration returns.
     """
 
     sheet: OnnxGraph
@@ -57,12 +57,12 @@ class GraphBody:
 
     @property
     def nodes(self) -> list[GraphNode]:
-        """Nodes of an iteration, in order."""
+        """Nodes that an iteration needs, in order."""
         return self.sheet.needed(self.outputs)
 
     @property
     def around(self) -> frozenset[str]:
-        """Names of the outer graph that the body reads."""
+        """Names of the enclosing graph that the body reads."""
         nodes = self.nodes
         read = {name for node in nodes for name in node.reads} | {value.name for value in self.outputs}
         made = {name for node in nodes for name in node.outputs}
@@ -76,10 +76,10 @@ class OnnxGraph:
     """ONNX graph under construction.
 
     Attributes:
-        nodes: in order.
+        nodes: operations in order.
         constants: name -> array.
-        inputs: of the graph.
-        prefix: of its names, distinct for a body and its outer graph.
+        inputs: input values of the graph.
+        prefix: prefix of its names, different for a loop body and the enclosing graph.
     """
 
     nodes: list[GraphNode] = field(default_factory=list)
@@ -89,12 +89,12 @@ class OnnxGraph:
     _known: dict[tuple[object, ...], tuple[Value, ...]] = field(default_factory=dict)
 
     def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float64") -> Value:
-        """Add an input."""
+        """Add an input of the graph."""
         self.inputs.append(Value(self, name, shape, kind))
         return self.inputs[-1]
 
     def constant(self, value: object, kind: Kind = "float64") -> Value:
-        """Return a constant of any shape; equal ones are shared."""
+        """Return a constant of any shape; equal constants are shared."""
         array = np.asarray(value, dtype=kind)
         key = ("constant", kind, array.shape, array.tobytes())
         if key not in self._known:
@@ -125,13 +125,14 @@ class OnnxGraph:
         return self._known[key]
 
     def repeated(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
-        """Write a loop over rows: unrolled where short, else as a `Scan` node.
+        """Write a loop over rows: unrolled if it is short, else as a `Scan` node.
 
         Args:
             carried: initial values of the loop state.
-            rows: (count, …) each; an iteration gets one row (1, …) of each.
-            turn: loop body: sheet to write to, state and rows -> state of the same shapes, and outputs,
-                (1, …) each. `Value.on` imports values of the outer graph.
+            rows: values (count, …); an iteration gets one row (1, …) of each.
+            turn: loop body, a function of the graph to write to, the loop state and the rows; returns the
+                next loop state, of the same shapes, and outputs, (1, …) each. `Value.on` imports values of
+                the enclosing graph.
 
         Returns:
             Outputs of all iterations, (count, …) each.
@@ -156,7 +157,7 @@ class OnnxGraph:
         return tuple(joined(each) for each in zip(*history, strict=True))
 
     def needed(self, outputs: Sequence[Value]) -> list[GraphNode]:
-        """Return the nodes that outputs depend on, in order."""
+        """Return the nodes that `outputs` depend on, in order."""
         wanted, kept = {value.name for value in outputs}, []
         for node in reversed(self.nodes):
             if wanted & set(node.outputs):
@@ -170,9 +171,9 @@ class Value:
     """Symbolic array.
 
     Attributes:
-        sheet: graph that it belongs to.
-        name: in the graph.
-        shape: `BATCH` where a length is not known.
+        sheet: graph that the value belongs to.
+        name: name of the value in the graph.
+        shape: lengths of the axes; `BATCH` for an unknown length.
         kind: element type.
     """
 
@@ -182,7 +183,7 @@ class Value:
     kind: Kind
 
     def on(self, sheet: OnnxGraph) -> Value:
-        """Return the value as an input to the sheet of a loop body."""
+        """Return the value for use in `sheet`, the graph of a loop body."""
         return Value(sheet, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic
@@ -215,7 +216,7 @@ class Value:
         return self.apply("Neg")
 
     def beside(self, other: Value | float) -> Value:
-        """Return a number as a constant of the same kind; a value is returned unchanged."""
+        """Convert a float to a constant of the element type of this value; a value is returned unchanged."""
         return other if isinstance(other, Value) else self.sheet.constant(other, self.kind)
 
     def apply(self, op: str, *others: Value | float, kind: Kind | None = None) -> Value:
@@ -225,7 +226,7 @@ class Value:
         return out
 
     def broadcast(self, *others: Value) -> tuple[int, ...]:
-        """Broadcast shape."""
+        """Shape to which this value and `others` broadcast."""
         return reduce(_broadcast, (other.shape for other in others), self.shape)
 
     def cast(self, kind: Kind) -> Value:
@@ -261,7 +262,7 @@ class Value:
         return out
 
     def rows(self) -> tuple[Value, ...]:
-        """Return each row along axis 0, with the axis kept."""
+        """Split into rows along axis 0, (1, …) each."""
         count = self.shape[0]
         if count == 1:
             return (self,)
@@ -270,7 +271,7 @@ class Value:
         return self.sheet.emit("Split", (self, sizes), shapes, self.kind, {"axis": 0})
 
     def reshaped(self, *shape: int) -> Value:
-        """Reshape; at most one length of the new shape is `BATCH`."""
+        """Reshape; at most one length of the new shape may be `BATCH` (unknown)."""
         wanted = self.sheet.constant([-1 if length == BATCH else length for length in shape], "int64")
         (out,) = self.sheet.emit("Reshape", (self, wanted), [shape], self.kind)
         return out
@@ -287,7 +288,7 @@ class Value:
         return self.transposed(1, 0)
 
     def expand(self, *shape: int, like: Value | None = None) -> Value:
-        """Expand axes of length 1 to a shape; its `BATCH` is the last axis of `like`."""
+        """Expand axes of length 1 to a shape; a `BATCH` (unknown length) in it is the last axis of `like`."""
         if self.shape == shape:
             return self
         parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]
@@ -298,7 +299,7 @@ class Value:
         return out
 
     def count(self) -> Value:
-        """Length of the last axis, (1,) int64."""
+        """Length of the last axis as a value, (1,) int64."""
         (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
         return out
 

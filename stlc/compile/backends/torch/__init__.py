@@ -1,1 +1,1 @@
-"""The array namespace over torch."""
+"""Torch back end: array operations with gradients."""

@@ -1,8 +1,8 @@
-"""Extrema in torch with cheap subgradients: of several arrays, along time, over sliding windows, and `until`.
+"""Minimum and maximum in torch with fast subgradients: elementwise, along time, over windows, and `until`.
 
-Torch's own backward passes spend most of their time on boolean masks. Here masks are numbers, stored in the
+The backward passes of torch spend most of their time on boolean masks. Here masks are numbers, stored in the
 memory of the resulting gradient. Windows are computed by the C kernel (`stlc.compile.backends.array.kernel`),
-or for small arrays by gathering all windows.
+or, for small arrays, by gathering all windows into one array.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Choice(torch.autograd.Function):
 
 
 class _Reduction(torch.autograd.Function):
-    """Extremum over axis 0, kept; equal operands share the gradient."""
+    """Minimum or maximum over axis 0, which is kept; equal operands share the gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, pick: Pick) -> Tensor:
@@ -77,7 +77,7 @@ class _Reduction(torch.autograd.Function):
 
 
 def choice(items: Sequence[Tensor], pick: Pick) -> Tensor:
-    """Return the elementwise extremum of one or more arrays."""
+    """Return the elementwise minimum or maximum of one or more arrays."""
     first = items[0]
     if len(items) == 1:
         return first
@@ -92,7 +92,7 @@ def choice(items: Sequence[Tensor], pick: Pick) -> Tensor:
 
 
 def reduction(x: Tensor, pick: Pick) -> Tensor:
-    """Return the extremum over axis 0, kept with length 1."""
+    """Return the minimum or maximum over axis 0, which is kept with length 1."""
     if x.requires_grad and x.numel() >= _LARGE_COLUMN:
         out: Tensor = _Reduction.apply(x, pick)  # type: ignore[no-untyped-call]
         return out
@@ -103,7 +103,7 @@ def reduction(x: Tensor, pick: Pick) -> Tensor:
 
 
 class _Windows(torch.autograd.Function):
-    """Window extrema of one operand, `until` or `release` of two; one of equal rows gets the gradient."""
+    """Extrema of one operand over windows, or `until` of two; one of equal rows gets the whole gradient."""
 
     @staticmethod
     def forward(ctx: Any, kernel: WindowKernel, *operands: Tensor) -> Tensor:
@@ -123,10 +123,10 @@ class _Windows(torch.autograd.Function):
 
 
 def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
-    """Return sliding extrema of one array, `until` or `release` of two; None where there is no kernel.
+    """Return the extrema of one array over windows, or `until` or `release` of two; None without a kernel.
 
     Args:
-        operands: `(time, batch)`, of one dtype.
+        operands: arrays `(time, batch)` of one dtype.
         pick: "max" for `until`, "min" for `release`.
         window: layout of the windows.
     """
@@ -145,7 +145,7 @@ def _strided(x: Tensor) -> Strided:
 
 
 def _like(x: Tensor, rows: int) -> Tensor:
-    """Uninitialized memory for `rows` rows in the layout of `x`: samples or traces contiguous."""
+    """Uninitialized array of `rows` rows with the memory layout of `x`."""
     batch = x.shape[1]
     return x.new_empty((batch, rows)).T if x.stride(0) == 1 and batch > 1 else x.new_empty((rows, batch))
 
@@ -154,12 +154,12 @@ def _like(x: Tensor, rows: int) -> Tensor:
 
 
 def is_small(x: Tensor, window: Sliding) -> bool:
-    """True if all windows may be gathered, which takes `rows * width` elements."""
+    """True if the array is small enough to gather all windows, which takes `rows * width` elements."""
     return x.numel() * window.width <= _SMALL
 
 
 def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
-    """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`."""
+    """Exact extrema over sliding windows: `(time, batch)` -> `(count, batch)`."""
     if window.to_end:
         turned = x.flip(0)
         running = torch.cummin(turned, 0) if pick == "min" else torch.cummax(turned, 0)
@@ -169,7 +169,7 @@ def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
 
 
 def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
-    """Exact `until` and `release`: two of `(time, batch)` -> `(count, batch)`."""
+    """Exact `until` ("max") or `release` ("min") over windows: `(time, batch)` -> `(count, batch)`."""
     held, then = _gathered(left, neutral(dual(pick)), window), _gathered(right, neutral(pick), window)
     if pick == "max":
         return torch.minimum(torch.cummin(held, -1).values, then).amax(dim=-1)
@@ -177,7 +177,7 @@ def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Ten
 
 
 def _gathered(x: Tensor, fill: float, window: Sliding) -> Tensor:
-    """Gathered windows, `(count, batch, width)`."""
+    """All windows as one array, `(count, batch, width)`; rows beyond the array are `fill`."""
     missing = window.count + window.width - 1 - window.rows
     filled = pad(x, (0, 0, 0, missing), value=fill) if missing > 0 else x
     return _first(filled.unfold(0, window.width, 1), window.count)

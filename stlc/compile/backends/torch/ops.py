@@ -1,4 +1,4 @@
-"""Array namespace over torch: gradients, batches, any device. Every method is one or two operations."""
+"""Array operations of torch, with gradients, on any device. Every method is one or two torch operations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _SafeSqrt(torch.autograd.Function):
 
 
 class _MaskedRows(torch.autograd.Function):
-    """Rows of an array, with a constant in the others."""
+    """Copy of an array with a constant in the rows outside a mask; those rows have no gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
@@ -67,7 +67,7 @@ def _masked(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
 
 
 class _SmoothMax(torch.autograd.Function):
-    """`log(sum(exp(k x))) / k` over axis 0; infinite values have no gradient and cause no NaN."""
+    """`log(sum(exp(k x))) / k` over axis 0; infinite values have gradient 0 and cause no NaN."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
@@ -86,7 +86,7 @@ class _SmoothMax(torch.autograd.Function):
 
 
 class _SmoothMax2(torch.autograd.Function):
-    """`log(exp(k a) + exp(k b)) / k` for operands of one shape."""
+    """`log(exp(k a) + exp(k b)) / k` for operands of the same shape."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
@@ -111,7 +111,7 @@ def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Return both operands as tensors, where torch needs two."""
+    """Return both operands as tensors, for torch functions that do not accept a float."""
     if isinstance(a, Tensor):
         return a, b if isinstance(b, Tensor) else _constant(b, a.dtype, a.device)
     assert isinstance(b, Tensor)
@@ -120,9 +120,9 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 @final
 class TorchOps:
-    """`stlc.compile.backends.array.namespace.Ops` over torch tensors; dtype and device follow the operands.
+    """`stlc.compile.backends.array.namespace.Ops` for torch tensors; results keep dtype and device.
 
-    Operands are `(time, batch)`, or of any shapes that broadcast; axis 0 is time, reduced to `(1, batch)`.
+    Operands are `(time, batch)` or of any shapes that broadcast; reductions over time give `(1, batch)`.
     """
 
     name = "torch"
@@ -144,12 +144,12 @@ class TorchOps:
     where = staticmethod(torch.where)
 
     def sqrt(self, x: Tensor) -> Tensor:
-        """Square root; gradient 0 at 0."""
+        """Square root; its gradient at 0 is 0."""
         root: Tensor = _SafeSqrt.apply(x)  # type: ignore[no-untyped-call]
         return root
 
     def atan2(self, a: Tensor | float, b: Tensor | float) -> Tensor:
-        """Angle of the point (b, a)."""
+        """Angle of the point (b, a), in radians."""
         return torch.atan2(*_pair(a, b))
 
     def axpy(self, a: Tensor | float, b: Tensor, factor: float) -> Tensor:
@@ -161,11 +161,11 @@ class TorchOps:
         return torch.addcmul(_pair(a, b)[0], b, c, value=factor)
 
     def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
-        """`x` clamped to [low, high]; the gradient at a bound is 1."""
+        """Clamp `x` to [low, high]; the gradient at a bound is 1."""
         return torch.clamp(x, low, high)
 
     def norm(self, *components: Tensor | float) -> Tensor:
-        """Euclidean length; gradient 0 at 0."""
+        """Euclidean norm of a vector given by its components; its gradient at 0 is 0."""
         like = next(part for part in components if isinstance(part, Tensor))
         first, *others = (_pair(part, like)[0] for part in components)
         total = first * first
@@ -177,24 +177,24 @@ class TorchOps:
         return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
 
     def settled(self, weight: Tensor, mask: Mask) -> Tensor:
-        """1 where `mask`, else 0, with the gradient of `weight`."""
+        """Array that is 1 where `mask` is True, else 0, with the gradient of `weight`."""
         return weight + (self.number(mask, weight) - weight.detach())
 
     def number(self, mask: Mask, like: Tensor) -> Tensor:
-        """1 where `mask`, else 0."""
+        """Array that is 1 where `mask` is True, else 0."""
         out: Tensor = mask.to(like.dtype)
         return out
 
     def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
-        """`no + weight (yes - no)`, exact at both ends."""
+        """`no + weight (yes - no)`, exact if `weight` is 0 or 1."""
         return torch.lerp(*_pair(no, yes), weight)
 
     def infinite(self, mask: Mask, like: Tensor) -> Tensor:
-        """+inf where `mask`, else -inf, without gradient."""
+        """Array that is +inf where `mask` is True, else -inf, without gradient."""
         return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
 
     def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
-        """Hard forward, the slope of a tanh backward; `soft + (1 - soft)` is exactly 1 for `soft` >= 1/2."""
+        """Array of exactly 0 or 1 by the sign of `rho`, with the gradient of `(1 + tanh(slope rho)) / 2`."""
         hard = torch.heaviside(rho.detach(), self.constant(0.0 if strict else 1.0, rho))
         if not rho.requires_grad:
             return hard
@@ -202,15 +202,15 @@ class TorchOps:
         return soft + (hard - soft.detach())
 
     def amin(self, x: Tensor) -> Tensor:
-        """Minimum over axis 0, kept with length 1; ties share the gradient."""
+        """Minimum over axis 0, which is kept with length 1; equal operands share the gradient."""
         return reduction(x, "min")
 
     def amax(self, x: Tensor) -> Tensor:
-        """Maximum over axis 0, kept with length 1; ties share the gradient."""
+        """Maximum over axis 0, which is kept with length 1; equal operands share the gradient."""
         return reduction(x, "max")
 
     def sum(self, x: Tensor) -> Tensor:
-        """Sum over axis 0, kept with length 1."""
+        """Sum over axis 0, which is kept with length 1."""
         return x.sum(dim=0, keepdim=True)
 
     def cummin(self, x: Tensor) -> Tensor:
@@ -228,7 +228,7 @@ class TorchOps:
         return choice(items, pick)
 
     def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact extrema of sliding windows; one of several equal operands may get all of the gradient."""
+        """Exact extrema over sliding windows; one of equal operands may get the whole gradient."""
         if x.ndim != 2 or torch.compiler.is_exporting():
             return None
         if is_small(x, window):
@@ -236,7 +236,7 @@ class TorchOps:
         return by_kernel((x,), pick, window)
 
     def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact `until` and `release`; one of several equal operands may get all of the gradient."""
+        """Exact `until` and `release`; one of equal operands may get the whole gradient."""
         if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
             return None
         if is_small(left, window):
@@ -244,51 +244,51 @@ class TorchOps:
         return by_kernel((left, right), pick, window)
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
-        """Smooth extremum over axis 0, kept with length 1."""
+        """Smooth maximum (`k` > 0) or minimum over axis 0, which is kept with length 1."""
         out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
         return out
 
     def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
-        """Smooth extremum of two arrays of one shape."""
+        """Smooth maximum (`k` > 0) or minimum of two arrays of the same shape."""
         out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
         return out
 
     def kind(self, like: Tensor) -> Hashable:
-        """Dtype and device: arrays that agree in both share constants."""
+        """Return dtype and device: arrays that agree in both can share constants."""
         return like.dtype, like.device
 
     def constant(self, value: float, like: Tensor) -> Tensor:
-        """Zero-dimensional tensor: torch would convert a Python number in every operation."""
+        """Return a zero-dimensional tensor, since torch would convert a Python number in every operation."""
         return _constant(value, like.dtype, like.device)
 
     def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
-        """A constant array; infinite where the dtype cannot hold the value."""
+        """Array of a constant; infinite if the dtype cannot represent the value."""
         return self.constant(value, like).expand(shape).clone()
 
     def cat(self, parts: Sequence[Tensor]) -> Tensor:
-        """Concatenation along axis 0."""
+        """Concatenate arrays along axis 0."""
         return torch.cat(list(parts))
 
     def stack(self, parts: Sequence[Tensor]) -> Tensor:
-        """Arrays stacked along a new axis 0."""
+        """Stack arrays along a new axis 0."""
         return torch.stack(list(parts))
 
     def counted(self, first: int, count: int, like: Tensor) -> Tensor:
-        """Integers along time."""
+        """Array that counts `first`, `first + 1`, … along time."""
         numbers = torch.arange(first, first + count, dtype=like.dtype, device=like.device)
         return numbers.view(-1, *(1,) * (like.ndim - 1)).expand(count, *like.shape[1:])
 
     def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
-        """Uninitialized tensor, writable outside of inference mode too."""
+        """Uninitialized tensor that is writable also outside of inference mode."""
         with torch.inference_mode(False):
             return like.new_empty(shape)
 
     def flip(self, x: Tensor) -> Tensor:
-        """Reversed along axis 0."""
+        """Reverse `x` along axis 0."""
         return x.flip(0)
 
     def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
-        """`x` with `value` in the rows outside `keep`."""
+        """Copy of `x` with `value` in the rows where `keep` is False."""
         if keep.all():
             return x
         if torch.compiler.is_exporting():
@@ -302,7 +302,7 @@ class TorchOps:
         return x.permute(2, 1, 0).contiguous().unbind(0)
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Empty context: torch does not warn."""
+        """Empty context, since torch does not warn of invalid operations."""
         return nullcontext()
 
 
