@@ -1,17 +1,17 @@
-"""Random tasks over circles in the plane, in the manner of TeLoGraF (Meng & Fan, ICML 2025, arXiv 2504.03015).
+"""Random tasks over circles in the plane, in the manner of TeLoGraF (Meng & Fan 2025, arXiv 2504.03015).
 
-Sizes, windows and shapes of formulas are those of its generator (https://github.com/mengyuest/TeLoGraF, commit
-e37bece, `code/generate_scene_v1.py`): reach or stay, nested `and`/`or`, sequences, until, each with up to six
-obstacles. A plan has 64 steps; there, windows are cut at its last sample. Here a stay must end within the plan,
-and the successor in a sequence may come at any later time, so that every window fits; plans are then judged by
-the published formula with its windows cut.
+Sizes, windows and shapes of formulas are those of its generator (https://github.com/mengyuest/TeLoGraF,
+commit e37bece, `code/generate_scene_v1.py`): reach or stay, nested `and`/`or`, sequences, until, each with up
+to six obstacles. The published windows are cut at the last sample of a plan of 64 steps. For planning, a stay
+must end within the plan, and the windows of a sequence share its length, so that all fit. Such a plan
+satisfies the published formula too, by which it is judged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot, pi
+from math import dist, hypot, pi
 
 from numpy.random import Generator, default_rng
 
@@ -64,9 +64,6 @@ class _Text:
     planned: str
     published: str
 
-    def map(self, template: str) -> _Text:
-        return _Text(template.format(self.planned), template.format(self.published))
-
 
 @dataclass(frozen=True, slots=True)
 class _Visit:
@@ -84,22 +81,17 @@ class _Visit:
         published = f"eventually[{self.first} steps, {self.last} steps] {self._held(inside)}"
         if not self.stay:
             return _Text(published, published)
-        begin, end = self.first + self.stay, min(self.last + self.stay, STEPS)
-        if begin > STEPS:  # the end of the plan cuts every stay
+        last = min(self.last, STEPS - self.stay)
+        planned = f"eventually[{self.first} steps, {last} steps] {self._held(inside)}"
+        if last < self.first:  # the end of the plan cuts every stay
             planned = f"eventually[{self.first} steps, {self.last} steps] always[0, end] {inside}"
-        else:
-            planned = f"eventually[{begin} steps, {end} steps] historically[0, {self.stay} steps] {inside}"
         return _Text(planned, published)
 
-    def then(self, rest: _Text, since: _Visit | None) -> _Text:
-        """With what follows it, as a formula at the end of the visit `since`, at first the first sample."""
-        inside = f"at_{self.circle}"
-        published = f"eventually[{self.first} steps, {self.last} steps] ({self._held(inside)} and {rest.published})"
-        begin, end = self.first + self.stay, f"{min(self.last + self.stay, STEPS)} steps"
-        if since is not None:
-            begin, end = max(self.first - since.stay, 1) + self.stay, "end"
-        held = f"historically[0, {self.stay} steps] {inside}" if self.stay else inside
-        return _Text(f"eventually[{begin} steps, {end}] ({held} and {rest.planned})", published)
+    def then(self, rest: str, last: int) -> str:
+        """Formula of this visit, to begin at `last` at the latest, and from its begin on of the `rest`."""
+        follow = f" and {rest}" if rest else ""
+        inside = self._held(f"at_{self.circle}")
+        return f"eventually[{self.first} steps, {min(self.last, last)} steps] ({inside}{follow})"
 
     def _held(self, inside: str) -> str:
         return f"always[0, {self.stay} steps] {inside}" if self.stay else inside
@@ -120,23 +112,25 @@ class _Draw:
     def task(self, kind: str | None) -> CircleTask:
         shares = [each / sum(RATIOS) for each in RATIOS]
         kind = kind or KINDS[int(self._random.choice(len(KINDS), p=shares))]
-        goal = {"reach": self._reach, "nested": self._nested, "sequence": self._sequence, "until": self._until}
-        parts = [("goal", goal[kind]())]
+        kinds: Mapping[str, Callable[[], _Text | list[_Visit]]] = {
+            "reach": self._reach,
+            "nested": self._nested,
+            "sequence": self._sequence,
+            "until": self._until,
+        }
+        drawn = kinds[kind]()
         goals = len(self._circles)
         for _ in range(int(self._random.choice(len(OBSTACLES), p=OBSTACLES))):
             if self._placed(MIDDLE, LARGE) is None:
                 break
-        avoid = f"always[0, {STEPS - 1} steps] not at_{{}}"
-        parts += [
-            (f"avoid_{i}", _Text(avoid.format(i), avoid.format(i))) for i in range(goals, len(self._circles))
-        ]
         start = self._start()
-        return CircleTask(
-            kind,
-            self._spec((name, text.planned) for name, text in parts),
-            self._spec((name, text.published) for name, text in parts),
-            (*start, float(self._random.uniform(-pi, pi)), float(self._random.uniform(0, 1))),
-        )
+        goal = drawn if isinstance(drawn, _Text) else self._chain(drawn, start)
+        avoid = {
+            f"avoid_{i}": f"always[0, {STEPS - 1} steps] not at_{i}" for i in range(goals, len(self._circles))
+        }
+        heading, speed = float(self._random.uniform(-pi, pi)), float(self._random.uniform(0, 1))
+        planned, published = ({"goal": text, **avoid} for text in (goal.planned, goal.published))
+        return CircleTask(kind, self._spec(planned), self._spec(published), (*start, heading, speed))
 
     # ------------------------------------------------------------------- kinds
 
@@ -154,23 +148,17 @@ class _Draw:
             ("rr",),
         )[depth]
         other = "or" if word == "and" else "and"
-        parts = []
-        for leaf in shapes[int(self._random.integers(len(shapes)))]:
-            parts.append(self._visit().alone if leaf == "r" else self._branch(depth + 1, other))
-        return _joined(word, parts)
+        shape = shapes[int(self._random.integers(len(shapes)))]
+        return _joined(
+            word, [self._visit().alone if leaf == "r" else self._branch(depth + 1, other) for leaf in shape]
+        )
 
-    def _sequence(self) -> _Text:
+    def _sequence(self) -> list[_Visit]:
         """Two to four visits, each within its window after the one before began."""
-        visits = [
+        return [
             self._visit(int(self._random.integers(8)), int(self._random.integers(STEPS - 8, STEPS)))
             for _ in range(int(self._random.integers(2, 5)))
         ]
-        told: _Text | None = None
-        for number in reversed(range(len(visits))):
-            rest = told or _Text("true", "true")
-            told = visits[number].then(rest, visits[number - 1] if number else None)
-        assert told is not None
-        return told
 
     def _until(self) -> _Text:
         pattern = PATTERNS[int(self._random.integers(len(PATTERNS)))]
@@ -225,12 +213,24 @@ class _Draw:
                 break
         return x, y
 
-    def _spec(self, parts: Sequence[tuple[str, str]]) -> str:
+    def _chain(self, visits: Sequence[_Visit], start: tuple[float, float]) -> _Text:
+        """Visits in sequence; for planning, each window has a share of the plan, by stays and distances."""
+        places = [start, *(self._circles[visit.circle][:2] for visit in visits)]
+        stays = [0, *(visit.stay for visit in visits)]
+        needs = [stay + 2 * dist(a, b) for stay, a, b in zip(stays, places, places[1:], strict=False)]
+        left = STEPS - stays[-1] - sum(visit.first for visit in visits)
+        published = planned = ""
+        for visit, need in zip(reversed(visits), reversed(needs), strict=True):
+            published = visit.then(published, visit.last)
+            planned = visit.then(planned, visit.first + int(left * need / sum(needs)))
+        return _Text(planned, published)
+
+    def _spec(self, requirements: Mapping[str, str]) -> str:
         lines = ["spec circles", "state signal x, y [m]"]
         for number, (x, y, r) in enumerate(self._circles):
             margin = f"({r:.4f} m)^2 - (x - ({x:.4f} m))^2 - (y - ({y:.4f} m))^2"
             lines.append(f"def at_{number} = {margin} >= 0 m^2")
-        return "\n".join([*lines, *(f"require {name}: {text}" for name, text in parts), ""])
+        return "\n".join([*lines, *(f"require {name}: {text}" for name, text in requirements.items()), ""])
 
 
 def _joined(word: str, parts: Sequence[_Text]) -> _Text:

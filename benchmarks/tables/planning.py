@@ -1,0 +1,229 @@
+"""Planning problems of other people: found or not, robustness and processor time, beside published figures.
+
+Problems of stlpy and STLCCP are one start each, whose robustness is maximised up to a target. Circles are
+tasks drawn in the manner of TeLoGraF, searched up to the first satisfying plan. Compilation is not counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from math import inf
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+import typer
+
+from benchmarks.circles import STEPS, draw
+from benchmarks.options import OnlyOption, ResultsOption
+from benchmarks.store import RESULTS, Key, ResultStore, inputs_of, load
+from benchmarks.table import Columns, Table, show
+from benchmarks.timing import one_thread
+from stlc.cli.framework.options import JsonOption
+from stlc.cli.framework.program import command
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.diagnostics import StlcError
+from stlc.files import find_system
+from stlc.provenance import sha256
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+
+SEED = 12345
+"""Of the planner; circles are the tasks of this seed and the following ones."""
+SLOW = {"umax": "0.2 m/s^2"}
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A problem: a specification with changes, or a system with drawn tasks.
+
+    Attributes:
+        spec: name in `specs/planning`, or of a system for circles.
+        published: figures of other tools, with their source.
+        steps: horizon, if changed.
+        target: robustness at which the search ends.
+        seconds: processor time a start.
+        tasks: number of drawn tasks; 0 for a specification.
+    """
+
+    spec: str
+    published: str
+    steps: int | None = None
+    target: float = inf
+    seconds: float = 10.0
+    tasks: int = 0
+
+    @property
+    def name(self) -> str:
+        """Specification and horizon."""
+        return self.spec + (f", T = {self.steps}" if self.steps else "")
+
+
+PROBLEMS = (
+    *(
+        Problem(name, "stlpy: by MILP, no figures")
+        for name in (
+            "reach_avoid",
+            "either_or",
+            "narrow_passage",
+            "door_puzzle_1",
+            "door_puzzle_2",
+            "stepping_stones",
+            "many_target",
+        )
+    ),
+    Problem("nonlinear_reach_avoid", "stlpy: by SNOPT, no figures"),
+    Problem("many_target", "STLCCP: Gurobi .50 / 2,527 s; CCP .36 to .50 / 12 to 22 s", 50, 0.48, 12.0),
+    Problem(
+        "narrow_passage", "STLCCP: Gurobi stopped at 15,000 s; CCP -.29 to .14 / 19 to 192 s", 75, 0.2, 20.0
+    ),
+    Problem("either_or", "STLCCP: Gurobi / 7,371 s; CCP at T = 100 .50 / 30 to 47 s", 105, 0.45, 20.0),
+    Problem(
+        "circles_linear", "gradient .94 / 4.9 s; TeLoGraF .52 / 1.3 s, fast .51 / .13 s", None, 0.0, 0.15, 100
+    ),
+    Problem("circles_dubins", "TeLoGraF .62 / 1.3 s; gradient .60 / 6.7 s", None, 0.0, 0.15, 100),
+)
+METHODS = ("search", "gradient", "cem", "milp")
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A method's plans for a problem.
+
+    Attributes:
+        found: number of satisfying plans, judged by the published formula.
+        starts: of so many.
+        rho: robustness; the median of several starts.
+        seconds: processor time a start, mean.
+        evaluations: judged plans a start, mean.
+    """
+
+    found: int
+    starts: int
+    rho: float
+    seconds: float
+    evaluations: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One cell of the table."""
+
+    problem: str
+    method: str
+    budget: float
+    target: float
+    seed: int
+    solution: Solution | None
+    reason: str
+    published: str
+
+
+COLUMNS: Columns[Row] = {
+    "problem": "{problem}",
+    "method": "{method}",
+    "budget": lambda row: f"{row.budget:g} s" + ("" if row.target == inf else f", rho ≥ {row.target:g}"),
+    "seed": "{seed}",
+    "found": lambda row: f"{row.solution.found} of {row.solution.starts}" if row.solution else row.reason,
+    "robustness": "{solution.rho:.3f}",
+    "processor s": "{solution.seconds:.3f}",
+    "plans": "{solution.evaluations:,.0f}",
+    "published (other machines)": "{published}",
+}
+
+
+@command("python -m benchmarks planning", "python -m benchmarks planning --only either_or --method milp")
+def planning(
+    only: OnlyOption = None,
+    method: Annotated[
+        list[str] | None, typer.Option("--method", metavar="NAME", help="Some of the planners; repeatable.")
+    ] = None,
+    out: ResultsOption = RESULTS,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan for problems of stlpy, STLCCP and TeLoGraF; finished cells are kept, so that a run continues."""
+    wanted = None if only is None else {each.strip() for each in only.split(",")}
+    store = ResultStore("planning", out)
+    cells = [
+        (problem, name)
+        for problem in PROBLEMS
+        if wanted is None or problem.spec in wanted
+        for name in method or METHODS
+        if not (name == "milp" and problem.tasks)
+    ]
+    with one_thread():
+        table = Table("planning", cells, lambda cell: measured(*cell, store), COLUMNS, "{problem}, {method}")
+        show("planning", {"rows": table}, as_json=as_json)
+
+
+def measured(problem: Problem, method: str, store: ResultStore) -> Row:
+    """The row of a cell: the stored solution, else a new one; a method that refuses the problem says why."""
+    budget, target = problem.seconds, problem.target
+    shown = (problem.name, method, budget, target, SEED)
+    try:
+        if problem.tasks:
+            texts = sha256("\0".join(draw(SEED + i).planned for i in range(problem.tasks)))
+            inputs: Mapping[str, Any] = {"tasks": texts, "system": sha256(_circles(problem).read_bytes())}
+        else:
+            inputs = inputs_of(_task(problem))
+        key = Key(
+            f"{problem.name}, {method}",
+            {**inputs, "steps": problem.steps, "seconds": budget, "target": str(target), "seed": SEED},
+        )
+        kept = store.get(
+            key, lambda: _values(_drawn(problem, method) if problem.tasks else _one(problem, method))
+        )
+    except StlcError as why:
+        return Row(*shown, None, str(why), problem.published)
+    return Row(
+        *shown, Solution(**{each.name: kept[each.name] for each in fields(Solution)}), "", problem.published
+    )
+
+
+def _values(solution: Solution) -> dict[str, float]:
+    return {each.name: getattr(solution, each.name) for each in fields(Solution)}
+
+
+def _task(problem: Problem) -> Task:
+    changed = {} if problem.steps is None else {"time.horizon": f"{problem.steps} steps", **SLOW}
+    return load(f"planning/{problem.spec}", tuple(changed.items()))
+
+
+def _one(problem: Problem, method: str) -> Solution:
+    task = _task(problem)
+    x0 = task.sample(1, seed=0, dtype=torch.float64)
+    found = plan(task, x0, method, budget=PlanBudget(problem.seconds, target=problem.target), seed=SEED)
+    values = (found.rho, found.seconds, found.evaluations.double())
+    return Solution(int(found.satisfied.sum()), 1, *(float(each[0]) for each in values))
+
+
+def _circles(problem: Problem) -> Path:
+    return find_system(f"examples/planning/{problem.spec}.yaml")
+
+
+def _drawn(problem: Problem, method: str) -> Solution:
+    """Plans for drawn tasks, judged by the published formulas with windows cut at the last sample."""
+    import stlc
+    from stlc.controller.problem.task import Task
+    from stlc.dynamics.model.system import System
+
+    system = System.load(_circles(problem))
+    rows = []
+    for seed in range(SEED, SEED + problem.tasks):
+        drawn = draw(seed)
+        task = Task.of(stlc.parse(drawn.planned), system)
+        x0 = torch.tensor([drawn.x0[: len(system.names)]], dtype=torch.float64)
+        made = plan(task, x0, method, budget=PlanBudget(problem.seconds), seed=SEED)
+        states = task.rollout(made.states, made.plans)[0, : STEPS + 1].numpy()
+        signals = {"x": states[:, 0], "y": states[:, 1]}
+        rho = stlc.Monitor(stlc.parse(drawn.published), dt=system.dt).robustness(
+            signals, at=0, end="truncate"
+        )
+        rows.append((float(rho), float(made.seconds[0]), float(made.evaluations[0])))
+    rho, seconds, evaluations = zip(*rows, strict=True)
+    found = sum(each >= -TOLERANCE for each in rho)
+    return Solution(found, len(rows), sorted(rho)[len(rho) // 2], fmean(seconds), fmean(evaluations))
