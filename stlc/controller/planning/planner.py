@@ -18,7 +18,7 @@ from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.policies.policy import Policy
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.native import Stop, never
 from stlc.registry import PLANNERS, closest
 
@@ -256,12 +256,16 @@ def plan(
         The best plans, judged exactly in float64.
 
     Raises:
-        UsageError: U101, there is no such planner or option, or it cannot plan for this task.
+        UsageError: U101, there is no such planner or option, it cannot plan for this task, or the states have
+            other columns than its system.
         MissingError: R301, the planner needs a package that is not installed.
     """
-    solver = planner_named(method, **options).prepare(task)
     given = torch.as_tensor(x0, dtype=torch.float64)
     states = given if given.dim() == 2 else given[None]
+    names = task.system.names
+    if states.dim() != 2 or states.shape[1] != len(names):
+        raise usage(f"initial states of {tuple(given.shape)} are not (B, {len(names)})", ", ".join(names))
+    solver = planner_named(method, **options).prepare(task)
     search = PlanSearch(task, states, budget or PlanBudget(), seed=seed, start=start, progress=progress)
     solver(search)
     return search.result

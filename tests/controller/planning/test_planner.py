@@ -135,3 +135,9 @@ def test_progress_is_reported(car_task: Task) -> None:
     plan(car_task, x0, "search", budget=PlanBudget(5.0, 4_000, torch.inf), progress=note)
     assert seen == sorted(seen)
     assert len(seen) >= 2
+
+
+def test_states_with_other_columns_are_refused() -> None:
+    task = stlc.compile(stlc.load("specs/reach_n_avoid.stl"), stlc.System.load("examples/maze.yaml"))
+    with pytest.raises(UsageError, match="initial states of"):
+        stlc.plan(task, torch.zeros(2))

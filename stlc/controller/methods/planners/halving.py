@@ -1,0 +1,85 @@
+"""`halving`: many local searches from random plans; the best go on, for longer (successive halving)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.training.local_search import Searcher
+
+if TYPE_CHECKING:
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Halving:
+    """Local searches from random piecewise constant plans, by successive halving (Karnin et al. 2013).
+
+    A plan that visits goals in the wrong order improves up to a robustness just below 0, where single moves
+    lead no further. Other beginnings lead elsewhere, so each round begins many searches and continues the
+    best.
+
+    Attributes:
+        starts: searches of a start that a round begins.
+        tries: plans of each search in the first rung.
+        keep: one of this many searches goes on to the next rung, with as many times the plans.
+        pieces: most pieces of a random plan.
+    """
+
+    starts: int = 64
+    tries: int = 64
+    keep: int = 4
+    pieces: int = 12
+
+    def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
+        """Nothing to prepare."""
+        return self._run
+
+    def _run(self, search: PlanSearch) -> None:
+        enough = search.budget.target or TOLERANCE
+        searcher = Searcher(search.task, search.generator, enough=enough)
+        while len(rows := search.open()):
+            for part in torch.split(rows, 512):
+                plans = self._random(search, len(part))
+                tries = self.tries
+                while len(going := part[torch.isin(part, search.open())]):
+                    plans = plans[torch.isin(part, going)]
+                    part = going
+                    with search.charged(part):
+                        plans = self._rung(search, part, plans, searcher, tries)
+                    if plans.shape[1] == 1:
+                        break
+                    plans, tries = plans[:, : -(-plans.shape[1] // self.keep)], tries * self.keep
+
+    def _rung(
+        self, search: PlanSearch, rows: Tensor, plans: Tensor, searcher: Searcher, tries: int
+    ) -> Tensor:
+        """Continue the searches of some starts: (k, p, T, m) -> the same, the best first."""
+        count = plans.shape[1]
+        tries = max(1, search.affordable(rows, tries * count) // count)
+        x0 = search.states[rows].repeat_interleave(count, 0)
+        bank = plans.new_zeros(0, *plans.shape[2:])
+        found = searcher.repair(x0, plans.flatten(0, 1), bank, tries=tries, stop=search.budget.stop)
+        order = found.rho.view(-1, count).argsort(1, descending=True)
+        sorted_ = found.plans.view_as(plans).gather(1, order[..., None, None].expand_as(plans))
+        search.offer(rows, sorted_[:, 0], evaluations=tries * count)
+        return sorted_
+
+    def _random(self, search: PlanSearch, count: int) -> Tensor:
+        """Piecewise constant plans, each with its own number of pieces: (count, starts, T, m)."""
+        system, draw = search.task.system, search.generator
+        low, high = system.control_low.double(), system.control_high.double()
+        steps, shape = system.horizon, (count, self.starts)
+        number = torch.randint(1, self.pieces + 1, (*shape, 1), generator=draw)
+        begins = torch.rand(*shape, steps, generator=draw) < number / steps
+        piece = begins.cumsum(2)[..., None].expand(-1, -1, -1, len(low))
+        levels = torch.rand(*shape, steps + 1, len(low), generator=draw).double()
+        return low + (high - low) * levels.gather(2, piece)
+
+
+PLANNER = Halving
