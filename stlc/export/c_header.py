@@ -119,7 +119,10 @@ def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
 
 
 def _framed(text: str, guard: str) -> str:
-    """Insert the compiler directives after the include guard; a text without the guard is unchanged."""
+    """Insert compiler directives (`extern "C"` and the like) after the include guard of a header.
+
+    A text without the guard is unchanged.
+    """
     if guard not in text:
         return text
     body, end = text.replace(guard, guard + _OPENING, 1).rsplit("#endif", 1)

@@ -183,7 +183,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
 def _folded(
     task: Task, network: PlanNetwork, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
-    """States on the side of the mirror on which the network was trained, and the mask of reflected ones."""
+    """States reflected to the mirror side that the network was trained on; mask of the reflected ones."""
     if network.mirror is None:
         return state, None
     moved = assigned(state_images(task), state)

@@ -178,7 +178,10 @@ class Guarding(nn.Module):
 
 
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """Index of the plan with the longest safe prefix; ties: highest robustness, then latest violation."""
+    """Index of the plan with the longest safe prefix.
+
+    Among equal ones, that of highest robustness, then with the latest violation.
+    """
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)
     longest = samples == samples.amax(1, keepdim=True)

@@ -112,7 +112,7 @@ def _torch(run: Run, folder: Path) -> Checked:
 
 
 def _onnx(run: Run, folder: Path) -> Checked:
-    """Write the graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
+    """Write the ONNX graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
@@ -122,7 +122,7 @@ def _onnx(run: Run, folder: Path) -> Checked:
 
 
 def _c(run: Run, folder: Path) -> Checked:
-    """Write a header, its weights, an example program and its Makefile."""
+    """Write the C header, its weights, an example program and its Makefile."""
     try:
         text = c_header.header(run.task, run.network)
     except Untranslatable as error:

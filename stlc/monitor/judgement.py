@@ -1,4 +1,4 @@
-"""Verdicts per requirement and in total, per trace and over all traces."""
+"""Verdicts on traces: for one requirement or for all, per trace or over all traces."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Judgement:
         ]
 
     def counted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values (…, traces) of the traces within `scope`."""
+        """Select the traces that satisfy the assumptions (`scope`) from `values` (…, traces)."""
         return values if self.scope is None else values[..., self.scope]
 
     @property

@@ -73,7 +73,7 @@ class _PrefixBound:
         return self._seen(inner, 0) if cut and some is self.least else inner
 
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """An unbounded window that starts after the end of the trace: unknown, or empty where it is cut."""
+        """The formula; if its unbounded window starts after the trace ends, unknown, or empty if clipped."""
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)

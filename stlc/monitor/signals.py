@@ -312,7 +312,7 @@ def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace)
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """Conversion between units: `x * factor + shift`."""
+    """Conversion from one unit to another: `x * factor + shift`."""
 
     factor: float
     shift: float

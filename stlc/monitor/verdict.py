@@ -309,7 +309,7 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """True for traces that the assumptions do not exclude, (traces,)."""
+    """True for traces that do not certainly violate the assumptions, (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]

@@ -75,7 +75,10 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
 
 
 def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
-    """Index of the plan with the longest safe prefix; ties: highest robustness, then latest violation."""
+    """Index of the plan with the longest safe prefix.
+
+    Among equal ones, that of highest robustness, then with the latest violation.
+    """
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(
         [

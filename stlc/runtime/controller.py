@@ -129,7 +129,7 @@ class Controller:
         return tuple(each.name for each in self.facts.controls)
 
     def reset(self) -> None:
-        """Forget the previous plans, and restart the mission."""
+        """Forget the previous plans, and set the states that the specification adds as for a new mission."""
         self._previous = self._added = None
 
     def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> ControlDecision:
@@ -209,7 +209,7 @@ class Controller:
         return [state[name] for name in names]
 
     def _added_states(self, agents: int, elapsed: int) -> Numbers:
-        """States that the specification adds: as predicted by the model, or as at the start of a mission."""
+        """States that the specification adds: the model's prediction; at first, those of a new mission."""
         if self._added is not None:
             if elapsed != 1 or len(self._added) != agents:
                 raise _invalid("timers follow from every step", "give them as the last columns of the state")

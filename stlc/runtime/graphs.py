@@ -72,7 +72,7 @@ class Graphs:
         return _judged(found["plan"], found), found
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """The chosen plans, given previous ones; the output `kept` marks those that are continued."""
+        """Return the chosen plans, given the rests `begun` of previous ones; `kept` marks continued ones."""
         found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
@@ -82,7 +82,7 @@ class Graphs:
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
-        """Robustness of phi_safe on every prefix, (rows, T + 1); +inf without safety requirements."""
+        """Return the robustness of the safety requirements on every prefix, (rows, T + 1); +inf if none."""
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)
         return _run(self._fall, {"state": x, "plan": plans})["falls"]

@@ -1,4 +1,4 @@
-"""Recorded signals: traces, their clocks, and their file formats."""
+"""Recorded signals: traces, their sampling times, and their file formats."""
 
 from stlc.trace.trace import (
     AS_IT_IS,

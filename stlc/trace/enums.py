@@ -60,7 +60,7 @@ def wordless(recording: Recording) -> Recording:
 
 
 def _is_odd(values: NDArray[Any] | None) -> bool:
-    """True if an array holds words, or complex numbers."""
+    """True if an array contains words or complex numbers, which are not signal values."""
     return values is not None and values.dtype.kind in "Uc"
 
 

@@ -1,4 +1,4 @@
-"""Uniform time grid of a trace, and diagnostics where times are not uniform."""
+"""Uniform time grid of a trace, and error messages if its times are not uniform."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
 
 
 def snapped(step: float) -> float:
-    """Return a measured time step, rounded to a simple fraction where one is near."""
+    """Return a measured time step, rounded to a nearby simple fraction if there is one."""
     return _snap(step, None) if np.isfinite(step) and step > 0 else step
 
 

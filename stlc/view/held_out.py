@@ -217,7 +217,7 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
 
 
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """The two columns for a picture: those in the region's inequalities first, then by separation."""
+    """Indices of the two states to draw: those in the region's inequalities, then the best separating."""
     used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
     focus = _region(x0, [each for each in conditions if each.op == "="])
     many = [c for c in every if len(np.unique(x0[focus, c])) > FEW_VALUES] or every
@@ -358,7 +358,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
 
 
 def _draw_region(axes: Axes, weakness: Weakness, x0: NDArray[np.float64]) -> None:
-    """Outline the region's box in the two drawn columns."""
+    """Outline the failure region in the two states that are drawn."""
     from matplotlib.patches import Rectangle
 
     if len(x0) == 0 or not any(c.column in weakness.axes and c.op != "=" for c in weakness.conditions):

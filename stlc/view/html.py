@@ -1,4 +1,4 @@
-"""Injection-safe HTML: everything that is not `Html` is text and gets escaped."""
+"""HTML that is safe against injection: everything that is not `Html` is text and gets escaped."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def _controls(frames: int) -> Html:
 
 
 def _keys(panels: Sequence[RunPanel]) -> Html:
-    """The legend of all runs."""
+    """Legend of the symbols in the animations of all runs."""
     keys = {key.word: key for panel in panels for key in panel.keys}
     swatches = {
         word: el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)})

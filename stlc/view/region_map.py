@@ -260,7 +260,7 @@ def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None
 
 
 class _MovingAgents:
-    """The agents of an animation, each drawn as a point with a trail."""
+    """The agents in an animation, each drawn as a point with a trail."""
 
     def __init__(self, axes: Axes, region_map: RegionMap) -> None:
         chosen = region_map.first(MOST_AGENTS)
@@ -275,7 +275,7 @@ class _MovingAgents:
         )
 
     def turn(self, index: int) -> None:
-        """Move the agents to their positions at a sample."""
+        """Move the agents to their positions at sample `index`."""
         recent = slice(max(0, index - self._tail), index + 1)
         self._recent.set_data(_joined(self._across[:, recent]), _joined(self._up[:, recent]))
         self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))
@@ -339,7 +339,7 @@ class MapRegion:
 
     @property
     def visited(self) -> bool:
-        """True if one visit is enough."""
+        """True if it is enough that the region is visited once."""
         return self.role == "reach" and all(use.visit for use in self.uses)
 
     @property

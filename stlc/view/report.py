@@ -166,7 +166,7 @@ def _advice(contents: RunContents) -> Html | None:
 
 
 def _sentence(advice: str) -> Html:
-    """Advice as a sentence, capitalised and with a full stop, commands marked as code."""
+    """Format advice as a sentence: capitalised, with a full stop, and with commands marked as code."""
     return with_code(f"{advice[0].upper()}{advice[1:]}.")
 
 
@@ -350,7 +350,7 @@ def _commands(contents: RunContents) -> list[str]:
 
 
 def _set(record: Mapping[str, Any]) -> list[str]:
-    """The `--set` options of the run's overrides."""
+    """The `--set` options that repeat the overrides of a run."""
     changed = record.get("overrides") or {}
     return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
 

@@ -93,7 +93,7 @@ def margin_limits(rho: Floats) -> tuple[float, float]:
 
 
 def finite(rho: Floats) -> Floats:
-    """Robustness with NaN in place of infinities."""
+    """Robustness with infinities replaced by NaN."""
     return np.where(np.isfinite(rho), rho, np.nan)
 
 
@@ -310,7 +310,7 @@ class Strip:
 
     @property
     def height(self) -> int:
-        """Number of charts."""
+        """Number of strip charts."""
         return len(self.rows) + bool(self.acted.any())
 
     @property

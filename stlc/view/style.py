@@ -149,7 +149,7 @@ class Picture:
     alt: str
 
     def svg(self) -> str:
-        """The figure as SVG that follows the reader's light or dark scheme."""
+        """Return the figure as SVG that follows the reader's light or dark scheme."""
         from matplotlib.text import Text
 
         buffer = io.StringIO()

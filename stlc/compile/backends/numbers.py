@@ -11,7 +11,7 @@ from stlc.compile.ir import nodes as ir
 
 
 class Untranslatable(Exception):  # noqa: N818 - not an error: another back end is used
-    """The IR has a node that a back end cannot express, such as a Python function of the system."""
+    """Error: a back end cannot express a node of the IR, such as a Python function of the system."""
 
 
 Leaf: TypeAlias = ir.Signal | ir.ShiftedSignal | ir.FrozenVar | ir.Extern

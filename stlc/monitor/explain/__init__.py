@@ -1,4 +1,4 @@
-"""Causes of a violation, and their wording."""
+"""Causes of the violation of a requirement, and their description in words."""
 
 from stlc.monitor.explain.report import explain
 

@@ -278,7 +278,7 @@ def _body(node: CauseNode) -> CauseNode:
 
 
 def shown(value: float, column: Column) -> str:
-    """Return a value as text: the label of an enum member, else the number with its unit."""
+    """Return a signal's value as text: the label of an enum member, else the number with its unit."""
     for label, number in column.labels:
         if number == value:
             return label

@@ -223,7 +223,7 @@ class Side:
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
-        """Drop rows before sample `first` that no column needs."""
+        """Free the rows before sample `first`, as far as no column needs them to continue."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
         if (base := min([first, *needs])) > self.base:
             self.history.forget(base)

@@ -45,18 +45,18 @@ class ColumnHistory:
         self.samples += count
 
     def put(self, name: str, start: int, values: Floats) -> None:
-        """Write the rows (rows, width) of a column from sample `start` on."""
+        """Write rows (rows, width) of the series `name` from sample `start` on."""
         self._rows[name][start - self._origin : start - self._origin + len(values)] = values
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Append samples, (count, width) by name."""
+        """Append `count` samples to all series: name -> (count, width)."""
         start = self.samples
         self.grow(columns, count, next(iter(columns.values())).shape[1])
         for name in self._rows:
             self.put(name, start, columns[name])
 
     def columns(self, first: int | None = None, stop: int | None = None) -> dict[str, Floats]:
-        """Return views of the stored rows from `first` up to `stop`."""
+        """Return views of the stored rows of all series, from sample `first` up to `stop`."""
         end = self.samples + self._beyond
         low = max(self.first if first is None else first, self.first) - self._origin
         high = (end if stop is None else min(stop, end)) - self._origin

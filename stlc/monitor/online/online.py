@@ -113,11 +113,11 @@ class Watched:
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> JudgedInstants:
-        """Return bounds and verdicts at instants while the trace continues."""
+        """Return bounds and verdicts at the instants from `start` up to `stop` while the trace continues."""
         return self._judged(*(tracker.live(start, stop) for tracker in self.trackers))
 
     def ended(self, starts: range) -> JudgedInstants:
-        """Return bounds and verdicts at instants once the trace has ended."""
+        """Return bounds and verdicts at the instants `starts` once the trace has ended."""
         return self._judged(*(tracker.ended(starts) for tracker in self.trackers))
 
     def _judged(self, bounds: Bounds, truths: Bounds | None = None) -> JudgedInstants:
@@ -132,11 +132,11 @@ class Watched:
 
 
 class Online:
-    """Monitor of a stream of samples; see `Monitor.online`.
+    """Monitor of a stream of samples; made by `Monitor.online`.
 
-    Memory is bounded by the windows of the requirements, not by the length of the stream. An
-    unbounded window (to the end of the trace) needs no memory if it is outermost or inside unbounded windows
-    only. If it is inside a bounded window, all samples are stored and the requirement is evaluated on them.
+    Memory is bounded by the windows of the requirements, not by the length of the stream. A window to the end
+    of the trace needs no memory if it is outermost or inside other such windows only. If it is inside a
+    bounded window, all samples are stored and the requirement is evaluated on them.
     """
 
     def __init__(

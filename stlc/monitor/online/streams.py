@@ -89,7 +89,7 @@ def _lag(streams: Sequence[DerivedColumn]) -> int:
 
 
 def read_by(stream: DerivedColumn) -> frozenset[str]:
-    """Return the names of the columns that a column reads."""
+    """Return the names of the columns (time series) from which a column is computed."""
     parts = () if isinstance(stream, PredicateColumn) else stream.parts
     return frozenset().union(*map(names_of_columns, parts))
 

@@ -60,7 +60,7 @@ class TraceBuffer:
 
     @property
     def full(self) -> bool:
-        """True if the buffer is full, so that samples have to be dropped."""
+        """True if the buffer is full, so that samples must be dropped."""
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
     def forget(self) -> None:

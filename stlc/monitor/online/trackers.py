@@ -167,7 +167,7 @@ def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPla
 
 @dataclass(slots=True)
 class BoundedTracker(_ColumnTracker):
-    """Tracker of a formula with bounded windows, at consecutive instants."""
+    """Evaluator, at consecutive instants, of a formula whose windows are all bounded."""
 
     _readers: list[ColumnReader] = field(default_factory=list, init=False)
     _ahead: int = field(default=0, init=False)

@@ -70,7 +70,7 @@ class _File:
     decoders: dict[int, Decode | None] = field(default_factory=dict)
 
     def take(self, record: Any) -> None:
-        """Process a record inside or outside of a chunk."""
+        """Process one record of the file, inside or outside of a chunk."""
         match type(record).__name__:
             case "Schema":
                 self.schemas.setdefault(record.id, record)

@@ -41,7 +41,7 @@ def read(path: Path) -> Recording:
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
-    """Open a file; with `whole`, check that its numbers fit into memory."""
+    """Open a file; with `whole`, raise an error if its numbers do not fit into memory."""
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))

@@ -112,7 +112,7 @@ def opened(path: Path) -> Iterator[None]:
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """Convert library errors in reading a file to TraceError (E603)."""
+    """Convert errors that a library raises on damaged files to TraceError (E603)."""
     try:
         yield
     except StlcError:

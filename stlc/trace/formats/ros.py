@@ -140,7 +140,7 @@ def _declares(line: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """A decoder of the messages of one definition."""
+    """Decoder of ROS messages of one definition."""
 
     layout: _Layout
     form: Form

@@ -110,7 +110,7 @@ class Freezer:
             yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
     def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
-        """Evaluate arbitrary instants, each on its own copy of the surrounding trace."""
+        """Evaluate arbitrary instants, each on its own copy of the trace around it."""
         ops, batch = self.ops, self._batch
         for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
             start = max(chunk.start - back, 0)

@@ -82,7 +82,7 @@ class Ops(Protocol):
         """`a ^ b`."""
 
     def mod(self, a: Array | float, b: Array | float) -> Array:
-        """Floored modulo: the sign of `b`; gradient 1 in `a`."""
+        """Floored modulo: the result has the sign of `b`; the gradient by `a` is 1."""
 
     def atan2(self, a: Array | float, b: Array | float) -> Array:
         """Angle of the point (b, a), in radians."""

@@ -223,7 +223,7 @@ class GradientTape:
 
 
 def _constant_last(a: Operand, b: Operand) -> tuple[Operand, Operand]:
-    """Canonical order of commutative operands: registers first, ascending."""
+    """Order the operands of a commutative operation: registers first, in ascending order."""
     if isinstance(a, float):
         return (a, b) if isinstance(b, float) else (b, a)
     return (b, a) if isinstance(b, int) and b < a else (a, b)

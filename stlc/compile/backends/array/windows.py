@@ -70,7 +70,7 @@ class Windows:
         return [(some, slice(some.start, some.stop + width - 1)) for some in asked]
 
     def _to_end(self, x: Array, pick: Pick) -> Array:
-        """Extrema of windows that all extend to the last row: a running extremum backward in time."""
+        """Extrema over windows that all extend to the last row: running extrema, backward in time."""
         running = self.ops.cummin if pick == "min" else self.ops.cummax
         return self.ops.flip(running(self.ops.flip(x)))
 
@@ -95,7 +95,7 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Merge the block at each row with the block `shift` rows later."""
+        """Merge the extrema of blocks of rows with those of the blocks that start `shift` rows later."""
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
             tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops

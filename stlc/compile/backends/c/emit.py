@@ -74,7 +74,7 @@ class Motion:
 
 
 def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
-    """Return the C source of `judge` and `climb`; see `stlc.native` for their signatures.
+    """Return the C source of `judge` (robustness) and `climb` (local search), described in `stlc.native`.
 
     Raises:
         Untranslatable: the IR has a node without a C form.

@@ -121,7 +121,7 @@ class Tabled:
 
 @dataclass(frozen=True, slots=True)
 class Storage:
-    """Location of one value: a row of a buffer."""
+    """Location of one value in memory: a row of a buffer."""
 
     buffer: Buffer
     row: int
@@ -224,7 +224,7 @@ class _Planner(Scheduler):
         return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add a step. Raises Untranslatable where it needs samples outside of the plan."""
+        """Add a step; returns its number. Raises Untranslatable if it needs samples beyond the trajectory."""
         match node:
             case ir.Predicate(num):
                 self._check(num, run)
@@ -348,7 +348,7 @@ LARGE = 64
 
 
 def _split(formula: ir.Formula) -> ir.Formula:
-    """Rewrite a predicate over a large extremum as a formula over predicates; others are unchanged."""
+    """Rewrite a predicate over a large `min` or `max` as `and` or `or` of predicates."""
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
     if not _large(formula.num):

@@ -111,7 +111,7 @@ class LeafReader:
     indices: dict[str, str] = field(default_factory=dict)
 
     def __call__(self, leaf: Leaf) -> str | None:
-        """Return the C expression of a leaf; None for a function that must be inlined."""
+        """Return the C expression of a leaf; None for a function that must be expanded in place."""
         if isinstance(leaf, ir.FrozenVar):
             return self.printer.held[leaf.name][0]
         if not isinstance(leaf, ir.Extern):
@@ -426,7 +426,11 @@ class _Until(_Windowed):
         return f"{self.dual}({self.args[0]['k']}, {reached})"
 
     def _scan_back(self) -> list[str]:
-        """Gradient at the first instant that attains the value: to its right or to the worst left side."""
+        """Statements that pass the gradient at `k` to the operand that attains the value there.
+
+        That is, at the first instant that attains it, the right side, or the left side at its worst instant
+        before.
+        """
         out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
         near, far = self._outwards()
         worse = f"if ({left['i']} {less} {left['worst']}) worst = i;"

@@ -112,7 +112,7 @@ class OnnxOps:
         return self.atan2(((1.0 - x) * (1.0 + x)).apply("Sqrt"), x)
 
     def atan2(self, a: Number, b: Number) -> Value:
-        """Angle of the point (b, a), from the arc tangent of the smaller coordinate over the larger."""
+        """Angle of the point (b, a) in radians, from the smaller coordinate divided by the larger."""
         like = _like(a, b)
         y, x = like.beside(a), like.beside(b)
         tall, wide = y.apply("Abs"), x.apply("Abs")

@@ -247,7 +247,7 @@ class Value:
         return len(self.shape)
 
     def __getitem__(self, rows: slice | int) -> Value:
-        """Slice along axis 0; a single index drops the axis."""
+        """Slice along axis 0; a single index removes the axis."""
         if isinstance(rows, int):
             index = self.sheet.constant(rows % self.shape[0], "int64")
             (out,) = self.sheet.emit("Gather", (self, index), [self.shape[1:]], self.kind, {"axis": 0})

@@ -222,7 +222,7 @@ class TorchOps:
         return torch.cummax(x, dim=0).values
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
-        """Exact extremum of one or more arrays; one of several equal operands may get all of the gradient."""
+        """Exact minimum or maximum of arrays; one of several equal operands may get the whole gradient."""
         if torch.compiler.is_exporting():  # the choice must not depend on the batch size
             return reduce(torch.minimum if pick == "min" else torch.maximum, items)
         return choice(items, pick)
