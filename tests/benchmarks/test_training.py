@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.__main__ import main as measure
-from benchmarks.feasible import TRIES, _union, known_feasible, search_on
+from benchmarks.feasible import TRIES, _union, known_feasible, prove_on, search_on
 from benchmarks.options import Training
 from benchmarks.store import BENCHMARKS, ResultStore, load
 from benchmarks.tables import ablation, paper
@@ -240,6 +240,25 @@ def test_what_any_policy_solves_counts(tmp_path: Path, result: Callable[..., dic
     assert (known.share, known.open, known.by_search) == (1.0, 0, 0)
     elsewhere = ResultStore("feasible", tmp_path / "elsewhere")
     assert known_feasible(elsewhere, cells[:1])["traffic"].share == 20 / 24
+
+
+def test_states_without_a_plan_are_proved_infeasible(
+    tmp_path: Path, result: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("highspy")
+    searched, proved = ResultStore("feasible", tmp_path / "a"), ResultStore("feasible", tmp_path / "b")
+    search_on([result()], searched, passes=2)
+    assert known_feasible(searched, [result()])["traffic"].proved is None
+    for _ in range(2):
+        prove_on([result()], proved)
+    assert capsys.readouterr().err.count("no plan exists for") == 2  # 20 states, then 4, then none again
+    search, proof = (known_feasible(store, [result()])["traffic"] for store in (searched, proved))
+    assert proof.proved == proof.open
+    assert proof.share >= search.share
+    search_on([result()], proved, passes=1)
+    assert known_feasible(proved, [result()])["traffic"].proved == proof.proved
+    prove_on([result()], searched)
+    assert known_feasible(searched, [result()])["traffic"].proved == proof.proved
 
 
 def test_other_states_are_searched_anew(tmp_path: Path, result: Callable[..., dict[str, Any]]) -> None:
