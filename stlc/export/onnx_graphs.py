@@ -494,7 +494,7 @@ def _one(values: Value, place: int) -> Value:
 
 
 def _added(task: Task, state: Value) -> dict[str, Value]:
-    """Output `added`: states that the specification adds (parameters and timers) one step later; or empty."""
+    """States that the specification adds (parameters and timers) one step later, as the output `added`."""
     if not task.system.added:
         return {}
     now = columns_of(state, task.system.names)

@@ -76,7 +76,7 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 
 
 def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
-    """Graph of the nodes on which `outputs` depend; the outputs get their public names."""
+    """ONNX graph of the nodes on which `outputs` depend; the outputs get their public names."""
     from onnx import helper, numpy_helper
 
     shown = list(outputs)

@@ -48,9 +48,9 @@ class Exported:
     Attributes:
         folder: folder of the written files.
         files: names of the files.
-        agreement: comparison with the run; None if there is no compiler for it.
+        agreement: comparison with the run; None if it could not be made.
         latency: decision time of the Python runtime, if it was measured.
-        unchecked: reason why there is no agreement.
+        unchecked: reason why there is no comparison.
     """
 
     folder: Path

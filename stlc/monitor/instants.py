@@ -83,8 +83,8 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
     """Return the robustness at every sample, `(samples, batch)`.
 
     Values are NaN where the window extends beyond the trace and `end` is "strict", and where they depend on
-    unknown samples unless `end` is "lower" or "upper". A requirement with absolute operators (`always@[a,
-    b]`) has one value at all samples.
+    unknown samples unless `end` is "lower" or "upper". A requirement with absolute operators
+    (`always@[a, b]`) has one value at all samples.
     """
     if record.holes:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))

@@ -154,7 +154,7 @@ class Judgement:
 
     @property
     def least(self) -> Floats:
-        """`robustness` as an array (traces,)."""
+        """Least robustness of each trace over the evaluated instants, (traces,); NaN if unknown."""
         low, high = (end.min(axis=0) for end in self.margins)
         known = np.where(self.holds.all(axis=0), low, np.nan)
         known = np.where(self.fails.any(axis=0), high, known)

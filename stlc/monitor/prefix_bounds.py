@@ -49,7 +49,10 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return the formula whose windows leave out the instants that an early end of the trace removes."""
+        """Return a bound of the formula over the traces that end with the last sample or later.
+
+        Instants that do not exist if the trace ends early are left out of the windows.
+        """
         match formula:
             case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
@@ -73,13 +76,13 @@ class _PrefixBound:
         return self._seen(inner, 0) if cut and some is self.least else inner
 
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """The formula; if its unbounded window starts after the trace ends, unknown, or empty if clipped."""
+        """The formula, with the worst case for the bound if its window starts after the last sample."""
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """The formula, false if the sample `later` steps later does not exist; for the upper bound, true."""
+        """The formula, and that the sample `later` steps later exists; for the upper bound the dual."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))

@@ -50,7 +50,7 @@ class Record:
 
     @property
     def sure(self) -> Record:
-        """The record without `holes`, for formulas in which unknown values are already accounted for."""
+        """The record without `holes`, for formulas that already account for unknown values."""
         return replace(self, holes=frozenset()) if self.holes else self
 
     @property

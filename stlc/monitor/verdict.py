@@ -100,7 +100,7 @@ class Monitor:
 
     @property
     def horizon(self) -> float:
-        """Seconds of signal that a verdict at time 0 needs; windows to the end are clipped."""
+        """Seconds of signal that a verdict at time 0 needs; of an unbounded window only its start counts."""
         return float(self.compiled.reach * (self.compiled.grid.dt or 0))
 
     # ----------------------------------------------------------------- evaluation
@@ -121,7 +121,7 @@ class Monitor:
             signals: signals by name, or a trace, or the path of a trace file.
             at: a sample number, or "all" for every sample with a complete window; None: each requirement's
                 own instants.
-            end: treatment of a trace that is too short: "open" takes bounds over all its continuations and
+            end: treatment of a trace that is too short: "open" computes bounds over all its continuations and
                 may be inconclusive, "strict" raises an error, "truncate" clips the windows.
             tolerance: robustness values down to minus this count as satisfied; 0 distinguishes `<` from `<=`.
             require: names of the requirements to evaluate; empty: all.
@@ -240,10 +240,11 @@ class Monitor:
         return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
-        """Compile for the time step and horizon of the arguments, the trace, or the system, in that order.
+        """Compile for the known time step and horizon.
 
-        The horizon of the trace comes last. If one is still unknown, the system that the specification names
-        gives it.
+        The time step is that of the trace, else of the argument, else of the system; the horizon is that of
+        the argument, else of the system, else of the trace. What is still unknown comes from the system that
+        the specification names.
         """
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)

@@ -75,8 +75,8 @@ class VectorAnimation:
 
     Attributes:
         width, height: size of the picture in dots.
-        commands: the distinct drawing commands: `["p", path, fill, stroke, width, dash, clip]`, `["t", x, y,
-            text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
+        commands: the distinct drawing commands: `["p", path, fill, stroke, width, dash, clip]`,
+            `["t", x, y, text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
         frames: for every frame, indices into `commands` in the order of drawing.
     """
 

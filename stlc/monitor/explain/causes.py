@@ -294,7 +294,8 @@ class CauseFinder:
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
         """Values that a `freeze` formula binds at a sample.
 
-        An unknown value is bound to a sample beyond the trace.
+        A value that is unknown there is replaced by one read beyond the trace, which makes its readers
+        unknown.
         """
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1

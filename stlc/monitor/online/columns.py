@@ -49,11 +49,12 @@ _EXACT = Windows(Exact(), NUMPY)
 
 
 class ColumnReader:
-    """Evaluator of fixed formulas over growing columns (time series); its evaluation schedules are cached.
+    """Evaluator of fixed formulas over growing columns (time series); it caches its evaluation plans.
 
     Args:
         formulas: formulas whose predicates are columns.
-        end: value of rows after the last one: least, greatest, both, or none, which clips windows there.
+        end: value of rows after the last one: "lower" -inf, "upper" +inf, "both" the two side by side;
+            "truncate" clips windows at the last row.
         going_on: whether the trace continues after the last row.
         back: lookback in rows.
     """
@@ -87,9 +88,10 @@ class ColumnReader:
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
     ) -> list[Floats]:
-        """Values of each formula from row `start` on, for NaN (unknown) at its least or greatest value.
+        """Bounds of each formula from row `start` on, over all values that unknown (NaN) rows may have.
 
-        If `least` is None, both bounds are returned side by side, (count, 2), for columns (rows, 1).
+        `least` selects the lower (True) or the upper bound. If it is None, both bounds are returned side by
+        side, (count, 2), for columns (rows, 1).
         """
         rows = {name: env[name] for name in self.names}
         near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
@@ -103,7 +105,7 @@ class ColumnReader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
-        """The evaluator of the lower or of the upper bounds of the formulas, for the signals in `holes`."""
+        """The evaluator of the lower or upper bounds of the formulas if `holes` have unknown values."""
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
@@ -159,7 +161,7 @@ class Side:
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
 
     def _farthest(self) -> int:
-        """Number of rows after the last sample that the formula or the columns of other columns need."""
+        """Number of rows needed after the last sample, by the formula or to compute other columns."""
         if self.end == "truncate":
             return 0
         pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
@@ -219,7 +221,7 @@ class Side:
         return last
 
     def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
-        """Return values (count, traces) of formulas over the columns, from sample `start` on."""
+        """Return values (count, traces) of formulas over the columns, time series, from sample `start` on."""
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
@@ -240,7 +242,7 @@ _UNKNOWN: Mapping[Beyond, float | tuple[float, float]] = {
 
 
 def _of_the_present(stream: DerivedColumn) -> bool:
-    """True for a predicate that reads the signals at its own sample only: it is unknown after the last."""
+    """True for a predicate that reads the signals at its own sample only, not before or after it."""
     return isinstance(stream, PredicateColumn) and not (
         stream.back or stream.ahead or isinstance(stream.formula, ir.Freeze)
     )
@@ -259,7 +261,7 @@ def shareable(plans: ColumnPlans) -> bool:
 
 
 def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:
-    """Values of an unbounded past operator from its operands and its previous value (None at the start)."""
+    """Values of an unbounded past operator from its operands and its previous value, None at the start."""
     match op:
         case "once":
             found = np.maximum.accumulate(parts[0], axis=0)

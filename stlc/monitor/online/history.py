@@ -15,7 +15,9 @@ _SPARE = 64
 
 
 class ColumnHistory:
-    """Storage of columns (rows, width) in growing arrays; appending a row takes amortized constant time.
+    """Storage of columns (time series), (rows, width), in growing arrays.
+
+    Appending a row takes amortized constant time.
 
     Args:
         beyond: number of rows stored after the last sample.

@@ -247,12 +247,12 @@ class Online:
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
-        """Range (start, stop) from the first uncounted instant to the last one that can be evaluated."""
+        """Range (start, stop) of the instants that have begun but are not counted yet."""
         start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
         return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Append the verdicts that the latest sample decided to `found`, without those appended earlier."""
+        """Append to `found` the verdicts that became known with the latest sample."""
         start, stop = self._pending(watched)
         judged = watched.judged(start, stop)
         known = judged.holds | judged.fails
@@ -387,7 +387,7 @@ class Online:
         return Worst(tally.high_at, tally.high) if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
-        """Return the cause of the worst violation of a requirement up to now, as `explain` does for a trace.
+        """Return the cause of the worst violation of a requirement up to now.
 
         None if the monitor was made without `reasons`, if nothing is violated, or if the samples that show
         the cause were dropped. The monitor stores about two million numbers and finds causes before it drops

@@ -159,7 +159,10 @@ class PacedTracker:
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of evaluating `formula`, shortened or not, over `spanned` samples."""
+        """Return the work of evaluating `formula` over a piece of the trace, of `spanned` samples.
+
+        `formula` is that of the requirement, or the same with shorter windows.
+        """
         many = self.everywhere or _unbounded(formula)
         found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)
         own = (self.window or 0) * (spanned if self.everywhere else 1)
@@ -200,6 +203,9 @@ class PacedTracker:
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; all samples stay needed while windows are shortened."""
+        """Free the memory of instants before `start`; returns the first sample that is still needed.
+
+        While windows are shortened, all samples are needed.
+        """
         needed = self._inner.drop(start)
         return needed if self._most is None else 0

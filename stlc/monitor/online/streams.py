@@ -101,7 +101,7 @@ def endless(formula: ir.Formula) -> bool:
 
 
 def column(name: str) -> ir.Predicate:
-    """Return the formula that reads one column."""
+    """Return a predicate whose value is that of a column (time series)."""
     return ir.Predicate(ir.Signal(name))
 
 
@@ -154,8 +154,7 @@ class _Planner:
     def _past(self, formula: ir.PastTemporal | ir.Since) -> ir.Formula:
         """Rewrite a past operator over columns.
 
-        An unbounded operator becomes a column, which is read as many samples earlier as the window's lower
-        bound.
+        An unbounded operator `op[a, inf)` becomes the column of `op[0, inf)`, read `a` samples earlier.
         """
         if formula.window.hi is not None:
             return formula

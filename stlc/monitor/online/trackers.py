@@ -48,9 +48,10 @@ def worst(
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """Return the columns evaluated for the least and for the greatest value.
+    """Return the columns (time series of subformulas) for the lower bound and for the upper bound.
 
-    If windows are clipped at the end of the trace, two more follow: both bounds of the formula so clipped.
+    If windows are clipped at the end of the trace, two more follow: both bounds of the formula with clipped
+    windows, over unknown samples.
     """
     sides = [
         Side(plans["lower"], "lower", beyond, options.truth),
@@ -72,9 +73,10 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 
 
 class _CutTracker(ABC):
-    """Base of evaluators that distinguish final values at settled instants from bounds at other instants.
+    """Base of evaluators for requirements whose windows may be clipped at the end of the trace.
 
-    The two differ if windows are clipped at the end of the trace.
+    With clipped windows, the value at a settled instant (one that no later sample affects) is computed on the
+    clipped formula, and bounds at other instants on the formula with unknown samples.
     """
 
     __slots__ = ()
@@ -91,7 +93,7 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Return bounds at settled instants (whose value is final), with windows clipped to the trace."""
+        """Return values at settled instants (not affected by later samples), windows clipped to the trace."""
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
@@ -133,7 +135,7 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def planned(self) -> ColumnPlan:
-        """Decomposition into columns of the requirement's own formula, not of one of its bounds."""
+        """Decomposition into columns (time series) of the formula itself, not of its lower or upper bound."""
         return self.plans["truncate"]
 
     @property
@@ -154,7 +156,7 @@ class _ColumnTracker(_CutTracker):
 
     @abstractmethod
     def _values(self, which: int, start: int, stop: int) -> Floats:
-        """Values of the formula for bound `which`: 0 lower, 1 upper, 2 and 3 these with clipped windows."""
+        """Values of the formula for one bound: `which` is 0 lower, 1 upper; with clipped windows 2 and 3."""
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
@@ -365,7 +367,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Values at many instants, if the formula reads past operators beyond the planning window."""
+        """Values at the instants `starts` if the formula reads past operators after its planning window."""
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
         ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
@@ -378,7 +380,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """True if a past operator or a lookback gives a column known values after the last sample."""
+    """True if a column may have known values after the last sample, by a past operator or a lookback."""
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -434,7 +436,7 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Drop samples that are already folded into the running state or that nothing reads any more.
+        """Free samples that the running state already accounts for and nothing else reads.
 
         Returns the number of the first sample that is still needed.
         """
@@ -544,7 +546,8 @@ class Trackers:
             everywhere: whether the requirement is evaluated at every instant or only at the first one.
 
         Raises:
-            UsageError: E313, too much work per instant that the instants cannot share.
+            UsageError: E313, the evaluation at each instant takes too much work and cannot share it with
+                other instants.
         """
 
         def make(part: CompiledRequirement) -> Tracker:
@@ -588,9 +591,9 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with `end` replaced by a fixed window of `window` samples; None if impossible.
+    """Return the formula with `end` replaced by `window` samples after its instant; None if impossible.
 
-    It is impossible if `end` occurs inside another window, in segments that would extend beyond `end`
+    It is impossible if `end` occurs inside another window or in segments that would extend beyond `end`
     (`sweep`), or if bounded windows extend beyond it.
     """
     moved = _ended(formula, window)

@@ -47,8 +47,8 @@ class DelayedFormula:
 class UnboundedOperators:
     """The unbounded operators of a formula, rewritten over columns (time series) with lower bound 0.
 
-    A subformula without unbounded windows is a column `$0`, `$1`, …. The value of an unbounded operator from
-    the last row on, called its rest, is a column `!0`, `!1`, ….
+    A subformula without unbounded windows is a column `$0`, `$1`, …. The value that an unbounded operator has
+    on the samples after the known rows is a column `!0`, `!1`, ….
 
     Attributes:
         root: the formula over columns.
@@ -64,11 +64,11 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Number of samples after an instant needed to fold the instant into the polynomial."""
+        """Number of samples after an instant that its subformulas without unbounded windows read."""
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
-        """Number of unknown samples after the last one beyond which more do not change the bounds."""
+        """Number of unknown samples to append for the bounds: more of them would not change the values."""
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
 
@@ -119,7 +119,7 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Name of the column with the value of an unbounded operator from the last row on.
+    """Name of the column with the value that an unbounded operator has on the samples after the known rows.
 
     Operators that read the same columns may still differ at the end of the trace: `next (always p)` and
     `always (next p)` are not equal there.
@@ -165,13 +165,16 @@ def _neutral(origin: DelayedFormula) -> float:
 
 @dataclass(slots=True)
 class UnboundedState:
-    """Bound on a formula with unbounded windows, computed incrementally: the least or the greatest value.
+    """Lower or upper bound on a formula with unbounded windows, computed incrementally.
+
+    The bound is a polynomial of minima and maxima in the values that the unbounded operators have from sample
+    `at` on.
 
     Attributes:
         bones: the formula, decomposed into its unbounded operators and the other subformulas.
-        side: columns of the predicates and past operators, evaluated for the bound.
+        side: columns (time series) of the predicates and past operators, evaluated for the bound.
         begin: the sample at which the formula is evaluated.
-        at: the frontier: the first sample that is not folded into the polynomial.
+        at: the first sample that the coefficients do not account for yet.
         coefficients: (subsets of the operators, traces): value of the formula if the operators of the subset
             are +inf from `at` on and the others -inf; None before the first `advance`.
     """
@@ -198,7 +201,7 @@ class UnboundedState:
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
-        """Fold the samples before `settled` into the coefficients of the polynomial."""
+        """Update the coefficients of the polynomial so that they account for the samples before `settled`."""
         count = settled - self.at
         if count <= 0:
             return
@@ -213,7 +216,7 @@ class UnboundedState:
         self.at = settled
 
     def value(self, samples: int) -> Floats:
-        """The bound while the trace continues: the value with enough unknown samples appended."""
+        """The bound while the trace continues, computed with enough unknown samples appended."""
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
             env[name] = np.full(env[NOTHING].shape, _neutral(origin))
@@ -221,7 +224,7 @@ class UnboundedState:
         return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
-        """The value if the trace ends with the last sample."""
+        """Value of the formula if the trace ends with the last sample."""
         if self.coefficients is None:
             return self._plain(formula, self.begin, samples)
         origins = self.bones.origins.values()
@@ -229,9 +232,9 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at the frontier (the first sample not yet folded in), one row each.
+        """Values at sample `at`, one row each, of every unbounded operator.
 
-        A row is the formula before the first `advance`, afterwards an unbounded operator.
+        Before the first `advance`, the one row is the value of the whole formula.
         """
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
@@ -255,7 +258,7 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Evaluate the polynomial at operator values `rests` (operators, points, traces): a row per point."""
+        """Evaluate the polynomial at several points: (operators, points, traces) -> (points, traces)."""
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))

@@ -1,7 +1,7 @@
 """Evaluation of `freeze`: a formula that refers to signal values at the instant at which it is evaluated.
 
-Each instant binds its own values, so instants become an axis: signals `(time, batch)` are copied to `(time,
-instants * batch)`. If the body reads a bounded neighbourhood of the instant, only that is copied.
+Each instant binds its own values, so instants become an axis: signals `(time, batch)` are copied to
+`(time, instants * batch)`. If the body reads a bounded neighbourhood of the instant, only that is copied.
 """
 
 from __future__ import annotations

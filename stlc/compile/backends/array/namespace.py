@@ -168,7 +168,10 @@ class Ops(Protocol):
         """
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch)."""
+        """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch).
+
+        None if operations of the array library are faster.
+        """
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:

@@ -59,7 +59,7 @@ class NumpyOps:
         return a + (product if factor == 1.0 else factor * product)
 
     def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
-        """`x` clamped to [low, high]."""
+        """Clamp `x` to [low, high]."""
         return np.clip(x, low, high)
 
     def norm(self, *components: Array | float) -> Array:
@@ -88,15 +88,15 @@ class NumpyOps:
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:
-        """Minimum over axis 0, kept with length 1."""
+        """Minimum over axis 0, which is kept with length 1."""
         return x.min(axis=0, keepdims=True)
 
     def amax(self, x: Array) -> Array:
-        """Maximum over axis 0, kept with length 1."""
+        """Maximum over axis 0, which is kept with length 1."""
         return x.max(axis=0, keepdims=True)
 
     def sum(self, x: Array) -> Array:
-        """Sum over axis 0, kept with length 1."""
+        """Sum over axis 0, which is kept with length 1."""
         return x.sum(axis=0, keepdims=True)
 
     def cummin(self, x: Array) -> Array:

@@ -74,7 +74,7 @@ class ArrayPlan:
     """An evaluation schedule with the programs and functions that compute its steps.
 
     Attributes:
-        schedule: the steps (a sub-formula at a range of instants each).
+        schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
         predicates: step number -> source of its values; a predicate that is defined nowhere has none.
         beyond: total number of values beyond the last sample.
@@ -154,7 +154,10 @@ class Machine:
 
     @property
     def unknown(self) -> float:
-        """Value of an unknown predicate; with both bounds side by side, one value per trace."""
+        """Value of an unknown predicate: -inf in a lower bound, +inf in an upper one.
+
+        If two traces hold the two bounds, it is one value per trace.
+        """
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])
             return both  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
 """Tape of array operations: common sub-expressions are shared, constants folded, operations fused.
 
-In training each array operation has microseconds of overhead, so the tape minimizes their number: `a * 0.1 +
-b` becomes one `axpy`, adding a product one `addcmul`, `min` and `max` with constants one `clamp`,
+In training each array operation has microseconds of overhead, so the tape minimizes their number:
+`a * 0.1 + b` becomes one `axpy`, adding a product one `addcmul`, `min` and `max` with constants one `clamp`,
 multiplication by an indicator one `where`. Each rule preserves the value up to rounding.
 """
 
@@ -51,7 +51,7 @@ class GradientTape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction that computes `operand` if that is a `kernel`, else None."""
+        """Operands of the instruction that computes `operand` if its operation is `kernel`, else None."""
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
@@ -159,7 +159,7 @@ class GradientTape:
                 return self.call("pow", a, b)
 
     def call(self, kernel: str, *args: Operand) -> Operand:
-        """Any operation; computed at once if all operands are constants."""
+        """Any operation by name; computed at once if all operands are constants."""
         if all(isinstance(arg, float) for arg in args):
             with NUMPY.quiet():
                 return float(getattr(NUMPY, kernel)(*(np.float64(arg) for arg in args)))
@@ -193,7 +193,7 @@ class GradientTape:
         return self.emit("clamp", x, params=bounds)
 
     def norm(self, *parts: Operand) -> Operand:
-        """Euclidean length."""
+        """Euclidean norm of a vector given by its components."""
         return self.call("abs", parts[0]) if len(parts) == 1 else self.call("norm", *parts)
 
     # ---------------------------------------------------------------- choice

@@ -54,7 +54,7 @@ static inline double floored_mod(double a, double b) {{
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One step of a system as straight-line code over states, controls and intermediate variables.
+    """One step of a system as straight-line code: expressions of states, controls and intermediate variables.
 
     Attributes:
         states: names of the states, in order.

@@ -208,7 +208,7 @@ class _Planner(Scheduler):
 
     @contextmanager
     def _inside(self, scopes: list[_Scope]) -> Iterator[_Scope]:
-        """Context in which new steps are added to the innermost of other scopes."""
+        """Context manager: new steps are added to the innermost of `scopes`."""
         before = self.scopes
         self.scopes, self.scope = scopes, scopes[-1]
         try:
