@@ -102,7 +102,7 @@ def train(
     reward: Annotated[
         str | None,
         typer.Option(
-            metavar="task|robustness|accuracy", help="Reward of the methods ppo and sac; robustness."
+            metavar="task|robustness|accuracy", help="Reward of methods that learn from one; robustness."
         ),
     ] = None,
     option: Annotated[

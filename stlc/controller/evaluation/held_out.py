@@ -40,8 +40,6 @@ CHUNK = 256
 """Batch size of the search."""
 TORCH_CHUNK = 32
 """Batch size of the search in torch."""
-JUDGED = 500
-"""Batch size of the evaluation, which can be stopped between batches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +157,7 @@ def _judged(
     plans: list[Tensor] = []
     rho: list[Tensor] = []
     each: list[Tensor] = []
-    for part in torch.split(states, JUDGED):
+    for part in torch.split(states, policy.judged_at_once):
         if rho and enough():
             break
         report(f"evaluation, {sum(map(len, rho)):,} of {len(states):,} held-out starts")

@@ -33,9 +33,12 @@ class Policy(ABC):
     Attributes:
         task: the problem whose verdicts select the plan; `for_task` changes it.
         network: the network that proposes the plans; None where there is none, then exports are refused.
+        judged_at_once: states of a batch of the final evaluation, which can be stopped between batches; fewer
+            where a plan is costly.
     """
 
     network: PlanNetwork | None = None
+    judged_at_once: int = 500
 
     def __init__(self, task: Task) -> None:
         self.task = task

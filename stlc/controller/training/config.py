@@ -154,6 +154,13 @@ _MOST = {
 }
 """Upper bounds on shares and on options that determine memory use."""
 MOST_TEXT = 1000
+
+
+def bounded(default: float, least: float, most: float) -> Any:
+    """Field of a method's options: a number with its bounds, which `checked_config` enforces."""
+    return field(default=default, metadata={"bounds": (least, most)})
+
+
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks", "environments")
 
 
@@ -177,9 +184,9 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
                 raise ValueError(f"`{option.name}` is {value!r:.40}")
             continue
         kinds = (int, float) if option.type in ("float", float) else (int,)
-        most = _MOST.get(option.name, 1e12)
+        low, most = option.metadata.get("bounds", (0, _MOST.get(option.name, 1e12)))
         each = value if option.name == "hidden" else (value,)
-        least = 1 if option.name in _POSITIVE else 0
+        least = 1 if option.name in _POSITIVE else low
         if not all(_is_number(number, kinds) and least <= number <= most for number in each):
             raise ValueError(f"`{option.name}` is {value!r:.40}")
     return config

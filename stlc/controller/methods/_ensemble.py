@@ -1,0 +1,331 @@
+"""Ensemble of probabilistic networks: a model of one step of a system, learnt from observed transitions.
+
+Networks, their loss and their bounded variances are those of Chua, Calandra, McAllister and Levine, "Deep
+reinforcement learning in a handful of trials using probabilistic dynamics models" (NeurIPS 2018), Section 4
+and Appendix A.1; training until the error on validation data stops falling, and the selection of the best
+networks, those of Janner, Fu, Zhang and Levine, "When to trust your model" (NeurIPS 2019).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+LOWEST, HIGHEST = -10.0, 0.5
+"""Initial bounds on the logarithm of a variance, in units of the spread of the targets."""
+BOUNDS = 0.01
+"""Weight of the distance between these bounds in the loss."""
+STILL = 1e-7
+"""Spread of a change, as a share of the spread of the column itself, below which the column is constant."""
+GAIN = 0.01
+"""Fall of a validation error, as a share of it, that counts as an improvement (Janner et al. 2019)."""
+FEWEST = 2
+"""Validation samples below which all samples are trained on."""
+
+
+class BatchedMlp(nn.Module):
+    """Several MLPs of the same shape, evaluated side by side in one batched matrix product a layer.
+
+    Args:
+        count: number of networks, E.
+        widths: of all layers, inputs first.
+        activation: between the layers.
+        generator: of the initial weights: normal with standard deviation 1 / (2 sqrt(inputs)), cut off at
+            twice that (Chua et al. 2018); biases are 0.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        widths: Sequence[int],
+        *,
+        activation: Callable[[Tensor], Tensor] = functional.silu,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self._activation = activation
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for inputs, outputs in pairwise(widths):
+            std = 0.5 / math.sqrt(inputs)
+            weight = torch.empty(count, inputs, outputs)
+            nn.init.trunc_normal_(weight, 0.0, std, -2.0 * std, 2.0 * std, generator=generator)
+            self.weights.append(nn.Parameter(weight))
+            self.biases.append(nn.Parameter(torch.zeros(count, 1, outputs)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs of all networks: (E, B, inputs) -> (E, B, outputs)."""
+        last = len(self.weights) - 1
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if index < last:
+                x = self._activation(x)
+        return x
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How an ensemble is trained.
+
+    Attributes:
+        lr: learning rate of Adam.
+        decay: weight of the squared weights.
+        batch: samples of a gradient step of each network.
+        epochs: passes over the data, at most.
+        patience: passes without improvement of any network that end the training; 0: makes all passes.
+        held: share of the samples held out for validation; 0: none.
+    """
+
+    lr: float = 1e-3
+    decay: float = 1e-5
+    batch: int = 256
+    epochs: int = 20
+    patience: int = 5
+    held: float = 0.2
+
+
+class Ensemble(nn.Module):
+    """Gaussian networks from inputs to changes of columns, all of which learn from different samples.
+
+    Inputs are normalised, and so are the targets, since the columns of a state have different units. Columns
+    that never change in the data stay as they are, exactly.
+
+    Attributes:
+        body: the networks, (E, B, inputs) -> (E, B, 2 outputs): means and logarithms of variances.
+        lowest: lower bounds on the logarithms of variances, (outputs,), learnt.
+        highest: upper bounds, (outputs,), learnt.
+        centre: mean of the inputs, (inputs,).
+        spread: their standard deviation, (inputs,).
+        drift: mean of the targets, (outputs,).
+        scale: their standard deviation, (outputs,); 0 of constant columns.
+        elites: indices of the networks with the least validation error, (elites,).
+    """
+
+    centre: Tensor
+    spread: Tensor
+    drift: Tensor
+    scale: Tensor
+    elites: Tensor
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        networks: int = 7,
+        elites: int = 5,
+        hidden: Sequence[int] = (200, 200, 200, 200),
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.body = BatchedMlp(networks, [inputs, *hidden, 2 * outputs], generator=generator)
+        self.lowest = nn.Parameter(torch.full((outputs,), LOWEST))
+        self.highest = nn.Parameter(torch.full((outputs,), HIGHEST))
+        self.register_buffer("centre", torch.zeros(inputs))
+        self.register_buffer("spread", torch.ones(inputs))
+        self.register_buffer("drift", torch.zeros(outputs))
+        self.register_buffer("scale", torch.ones(outputs))
+        self.register_buffer("elites", torch.arange(min(elites, networks)))
+
+    @property
+    def networks(self) -> int:
+        """Number of networks, E."""
+        return len(self.body.weights[0])
+
+    def normalise(self, inputs: Tensor, targets: Tensor) -> None:
+        """Set the units of inputs (N, inputs) and targets (N, outputs); columns of targets come first."""
+        spread = inputs.std(0)
+        scale = targets.std(0)
+        self.centre.copy_(inputs.mean(0))
+        self.spread.copy_(torch.where(spread > STILL, spread, torch.ones_like(spread)))
+        self.drift.copy_(targets.mean(0))
+        still = scale <= STILL * self.spread[: len(scale)]
+        self.scale.copy_(torch.where(still, torch.zeros_like(scale), scale))
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and logarithms of variances in units of `scale`: (E, B, inputs) -> 2 (E, B, outputs)."""
+        mean, log = self.body((inputs - self.centre) / self.spread).chunk(2, -1)
+        return mean, _bounded(log, self.lowest, self.highest)
+
+    def loss(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        """Negative logarithm of the likelihood (Chua et al. 2018, Section 4), summed over the networks: ().
+
+        Args:
+            inputs: (E, B, inputs).
+            targets: in the units of the data, (E, B, outputs).
+        """
+        mean, log = self(inputs)
+        error = (mean - self._scaled(targets)).square()
+        each = (error * torch.exp(-log) + log).mean((1, 2)).sum()
+        loss: Tensor = each + BOUNDS * (self.highest.sum() - self.lowest.sum())
+        return loss
+
+    @torch.no_grad()
+    def errors(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        """Mean squared errors of all networks on the same samples, in units of `scale`: (E,)."""
+        total, wanted = self.scale.new_zeros(self.networks), self._scaled(targets)
+        for part, target in zip(torch.split(inputs, 2048), torch.split(wanted, 2048), strict=True):
+            mean = self(part.expand(self.networks, -1, -1))[0]
+            total += (mean - target).square().mean(2).sum(1)
+        return total / len(inputs)
+
+    @torch.no_grad()
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Variance of the mixture of the elites in the units of the data: (B, inputs) -> (B, outputs)."""
+        mean, log = self(inputs.expand(self.networks, -1, -1))
+        mean, log = mean[self.elites], log[self.elites]
+        found: Tensor = (log.exp().mean(0) + mean.var(0, unbiased=False)) * self.scale.square()
+        return found
+
+    def predictor(self) -> Predictor:
+        """The elites as they are now, for sampling without gradient."""
+        return Predictor(self)
+
+    def _scaled(self, targets: Tensor) -> Tensor:
+        unit = torch.where(self.scale > 0.0, self.scale, torch.ones_like(self.scale))
+        scaled: Tensor = (targets - self.drift) / unit
+        return scaled
+
+
+def _bounded(log: Tensor, lowest: Tensor, highest: Tensor) -> Tensor:
+    """Logarithms of variances within bounds, smoothly (Chua et al. 2018, Appendix A.1)."""
+    log = highest - functional.softplus(highest - log)
+    return lowest + functional.softplus(log - lowest)
+
+
+class Predictor:
+    """Samples of the changes that the elites of an ensemble predict.
+
+    Attributes:
+        elites: number of networks.
+    """
+
+    def __init__(self, ensemble: Ensemble) -> None:
+        chosen = ensemble.elites
+        self.elites = len(chosen)
+        body = ensemble.body
+        with torch.no_grad():
+            self._layers = [
+                (weight[chosen].clone(), bias[chosen].clone())
+                for weight, bias in zip(body.weights, body.biases, strict=True)
+            ]
+            first, shift = self._layers[0]  # the normalisation of the inputs, folded into the first layer
+            scaled = first / ensemble.spread[:, None]
+            self._layers[0] = scaled, shift - ensemble.centre[None, None] @ scaled
+            self._bounds = ensemble.lowest.clone(), ensemble.highest.clone()
+            self._drift, self._scale = ensemble.drift.clone(), ensemble.scale.clone()
+
+    @torch.no_grad()
+    def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """A sample of each change by the network of its row of the first axis.
+
+        Args:
+            inputs: (k, B, inputs); the first k elites are asked, k <= `elites`.
+            generator: of the noise.
+
+        Returns:
+            Changes in the units of the data, (k, B, outputs).
+        """
+        count, x = len(inputs), inputs
+        last = len(self._layers) - 1
+        for index, (weight, bias) in enumerate(self._layers):
+            x = torch.baddbmm(bias[:count], x, weight[:count])
+            if index < last:
+                functional.silu(x, inplace=True)
+        mean, log = x.chunk(2, -1)
+        noise = torch.randn(mean.shape, generator=generator)
+        return (mean + noise * torch.exp(0.5 * _bounded(log, *self._bounds))) * self._scale + self._drift
+
+
+def optimizer_of(ensemble: Ensemble, fit: Fit) -> torch.optim.Optimizer:
+    """Adam over all networks at once; the bounds on variances do not decay."""
+    groups = [
+        {"params": list(ensemble.body.parameters()), "weight_decay": fit.decay},
+        {"params": [ensemble.lowest, ensemble.highest], "weight_decay": 0.0},
+    ]
+    return torch.optim.Adam(groups, lr=fit.lr, fused=True)
+
+
+def train_ensemble(
+    ensemble: Ensemble,
+    optimizer: torch.optim.Optimizer,
+    inputs: Tensor,
+    targets: Tensor,
+    *,
+    fit: Fit,
+    generator: torch.Generator,
+) -> float:
+    """Train all networks, each on its own bootstrap sample, and select the elites.
+
+    With validation data every network keeps its weights of least validation error; the training ends once no
+    network has improved by 1 % within `fit.patience` passes.
+
+    Args:
+        ensemble: to be trained further.
+        optimizer: of `optimizer_of`.
+        inputs: (N, inputs).
+        targets: (N, outputs).
+        fit: how.
+        generator: of all random numbers.
+
+    Returns:
+        Mean over the elites of the mean squared error on the validation data (without those, on the training
+        data), in units of the spread of the targets; NaN where the loss is not finite.
+    """
+    ensemble.normalise(inputs, targets)
+    order = torch.randperm(len(inputs), generator=generator)
+    held = int(fit.held * len(inputs))
+    held = held if held >= FEWEST and len(inputs) - held >= FEWEST else 0
+    judged = order[:held] if held else order
+    own = order[held:]
+    draws = torch.randint(len(own), (ensemble.networks, len(own)), generator=generator)
+    samples = own[draws]
+    best = _Best(ensemble, ensemble.errors(inputs[judged], targets[judged]) if held else None)
+    for _ in range(fit.epochs):
+        samples = samples[:, torch.randperm(len(own), generator=generator)]
+        for rows in torch.split(samples, fit.batch, 1):
+            loss = ensemble.loss(inputs[rows], targets[rows])
+            if not bool(torch.isfinite(loss)):
+                return math.nan
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+        if held and best.update(ensemble.errors(inputs[judged], targets[judged])) >= fit.patience > 0:
+            break
+    best.restore()
+    errors = ensemble.errors(inputs[judged], targets[judged])
+    ensemble.elites.copy_(errors.argsort(stable=True)[: len(ensemble.elites)])
+    return float(errors[ensemble.elites].mean())
+
+
+class _Best:
+    """Weights of least validation error of each network, and the passes since any of them improved."""
+
+    def __init__(self, ensemble: Ensemble, errors: Tensor | None) -> None:
+        self._ensemble, self._errors, self._idle = ensemble, errors, 0
+        self._kept = [] if errors is None else [each.detach().clone() for each in ensemble.body.parameters()]
+
+    def update(self, errors: Tensor) -> int:
+        """Keep the weights of networks that have improved; return the passes without improvement so far."""
+        assert self._errors is not None
+        better = errors < (1.0 - GAIN) * self._errors
+        self._idle = 0 if bool(better.any()) else self._idle + 1
+        self._errors = torch.where(better, errors, self._errors)
+        for kept, now in zip(self._kept, self._ensemble.body.parameters(), strict=True):
+            kept[better] = now.detach()[better]
+        return self._idle
+
+    @torch.no_grad()
+    def restore(self) -> None:
+        """Put the kept weights back."""
+        for kept, now in zip(self._kept, self._ensemble.body.parameters(), strict=False):
+            now.copy_(kept)

@@ -1,0 +1,305 @@
+"""Episodes of a task, real ones kept and imagined ones predicted by an ensemble, and their rewards.
+
+The ensemble learns the system. What the specification adds to it is known: parameters and timers follow from
+the states, and the reward is that of the task.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import torch
+from torch import Tensor
+
+from stlc.controller.methods import Learner
+from stlc.controller.methods._actor import ActorConfig, below, optimizer_tensors, restore_optimizer
+from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.problem.environments import MOST, SATISFIED, Environments, Reward
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.config import bounded
+from stlc.diagnostics import usage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from stlc.controller.problem.task import Task
+
+PIECE = 5
+"""Steps over which the controls of the first, random episodes are constant."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelConfig(ActorConfig):
+    """Options of a learner with a learnt model.
+
+    Attributes:
+        networks: of the ensemble.
+        elites: networks that predict, those with the least validation error.
+        width: of their hidden layers.
+        layers: number of hidden layers.
+        model_lr: learning rate of the networks.
+        model_decay: weight of their squared weights.
+        model_batch: samples of a gradient step of each network.
+        model_epochs: passes over the data after new episodes, at most.
+        model_patience: passes without improvement that end the training of the networks; 0: none.
+        model_held: share of the samples held out for their validation.
+        growth: share by which the data have to grow before the networks are trained again; 0: every time.
+        first: random episodes before the first training of the networks.
+        capacity: kept episodes; older ones are replaced.
+    """
+
+    environments: int = 16
+    networks: int = bounded(7, 1, 64)
+    elites: int = bounded(5, 1, 64)
+    width: int = bounded(200, 1, 8192)
+    layers: int = bounded(4, 1, 32)
+    model_lr: float = 2e-3
+    model_decay: float = 1e-5
+    model_batch: int = bounded(64, 1, 10**8)
+    model_epochs: int = 20
+    model_patience: int = 5
+    model_held: float = bounded(0.2, 0, 0.9)
+    growth: float = 0.5
+    first: int = bounded(200, 2, 10**6)
+    capacity: int = bounded(20_000, 2, 10**6)
+
+    @property
+    def fit(self) -> Fit:
+        """How the networks are trained."""
+        return Fit(
+            self.model_lr,
+            self.model_decay,
+            self.model_batch,
+            self.model_epochs,
+            self.model_patience,
+            self.model_held,
+        )
+
+
+# ------------------------------------------------------------------ episodes and rewards
+
+
+def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor:
+    """Rewards of all steps of whole episodes, as `Environments` gives them: (B, T).
+
+    Args:
+        task: specification and system.
+        kind: of reward.
+        states: (B, T+1, n).
+        actions: controls within their ranges, (B, T, m).
+    """
+    if kind == "task":
+        return step_rewards(task, states[:, :-1], states[:, 1:], actions)
+    found = actions.new_zeros(actions.shape[:2])
+    found[:, -1] = final_reward(task, kind, states)
+    return found
+
+
+def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
+    """Reward at the end of episodes (B, T+1, n), of the kinds `robustness` and `accuracy`: (B,)."""
+    rho = task.robustness(states)
+    if kind == "accuracy":
+        return SATISFIED * satisfied(rho).to(rho)
+    return torch.nan_to_num(rho, nan=-MOST).clamp(-MOST, MOST)
+
+
+def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
+    """The declared reward of steps: (…, n), (…, n), (…, m) -> (…)."""
+    system, shape = task.system, actions.shape[:-1]
+    flat = [part.reshape(-1, part.shape[-1]) for part in (before, after, actions)]
+    return system.reward(flat[1], system.commanded(flat[0], flat[2])).to(actions).view(shape)
+
+
+class Episodes:
+    """The latest episodes on the system.
+
+    Attributes:
+        states: (capacity, T+1, n); the first `count` hold.
+        actions: (capacity, T, m).
+        rewards: (capacity, T).
+        count: number of kept episodes.
+        total: number of episodes ever added.
+    """
+
+    def __init__(self, task: Task, capacity: int) -> None:
+        system = task.system
+        self.states = torch.zeros(capacity, system.horizon + 1, len(system.names))
+        self.actions = torch.zeros(capacity, system.horizon, len(system.control_names))
+        self.rewards = torch.zeros(capacity, system.horizon)
+        self.count = self.total = 0
+
+    def add(self, states: Tensor, actions: Tensor, earned: Tensor) -> None:
+        """Keep episodes (N, T+1, n), (N, T, m), (N, T) in place of the oldest."""
+        at = (self.total + torch.arange(len(states))) % len(self.states)
+        self.states[at], self.actions[at], self.rewards[at] = states, actions, earned
+        self.total += len(states)
+        self.count = min(self.total, len(self.states))
+
+    def transitions(self, own: int) -> tuple[Tensor, Tensor]:
+        """Inputs and targets of the ensemble: (N, own + m), (N, own); `own` columns belong to the system."""
+        states, actions = self.states[: self.count, :, :own], self.actions[: self.count]
+        before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
+        return torch.cat((before, actions.flatten(0, 1)), 1), after - before
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The kept episodes."""
+        names = ("states", "actions", "rewards")
+        found = {f"episodes.{name}": getattr(self, name)[: self.count].clone() for name in names}
+        return found | {"episodes.total": torch.tensor(self.total)}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore `tensors`, without their prefix."""
+        self.total, self.count = int(tensors["total"]), len(tensors["states"])
+        for name in ("states", "actions", "rewards"):
+            getattr(self, name)[: self.count] = tensors[name]
+
+
+@torch.no_grad()
+def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[Tensor, Tensor]:
+    """Episodes from given states under controls `act(states, step)`, (N, n) -> (N, T+1, n), (N, T, m)."""
+    system = task.system
+    states, actions = [x0], []
+    for step in range(system.horizon):
+        actions.append(torch.clamp(act(states[-1], step), system.control_low, system.control_high))
+        states.append(system.step(states[-1], actions[-1]))
+    return torch.stack(states, 1), torch.stack(actions, 1)
+
+
+def random_controls(task: Task, count: int, generator: torch.Generator) -> Tensor:
+    """Random plans whose controls are constant over `PIECE` steps, (count, T, m)."""
+    system = task.system
+    pieces = -(-system.horizon // PIECE)
+    drawn = torch.rand(count, pieces, len(system.control_names), generator=generator)
+    drawn = system.control_low + (system.control_high - system.control_low) * drawn
+    return drawn.repeat_interleave(PIECE, 1)[:, : system.horizon]
+
+
+# ------------------------------------------------------------------ the learnt model
+
+
+class LearntModel:
+    """One step of the system, sampled from an ensemble; parameters and timers as the specification says."""
+
+    def __init__(self, task: Task, predictor: Predictor) -> None:
+        self.task, self.predictor = task, predictor
+        self._own = len(task.system.decl.signature.names)
+
+    @torch.no_grad()
+    def step(self, x: Tensor, u: Tensor, generator: torch.Generator) -> Tensor:
+        """States one step later, each row of the first axis by an elite of its own.
+
+        Args:
+            x: (k, B, n), k at most the number of elites.
+            u: controls within their ranges, (k, B, m).
+            generator: of the predictions.
+        """
+        own = x[..., : self._own]
+        moved = own + self.predictor(torch.cat((own, u), -1), generator)
+        if self._own == x.shape[-1]:
+            return moved
+        added = self.task.system.added_later(x.flatten(0, 1)).view(*x.shape[:2], -1)
+        return torch.cat((moved, added), -1)
+
+
+class ModelLearner(Learner):
+    """Training with an ensemble: episodes on the system, the networks trained on them, then the subclass.
+
+    One step of the training is one episode in every environment, followed by the work on the learnt model.
+    The state between two steps is that of the networks, the kept episodes and the random numbers.
+
+    Attributes:
+        episodes: all kept episodes.
+        ensemble: the learnt model.
+        fitted: number of episodes at its latest training.
+        error: its validation error then, see `train_ensemble`.
+    """
+
+    config: ModelConfig
+
+    def __init__(
+        self, task: Task, config: ModelConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        """Raises UsageError (U101) for several ranks, a GPU, or an undeclared reward."""
+        super().__init__(task, config, steps=steps, device=device, ranks=ranks)
+        if ranks.size > 1:
+            raise usage(f"method `{config.method}` trains in one process", "start it without torchrun")
+        if device.type != "cpu":
+            raise usage(f"method `{config.method}` trains on the processor", "use --device cpu")
+        self.reward = cast("Reward", config.reward)
+        Environments(task, 1, reward=self.reward, generator=torch.Generator())
+        self.episodes = Episodes(task, config.capacity)
+        self.ensemble = ensemble_of(task, config)
+        self.optimizer = optimizer_of(self.ensemble, config.fit)
+        self.fitted = 0
+        self.error = math.nan
+
+    @property
+    def environment_steps(self) -> int:
+        """Steps on the system so far."""
+        return self.episodes.total * self.task.system.horizon
+
+    @property
+    def model(self) -> LearntModel:
+        """The system as learnt so far."""
+        return LearntModel(self.task, self.ensemble.predictor())
+
+    def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
+        """Play one episode in every environment and train the ensemble if due; False where that diverged.
+
+        Args:
+            act: states (N, n), step -> controls (N, m); None for random ones.
+        """
+        config = self.config
+        count = config.environments if self.episodes.total else max(config.first, config.environments)
+        x0 = self.task.sample(count, generator=self.generator)
+        if act is None or not self.episodes.total:
+            plans = random_controls(self.task, count, self.generator)
+            states, actions = play(self.task, x0, lambda _, step: plans[:, step])
+        else:
+            states, actions = play(self.task, x0, act)
+        self.episodes.add(states, actions, rewards(self.task, self.reward, states, actions))
+        if self.episodes.total < (1.0 + config.growth) * self.fitted:
+            return True
+        own = len(self.task.system.decl.signature.names)
+        inputs, targets = self.episodes.transitions(own)
+        self.error = train_ensemble(
+            self.ensemble, self.optimizer, inputs, targets, fit=config.fit, generator=self.generator
+        )
+        self.fitted = self.episodes.total
+        return not math.isnan(self.error)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State for an exact resumption, bit for bit: no episode is under way between two steps."""
+        found = super().tensors() | self.episodes.tensors()
+        found |= {f"ensemble.{name}": value for name, value in self.ensemble.state_dict().items()}
+        return found | optimizer_tensors(self.optimizer, "adam")
+
+    def facts(self) -> dict[str, float | int]:
+        """Scalars stored with `tensors`."""
+        error = {"model_error": self.error} if not math.isnan(self.error) else {}
+        own = {"fitted": self.fitted, "environment_steps": self.environment_steps}
+        return super().facts() | own | error
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Restore the state of `tensors` and `facts`."""
+        super().restore(tensors, facts)
+        self.episodes.restore(below(tensors, "episodes"))
+        self.ensemble.load_state_dict(below(tensors, "ensemble"))
+        restore_optimizer(self.optimizer, below(tensors, "adam"))
+        self.fitted, self.error = int(facts["fitted"]), float(facts.get("model_error", math.nan))
+
+
+def ensemble_of(task: Task, config: ModelConfig) -> Ensemble:
+    """An ensemble whose initial weights depend on the seed alone."""
+    outputs = len(task.system.decl.signature.names)
+    return Ensemble(
+        outputs + len(task.system.control_names),
+        outputs,
+        networks=config.networks,
+        elites=config.elites,
+        hidden=(config.width,) * config.layers,
+        generator=torch.Generator().manual_seed(config.seed),
+    )

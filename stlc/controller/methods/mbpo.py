@@ -1,0 +1,280 @@
+"""MBPO: model-based policy optimisation (Janner, Fu, Zhang and Levine, NeurIPS 2019).
+
+An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
+and soft actor-critic learns from their transitions, mixed with a few observed ones. The reward of imagined
+steps is that of the task: the robustness of an imagined episode that reaches the end is that of its observed
+beginning and its imagined rest.
+
+The settings of Meng and Fan (2023) for their comparison: the options `environments=1 growth=0 imagined=400
+longest=15 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
+temperature=0.2`, and `--lr 3e-4`. Their reward is learnt; here it is that of the task.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from stlc.controller.methods import Method
+from stlc.controller.methods._actor import ActorPolicy, below
+from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
+from stlc.controller.methods._soft_actor_critic import Batch, SacOptions, SoftActorCritic
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.training.checkpoint import load_checkpoint, restoring
+from stlc.controller.training.config import base_config, bounded
+from stlc.controller.training.run import spec_hash, trained_on
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.rundir import RunDir
+
+BATCH, RATE, HIDDEN = 256, 1e-3, (128, 128)
+EVERY, POOL = 5, 500
+"""Steps between validations, and the states judged by one."""
+
+
+@dataclass(frozen=True, slots=True)
+class MbpoConfig(ModelConfig):
+    """Options of MBPO.
+
+    Attributes:
+        imagined: imagined episodes that begin for every observed step.
+        shortest: their first length, in steps.
+        longest: their last length.
+        growing_from: training step from which they grow.
+        growing_to: training step at which they have their last length; they grow linearly.
+        observed: share of observed transitions in a batch.
+        updates: gradient steps of actor and critics for every observed step.
+        critic_width: of the hidden layers of actor and critics.
+        discount: gamma of the return.
+        follow: share by which the target critics follow in a gradient step.
+        temperature: weight of the entropy; 0: learnt.
+    """
+
+    imagined: float = 10.0
+    shortest: int = bounded(1, 1, 10**6)
+    longest: int = bounded(5, 1, 10**6)
+    growing_from: int = 5
+    growing_to: int = 40
+    observed: float = bounded(0.05, 0, 1)
+    updates: float = 0.5
+    critic_width: int = bounded(128, 1, 8192)
+    discount: float = bounded(0.99, 0, 1)
+    follow: float = bounded(0.005, 0, 1)
+    temperature: float = 0.0
+
+
+class Acting(nn.Module):
+    """Controls in physical units by the actor of a soft actor-critic.
+
+    Args:
+        task: whose control ranges the actions are shares of.
+        learner: with the actor.
+    """
+
+    def __init__(self, task: Task, learner: SoftActorCritic) -> None:
+        super().__init__()
+        self._learner = learner
+        low, high = task.system.control_low, task.system.control_high
+        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """The most probable controls: (B, k) -> (B, m)."""
+        return self.physical(self._learner(seen))
+
+    def physical(self, actions: Tensor) -> Tensor:
+        """Controls of actions in shares of their ranges: (…, m) -> (…, m)."""
+        return self._middle + self._half * actions
+
+    def shares(self, controls: Tensor) -> Tensor:
+        """Actions of controls in physical units: (…, m) -> (…, m)."""
+        return (controls - self._middle) / self._half.clamp(min=1e-12)
+
+
+class MbpoLearner(ModelLearner):
+    """Training of an ensemble, and of actor and critics on short imagined episodes."""
+
+    config: MbpoConfig
+
+    def __init__(
+        self, task: Task, config: MbpoConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        super().__init__(task, config, steps=steps, device=device, ranks=ranks)
+        self.actor_critic = actor_critic_of(task, config)
+        self.acting = Acting(task, self.actor_critic)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """The most probable controls."""
+        return ActorPolicy(self.task, self.acting)
+
+    @property
+    def length(self) -> int:
+        """Steps of imagined episodes at present."""
+        config = self.config
+        share = (self.step - config.growing_from) / max(1, config.growing_to - config.growing_from)
+        share = min(max(share, 0.0), 1.0)
+        return max(1, round(config.shortest + share * (config.longest - config.shortest)))
+
+    def advance(self) -> float:
+        """Play one episode in every environment, and learn from them: ensemble, then actor and critics."""
+        before = self.environment_steps
+
+        def act(states: Tensor, step: int) -> Tensor:
+            seen = self._seen(states, torch.full((len(states),), step))
+            return self.acting.physical(self.actor_critic.explore(seen, self.generator))
+
+        if not self.observed(act):
+            return math.nan
+        if not before:
+            self._normalise()
+        fresh = self.config.environments * self.task.horizon
+        imagined = self._imagined(max(1, round(self.config.imagined * fresh)))
+        total = torch.zeros(())
+        updates = max(1, round(self.config.updates * fresh))
+        for _ in range(updates):
+            total += self.actor_critic.learn(self._mixed(imagined), self.generator)
+        loss = float(total) / updates
+        if not math.isfinite(loss):
+            return math.nan
+        self.step, self.loss = self.step + 1, loss
+        return loss
+
+    def _seen(self, states: Tensor, steps: Tensor) -> Tensor:
+        """Observations with the elapsed share of the episode, (B, n), (B,) -> (B, k)."""
+        seen = self.task.system.observe(states)
+        return torch.cat((seen, (steps / self.task.horizon)[:, None].to(seen)), 1)
+
+    def _normalise(self) -> None:
+        """Units of observations and rewards by the first episodes."""
+        kept = self.episodes
+        states = kept.states[: kept.count]
+        steps = torch.arange(states.shape[1]).repeat(len(states))
+        self.actor_critic.normalise(
+            self._seen(states.flatten(0, 1), steps), kept.rewards[: kept.count].sum(1)
+        )
+
+    def _drawn(self, count: int) -> tuple[Tensor, Tensor]:
+        """Random observed steps: episodes and steps, (count,) each."""
+        episodes = torch.randint(self.episodes.count, (count,), generator=self.generator)
+        return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
+
+    def _mixed(self, imagined: Batch) -> Batch:
+        """A batch of imagined and observed transitions."""
+        size = self.config.batch
+        real = min(size, round(self.config.observed * size))
+        rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
+        return imagined.of(rows).joined(self._observed_batch(real)) if real else imagined.of(rows)
+
+    def _observed_batch(self, count: int) -> Batch:
+        """Random observed transitions."""
+        episodes, steps = self._drawn(count)
+        kept, after = self.episodes, steps + 1
+        return Batch(
+            self._seen(kept.states[episodes, steps], steps),
+            self.acting.shares(kept.actions[episodes, steps]),
+            kept.rewards[episodes, steps],
+            self._seen(kept.states[episodes, after], after),
+            (after == self.task.horizon).float(),
+        )
+
+    @torch.no_grad()
+    def _imagined(self, count: int) -> Batch:
+        """Transitions of at least `count` imagined episodes from random observed states, to their ends."""
+        model, horizon, length = self.model, self.task.horizon, self.length
+        members = model.predictor.elites
+        count = -(-count // members) * members
+        episodes, steps = self._drawn(count)
+        paths = self.episodes.states[episodes]  # (count, T+1, n): observed up to `steps`, then imagined
+        rows, found = torch.arange(count), []
+        for _ in range(length):
+            x = paths[rows, steps]
+            seen = self._seen(x, steps)
+            actions = self.actor_critic.explore(seen, self.generator)
+            controls = self.acting.physical(actions)
+            split = (members, -1)
+            moved = model.step(
+                x.view(*split, x.shape[1]), controls.view(*split, controls.shape[1]), self.generator
+            ).flatten(0, 1)
+            going = steps < horizon
+            after = (steps + 1).clamp(max=horizon)
+            paths[rows[going], after[going]] = moved[going]
+            earned = self._earned(paths, x, moved, controls, going & (after == horizon))
+            ended = (after == horizon).float()
+            parts = (seen, actions, earned, self._seen(moved, after), ended)
+            finite = going & torch.isfinite(moved).all(1) & torch.isfinite(earned)
+            found.append(Batch(*parts).of(finite.nonzero()[:, 0]))
+            steps = after
+        whole = found[0]
+        for part in found[1:]:
+            whole = whole.joined(part)
+        return whole
+
+    def _earned(self, paths: Tensor, x: Tensor, moved: Tensor, controls: Tensor, ends: Tensor) -> Tensor:
+        """Rewards of imagined steps (B, n), (B, n), (B, m), where episodes `paths` end at the mask: (B,)."""
+        if self.reward == "task":
+            return step_rewards(self.task, x, moved, controls)
+        earned = x.new_zeros(len(x))
+        at = ends.nonzero()[:, 0]
+        if len(at):
+            earned[at] = final_reward(self.task, self.reward, paths[at])
+        return earned
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State for an exact resumption; imagined episodes last no longer than a step."""
+        return super().tensors() | self.actor_critic.tensors()
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Restore the state of `tensors` and `facts`."""
+        super().restore(tensors, facts)
+        self.actor_critic.restore(tensors)
+
+
+class Mbpo(Method):
+    """Soft actor-critic on short imagined episodes of a learnt ensemble."""
+
+    options = MbpoConfig
+
+    def resolve(self, task: Task, config: TrainConfig) -> MbpoConfig:
+        """Options of MBPO; `--batch` and `--lr` are those of actor and critics."""
+        found = base_config(task, config, kind=MbpoConfig)
+        assert isinstance(found, MbpoConfig)
+        lr = config.lr or task.system.decl.train.lr or RATE
+        return replace(
+            found, hidden=HIDDEN, plans=1, lr=lr, batch=config.batch or BATCH, every=EVERY, pool=POOL
+        )
+
+    def learner(
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
+    ) -> MbpoLearner:
+        """Training state before the first step. Raises UsageError (U101), see `ModelLearner`."""
+        assert isinstance(config, MbpoConfig)
+        return MbpoLearner(task, config, steps=steps, device=device, ranks=ranks)
+
+    def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:  # noqa: ARG002
+        """The actor of a run."""
+        assert isinstance(config, MbpoConfig)
+        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        found = actor_critic_of(task, config)
+        with restoring(run):
+            found.load_state_dict(below(saved.tensors, "sac.weights"))
+        return ActorPolicy(task, Acting(task, found).eval())
+
+
+def actor_critic_of(task: Task, config: MbpoConfig) -> SoftActorCritic:
+    """Actor and critics whose initial weights depend on the seed alone."""
+    return SoftActorCritic(
+        task.system.observed_count + 1,
+        len(task.system.control_names),
+        width=config.critic_width,
+        options=SacOptions(config.lr, config.discount, config.follow, config.temperature),
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+
+
+METHOD = Mbpo()

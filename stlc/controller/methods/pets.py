@@ -1,0 +1,238 @@
+"""PETS: probabilistic ensembles with trajectory sampling (Chua et al., NeurIPS 2018).
+
+An ensemble learns the system from episodes. The policy plans with it whenever it is asked: the cross-entropy
+method over control sequences, each judged by the mean reward of particles that different networks carry
+forward. By default a plan is planned at once, by the reward of the imagined episode, and controls are
+constant over a few steps.
+
+The settings of Meng and Fan (2023) for their comparison: `--reward task`, and the options `ahead=5 piece=1
+population=350 rounds=5 particles=20 model_lr=7.5e-4 model_decay=3e-5 model_held=0 model_epochs=25 growth=0
+environments=10`; at run time they reduce it to `ahead=3 particles=3`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
+
+import torch
+from torch import Tensor
+
+from stlc.controller.methods import Method
+from stlc.controller.methods._actor import below
+from stlc.controller.methods._imagined import (
+    LearntModel,
+    ModelConfig,
+    ModelLearner,
+    ensemble_of,
+    final_reward,
+    step_rewards,
+)
+from stlc.controller.policies.policy import Policy
+from stlc.controller.training.checkpoint import load_checkpoint, restoring
+from stlc.controller.training.config import base_config, bounded
+from stlc.controller.training.run import spec_hash, trained_on
+
+if TYPE_CHECKING:
+    from stlc.controller.parallel.ddp import Ranks
+    from stlc.controller.problem.environments import Reward
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.rundir import RunDir
+
+ROWS = 20_000
+"""Imagined states that are advanced at a time, at most."""
+LEAST = 1e-3
+"""Least standard deviation of a population, as a share of the width of a control range."""
+EVERY, POOL = 10, 16
+"""Steps between validations, and the states judged by one: a plan costs far more than a network's."""
+
+
+@dataclass(frozen=True, slots=True)
+class PetsConfig(ModelConfig):
+    """Options of PETS.
+
+    Attributes:
+        ahead: steps that are planned at once; 0: the horizon of a plan, as for other rewards than `task`.
+            Otherwise a plan is the sequence of the first controls, planned anew at every step.
+        piece: steps over which a control is constant.
+        population: control sequences of a round.
+        rounds: of the cross-entropy method.
+        elite_share: of the population to which the next one is fitted.
+        inertia: weight of the former mean and variance (the paper's alpha).
+        particles: imagined episodes of a control sequence, distributed evenly over the elites.
+    """
+
+    environments: int = 8
+    first: int = 200
+    ahead: int = 0
+    piece: int = bounded(5, 1, 10**6)
+    population: int = bounded(100, 1, 10**6)
+    rounds: int = bounded(4, 1, 10**6)
+    elite_share: float = bounded(0.1, 0, 1)
+    inertia: float = bounded(0.1, 0, 1)
+    particles: int = bounded(5, 1, 4096)
+
+
+class PetsPolicy(Policy):
+    """Policy that plans with a learnt model; the same state gives the same plan.
+
+    Args:
+        task: specification and system.
+        model: the system as learnt.
+        config: options.
+    """
+
+    judged_at_once = 16
+
+    def __init__(self, task: Task, model: LearntModel, config: PetsConfig) -> None:
+        super().__init__(task)
+        self._model, self._config = model, config
+        self._reward = cast("Reward", config.reward)
+        members = min(config.particles, model.predictor.elites)
+        self._shape = members, config.particles // members
+
+    @torch.no_grad()
+    def candidates(self, x0: Tensor) -> Tensor:
+        """One plan per state: (B, n) -> (B, 1, T, m)."""
+        generator = torch.Generator().manual_seed(self._config.seed)
+        return self.sequence(x0.float(), generator).to(x0)[:, None]
+
+    @torch.no_grad()
+    def continuation(self, x0: Tensor) -> Tensor:
+        """Plans by a single round over the whole horizon: (B, n) -> (B, T, m)."""
+        other = PetsPolicy(self.task, self._model, replace(self._config, ahead=0, rounds=1))
+        generator = torch.Generator().manual_seed(self._config.seed)
+        return other.sequence(x0.float(), generator).to(x0)
+
+    @torch.no_grad()
+    def sequence(self, x0: Tensor, generator: torch.Generator) -> Tensor:
+        """Plans (B, T, m) from states (B, n): whole ones, or of first controls along the task's model."""
+        if not self._config.ahead or self._reward != "task":
+            return self._optimised(x0, self.task.horizon, generator)
+        x, actions = x0, []
+        ahead = min(self._config.ahead, self.task.horizon)
+        guess: Tensor | None = None
+        for _ in range(self.task.horizon):
+            found = self._optimised(x, ahead, generator, guess)
+            actions.append(found[:, 0])
+            guess = torch.cat((found[:, 1:], found[:, -1:]), 1)  # the former plan, one step later
+            x = self.task.system.step(x, actions[-1])
+        return torch.stack(actions, 1)
+
+    def _optimised(
+        self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None = None
+    ) -> Tensor:
+        """Controls of the next steps from states (B, n) by the cross-entropy method: (B, steps, m)."""
+        size = max(1, ROWS // (self._config.population * math.prod(self._shape)))
+        guesses = [None] * len(x0) if guess is None else torch.split(guess, size)
+        parts = zip(torch.split(x0, size), guesses, strict=False)
+        return torch.cat([self._climbed(part, steps, generator, start) for part, start in parts])
+
+    def _climbed(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
+        """As `_optimised`; mean and variance of each round are those of the best of the round before."""
+        config, system = self._config, self.task.system
+        low, high = system.control_low, system.control_high
+        pieces = -(-steps // config.piece)
+        mean = (0.5 * (low + high)).expand(len(x0), pieces, -1)
+        if guess is not None:
+            mean = guess[:, :: config.piece]
+        variance = (0.25 * (high - low)).square().expand_as(mean)
+        best = torch.full((len(x0),), -torch.inf)
+        chosen = mean.clone()
+        elites = max(1, round(config.elite_share * config.population))
+        rows = torch.arange(len(x0))
+        for _ in range(config.rounds):
+            room = 0.5 * torch.minimum(mean - low, high - mean)  # two deviations are within the range
+            deviation = torch.minimum(variance, room.square()).sqrt().clamp(min=LEAST * (high - low))
+            shape = (len(x0), config.population, pieces, len(low))
+            noise = torch.randn(shape, generator=generator).clamp(-2.0, 2.0)
+            sampled = torch.clamp(mean[:, None] + deviation[:, None] * noise, low, high)
+            values = self._values(x0, sampled.repeat_interleave(config.piece, 2)[:, :, :steps], generator)
+            value, which = values.max(1)
+            better = value > best
+            best = torch.where(better, value, best)
+            chosen = torch.where(better[:, None, None], sampled[rows, which], chosen)
+            top = values.topk(elites, 1).indices
+            kept = sampled[rows[:, None], top]
+            mean = config.inertia * mean + (1.0 - config.inertia) * kept.mean(1)
+            variance = config.inertia * variance + (1.0 - config.inertia) * kept.var(1, unbiased=False)
+        return chosen.repeat_interleave(config.piece, 1)[:, :steps]
+
+    def _values(self, x0: Tensor, sequences: Tensor, generator: torch.Generator) -> Tensor:
+        """Mean reward over the particles of sequences (B, P, steps, m) from states (B, n): (B, P)."""
+        members, each = self._shape
+        batch, count, steps = sequences.shape[:3]
+        flat = sequences.flatten(0, 1).repeat(each, 1, 1)
+        x = x0.repeat_interleave(count, 0).repeat(each, 1).expand(members, -1, -1)
+        u = flat.expand(members, -1, -1, -1)
+        total, path = x.new_zeros(x.shape[:2]), [x]
+        for step in range(steps):
+            x = self._model.step(x, u[:, :, step], generator)
+            if self._reward == "task":
+                total += step_rewards(self.task, path[-1], x, u[:, :, step])
+            path.append(x)
+        if self._reward != "task":
+            states = torch.stack(path, 2).flatten(0, 1)
+            total = final_reward(self.task, self._reward, states).view(members, -1)
+        values = torch.nan_to_num(total, nan=-torch.inf).view(members * each, batch, count).mean(0)
+        return torch.nan_to_num(values, nan=-torch.inf)
+
+
+class PetsLearner(ModelLearner):
+    """Training of the ensemble on episodes of its own plans; plans are carried out whole, or step by step."""
+
+    config: PetsConfig
+
+    @property
+    def policy(self) -> PetsPolicy:
+        """The planner with the model as learnt so far."""
+        return PetsPolicy(self.task, self.model, self.config)
+
+    def advance(self) -> float:
+        """Plan and play one episode in every environment, and learn from it."""
+        plans: list[Tensor] = []
+        planner = self.policy
+
+        def act(states: Tensor, step: int) -> Tensor:
+            if not step:
+                plans.append(planner.sequence(states, self.generator))
+            return plans[0][:, step]
+
+        if not self.observed(act):
+            return math.nan
+        self.step += 1
+        self.loss = self.error
+        return self.loss
+
+
+class Pets(Method):
+    """Planning with a learnt ensemble by the cross-entropy method."""
+
+    options = PetsConfig
+
+    def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
+        """Options of PETS; validations judge few states."""
+        found = base_config(task, config, kind=PetsConfig)
+        assert isinstance(found, PetsConfig)
+        return replace(found, hidden=(200,) * 4, plans=1, every=EVERY, pool=POOL)
+
+    def learner(
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
+    ) -> PetsLearner:
+        """Training state before the first step. Raises UsageError (U101), see `ModelLearner`."""
+        assert isinstance(config, PetsConfig)
+        return PetsLearner(task, config, steps=steps, device=device, ranks=ranks)
+
+    def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> PetsPolicy:  # noqa: ARG002
+        """The planner with the ensemble of a run."""
+        assert isinstance(config, PetsConfig)
+        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        ensemble = ensemble_of(task, config)
+        with restoring(run):
+            ensemble.load_state_dict(below(saved.tensors, "ensemble"))
+        return PetsPolicy(task, LearntModel(task, ensemble.predictor()), config)
+
+
+METHOD = Pets()
