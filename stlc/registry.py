@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from difflib import SequenceMatcher
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
@@ -140,8 +141,10 @@ class PackageRegistry(Registry[T]):
     @property
     def names(self) -> tuple[str, ...]:
         """The default, then the others in alphabetical order."""
-        package = find_spec(self._package)
-        folders = package.submodule_search_locations if package is not None else None
+        root, *inner = self._package.split(".")  # finding an inner package would import those around it
+        package = find_spec(root)
+        roots = (package.submodule_search_locations if package is not None else None) or ()
+        folders = [str(Path(folder, *inner)) for folder in roots]
         found = sorted(
             module.name
             for module in iter_modules(folders)

@@ -204,6 +204,11 @@ env = stlc.gym.make("specs/traffic.stl", "car.yaml")
 env.reset(seed=0)
 env.step(env.action_space.sample())
 """,
+    "rl": """
+from stlc.gym import make_vec
+from stlc.gym.sb3 import SB3VecEnv
+SB3VecEnv(make_vec("specs/traffic.stl", 2, "car.yaml")).reset()
+""",
     "panda": """
 import os
 os.environ["DISPLAY"] = ":0"
