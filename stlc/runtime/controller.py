@@ -227,7 +227,7 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
-        """The policy's plans, or rests of previous ones that are continued, and all outputs of the graph."""
+        """The graph's choice between the policy's plans and rests of previous plans, and all its outputs."""
         previous = self._previous
         if previous is None:
             judged, outputs = self._graphs.decided(x)

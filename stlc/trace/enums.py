@@ -53,7 +53,11 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
 
 def wordless(recording: Recording) -> Recording:
-    """Return the content of a trace file with signals of words moved to the extras, arrays not evaluated."""
+    """Return the content of a trace file with signals of words moved to the extras (unevaluated arrays).
+
+    Raises:
+        TraceError: E603, all signals are words.
+    """
     signals = [values for group in recording.groups for values in group.arrays.values()]
     none_left = all(map(_is_odd, signals))
     return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})

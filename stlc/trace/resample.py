@@ -1,6 +1,6 @@
 """Resampling of signals to one grid: discrete signals are held, real ones interpolated linearly.
 
-Within gaps between samples that are too long a signal is unknown: NaN.
+If the gap between two samples of a signal is too long, the signal is unknown (NaN) within it.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ class Spacing:
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
         """Grid for samples at `times`; values are known within gaps of at most `max_gap` seconds.
 
-        By default the limit is three steps, the step being the longer of `dt` and the usual time between
-        samples; there is no limit if the samples are `events`, values that hold until the next one.
+        By default the limit is three steps, a step being the longer of `dt` and the usual time between
+        samples. Without `max_gap` there is no limit for `events`: discrete signals whose values hold until
+        the next sample.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)

@@ -107,7 +107,10 @@ class VectorAnimation:
 
 
 def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Colours for the dark scheme: colour -> colour; empty if an animation has images or other colours."""
+    """Map from each colour to its replacement in the dark scheme.
+
+    It is empty if an animation contains images, or colours that `dark` does not list.
+    """
     known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}
 

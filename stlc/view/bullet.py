@@ -91,7 +91,7 @@ def require_window() -> None:
 
 
 class Renderer:
-    """PyBullet simulation that shows the robots of a stage and the balls at them, side by side along x."""
+    """PyBullet simulation that shows the robots of a stage, and the balls that belong to them, along x."""
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
         with _silenced():

@@ -89,7 +89,7 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: share of runs that satisfy all rules, the same among viable runs, and of each rule."""
+    """Table rows: shares of runs that satisfy all rules, of viable runs that do, and per rule."""
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
     if not known:
@@ -129,7 +129,7 @@ def _broken(simulation: Record | None) -> Html | None:
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:
-    """Names of all metrics, in the order of the first guard that has each one."""
+    """Names of all metrics, in order of first occurrence among the guards."""
     return list(dict.fromkeys(name for guard in guards.values() for name in guard.get("metrics") or {}))
 
 

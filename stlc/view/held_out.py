@@ -86,7 +86,7 @@ class Condition:
     value: float
 
     def holds(self, x0: Array) -> Mask:
-        """True for each of the starts (starts, columns) that meets the condition, (starts,)."""
+        """Evaluate the condition for starts (starts, columns): booleans, (starts,)."""
         return np.asarray(_COMPARE[self.op](x0[:, self.column], self.value))
 
 
@@ -153,7 +153,10 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
-    """The conjunction that a beam search finds; each condition must raise the score by `LEAST_GAIN` times."""
+    """Return the best conjunction of a beam search.
+
+    A condition is added only if the score grows by at least the factor `LEAST_GAIN`.
+    """
     best: tuple[Condition, ...] = ()
     best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
     values = [_Values.of(column) for column in x0.T]
@@ -173,7 +176,7 @@ def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
 
 
 def _region(x0: Array, conditions: Sequence[Condition]) -> Mask:
-    """True for starts that meet all conditions, (starts,)."""
+    """Evaluate the conjunction of conditions for starts (starts, columns): booleans, (starts,)."""
     return np.asarray(np.all([np.ones(len(x0), dtype=bool), *(c.holds(x0) for c in conditions)], axis=0))
 
 

@@ -1,4 +1,4 @@
-"""HTML that is safe against injection: everything that is not `Html` is text and gets escaped."""
+"""HTML that is safe against injection: text is escaped unless it is wrapped in `Html`."""
 
 from __future__ import annotations
 

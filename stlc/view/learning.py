@@ -43,10 +43,11 @@ class Curve:
     """Extrapolation of a learning curve.
 
     Attributes:
-        state: `short`: too few search rounds; `flat`: twice the steps would change little; `rising`.
-        times: multiple of the steps made at which the curve reaches the share `TRAINED` at its present slope;
-            curves flatten, so its square is the upper end of the forecast. None if it exceeds `MOST_TIMES` or
-            if the curve is not rising.
+        state: `short`: too few search rounds for an extrapolation; `flat`: twice the steps would change
+            little; `rising`.
+        times: factor by which the number of steps must grow until the curve reaches the share `TRAINED` at
+            its present slope; curves flatten, so the square of the factor is the upper end of the forecast.
+            None if it exceeds `MOST_TIMES` or if the curve is not rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -58,7 +59,7 @@ class Learning:
     """Verdict on a training.
 
     Attributes:
-        level: how far the policy is trained, or that no plan exists.
+        level: `trained`, `partly trained`, `undertrained`, `no plan known` or `infeasible`.
         share: share of the starts with a known satisfying plan that the policy solves; None if there are
             none.
         sentence: level and share as a sentence.
@@ -102,7 +103,7 @@ class Commands:
 
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
-        """Commands for the run named `run`; if it is the `newest`, the command to simulate needs no name.
+        """Return the commands for the run named `run`; for the `newest` run, `simulate` omits the name.
 
         `guard` is the recommended guard: `none`, `paper` or `full`.
         """

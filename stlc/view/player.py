@@ -135,7 +135,7 @@ def _keys(panels: Sequence[RunPanel]) -> Html:
 
 
 def _inks(color: str) -> str:
-    """Inline style that sets a colour for the light and for the dark scheme."""
+    """CSS that sets a colour for the light and for the dark scheme."""
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
 
 

@@ -159,7 +159,7 @@ def _summary(region_map: RegionMap) -> str:
 
 
 def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
-    """Axes of the map, and beside it a row of axes for each region."""
+    """Return the axes of the map, and the axes beside it, one per region below one another."""
     (left, right), (low, high) = region_map.plane.window(region_map.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
     grid = figure.add_gridspec(1, 2, width_ratios=[1.55 * ratio**0.5, 1])
@@ -442,9 +442,9 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
 
 
 def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
-    """A monitor of one membership predicate; None if it cannot be compiled alone.
+    """A monitor of one membership predicate; None if the predicate cannot be compiled by itself.
 
-    A predicate that uses an argument of a definition, for example, cannot.
+    This is the case, for example, if it uses an argument of a definition.
     """
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
     formula = replace(node, item=_point(node), negated=False)
@@ -486,7 +486,11 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """The occurrence inside a temporal operator; unchanged if the operator's window moves with time."""
+    """The occurrence inside a temporal operator, with the operator's window in seconds of the trace's time.
+
+    It is unchanged if the window has no fixed place in time, since the operator is evaluated at many
+    instants.
+    """
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)
     if low is None or high is None or (interval.clock == "now" and slides):

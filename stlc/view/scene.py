@@ -127,7 +127,7 @@ def _moment(scene: Scene, frames: int) -> int:
 
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
-    """Aspect ratio (height / width) of the picture that the world draws."""
+    """Aspect ratio (height / width) of the picture that the world draws of a scene."""
     with picture_style():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)

@@ -112,8 +112,8 @@ class SceneVerdicts:
     def marked(self) -> set[str]:
         """Requirements whose violations are marked in the picture.
 
-        These are all requirements of a separate specification for closed-loop runs; without one, the
-        requirements tagged `@safety`, or all if none is tagged.
+        If the trace has a separate specification for closed-loop runs, these are all its requirements.
+        Otherwise these are the requirements tagged `@safety`, or all if none is tagged.
         """
         safety = {each.name for each in self.executed if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)

@@ -407,10 +407,10 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """The operand with the least margin, for each of two ways to give an equivalence the value `wanted`.
+        """The operand with the least margin, in each of two cases that give an equivalence value `wanted`.
 
-        An equivalence holds if both sides are true or both are false, an exclusive or if exactly one side is
-        true.
+        If both sides should be equal, the cases are "both true" and "both false"; if they should differ,
+        "only the left side true" and "only the right side true".
         """
         left, right = formula.items
         same = (formula.op == "<->") is wanted

@@ -137,7 +137,7 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """`until` without upper bound: satisfied within the rows, or left side true there and satisfied later.
+    """Unbounded `until`: satisfied in the known rows, or its left side is true there and it is met later.
 
     `release` is the dual.
     """

@@ -62,7 +62,10 @@ def value_of(text: str) -> float | None:
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers in the selected columns, (lines, columns); None without lines or for other cells."""
+    """Return the numbers in the selected columns, (lines, columns); None without lines or for other cells.
+
+    Empty cells are NaN, truth values are 0 and 1; quotes around a number are removed.
+    """
     if not _ANY.search(body):
         return None
     values = _loaded(body, delimiter, columns)

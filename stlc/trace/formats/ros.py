@@ -164,7 +164,10 @@ class Decoder:
 
 
 def _kept(numbers: Iterator[MessageNumber], wanted: bool) -> Iterable[MessageNumber]:
-    """The numbers if `wanted`, else none; the iterator is consumed then, to move the position past them."""
+    """Return the numbers if `wanted`, else none.
+
+    The iterator is consumed even if they are not wanted, so that the read position moves past them.
+    """
     if wanted:
         return numbers
     deque(numbers, maxlen=0)

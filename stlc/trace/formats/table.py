@@ -66,7 +66,7 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
 
 
 def is_unit(text: str) -> bool:
-    """True if a text in parentheses after a name is a known unit."""
+    """True if the text in parentheses after a column name is a known unit."""
     if text.lower() in _SPELLINGS:
         return True
     try:

@@ -164,7 +164,7 @@ class Machine:
         return math.inf if self.domain.end == "upper" else -math.inf
 
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
-        """Return the function that extends a predicate's values at the instants `inside` to those of `run`.
+        """Return the function that pads a predicate's values at instants `inside` to those at instants `run`.
 
         Beyond the trace a predicate is unknown, or false if windows are clipped.
         """

@@ -1,6 +1,7 @@
-"""C translation unit of one step of a system, with its observation and reward, for many states at once.
+"""C code of one step of a system, with its observation and reward, for many states at once.
 
-Exact switching and double precision, `LANES` states at a time; observations are float32, which learners read.
+Switching is exact, numbers are double, and `LANES` states are computed at a time; observations are float32,
+the input of learners.
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ from stlc.compile.ir import nodes as ir
 def emit_advance(
     motion: Motion, *, observed: Sequence[ir.Num], reward: ir.Num | None, commands: Mapping[str, ir.Num]
 ) -> str:
-    """Return the C source of `advance` and `look`; see `stlc.native.Advance` for their signatures.
+    """Return the C source of `advance` (a step) and `look` (an observation).
+
+    Their signatures are described in `stlc.native.Advance`.
 
     Args:
         motion: one step of the system.
-        observed: numbers that the policy reads, over the states.
-        reward: of a step, over the states after it and the commands in it; None for none.
-        commands: control -> what its actuator gets, over states before the step and controls; those that are
-            absent get the control itself.
+        observed: expressions of the states that the policy reads.
+        reward: reward of a step, an expression of the states after the step and the commands in it; None: no
+            reward.
+        commands: control -> actuator command, an expression of the states before the step and the controls;
+            for a control that is not listed, the actuator gets the control itself.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
@@ -53,7 +57,7 @@ def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
 
 
 def _writer(motion: Motion) -> NumberWriter:
-    """Writer of numbers over the states `x` and the controls `u`, of lane `j`."""
+    """Writer of expressions of the states `x` and the controls `u`, for one state vector, number `j`."""
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
@@ -67,7 +71,7 @@ def _writer(motion: Motion) -> NumberWriter:
 
 
 def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
-    """Body of a step: next states `y` and commands `c` from states `x` and controls `u`."""
+    """C statements of a step: next states `y` and commands `c` from states `x` and controls `u`."""
     index, writer = state_index(motion), _writer(motion)
     given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
     for name, num in motion.lets:
@@ -78,7 +82,7 @@ def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
 
 
 def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
-    """Body that writes numbers over states `x` and commands `u` to `y`."""
+    """C statements that write expressions of states `x` and commands `u` to `y`."""
     writer = _writer(motion)
     values = [writer.number(num) for num in numbers]
     return [*writer.lines, *(f"y[{i}][j] = {value};" for i, value in enumerate(values))]

@@ -125,7 +125,10 @@ def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
 
 
 def along_roots(plan: Plan, form: str) -> list[str]:
-    """Return a C statement per requirement: `form` with its index `{i}` and its robustness `{value}`."""
+    """Return C statements of the form `form` for every requirement, filled with its index and robustness.
+
+    `{i}` stands for the index, `{value}` for the C expression of the robustness.
+    """
     lines = []
     for first, root, rows in _side_by_side(plan):
         if rows == 1:

@@ -23,7 +23,7 @@ class NumberWriter(NumberEvaluator[str]):
 
     Args:
         place: returns the C expression of a signal, a frozen value or an available function result; None for
-            a function that must be inlined.
+            a function that must be expanded in place.
 
     Attributes:
         lines: the statements.

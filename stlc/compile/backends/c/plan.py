@@ -60,7 +60,7 @@ class Buffer:
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """Step that evaluates a function of signals at all samples; its components get consecutive numbers."""
+    """Step that evaluates a function of signals at all samples; its components have consecutive numbers."""
 
     function: ir.Extern
 

@@ -179,7 +179,7 @@ class _Margin(StepForm):
         return [f"{loop(self.run)} {{ {reader.heads()} LANE {{ {body} }} }}"]
 
     def backward(self) -> list[str]:
-        """Propagate the gradient; guards, and predicates on the elapsed time, have none."""
+        """Propagate the gradient; guards, and predicates on the elapsed time, have a zero gradient."""
         num, sign = self.node.num, "" if self.node.sign > 0 else "-"
         counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
         if self.node.guard or counted:
@@ -334,7 +334,10 @@ class _Windowed(StepForm):
         return [*head, "  else LANE {", *_indented(self._step_back(), 4), "  }", "}"]
 
     def _recursion(self, lines: list[str], *, reverse: bool = False) -> list[str]:
-        """Head of the recursion's loop, with statements for its first instant; `reverse`: for the adjoint."""
+        """Head of the C loop of the recursion, with statements for its first instant.
+
+        With `reverse` the loop runs in the opposite direction, as the adjoint does.
+        """
         first = self.run.start if self.back else self.run.last
         head = loop(self.run, back=self.back if reverse else not self.back)
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
@@ -530,7 +533,7 @@ class _TableLoop(_Repeated):
     """C code of a family of formulas: one iteration per row of its table."""
 
     def _head(self) -> list[str]:
-        """The table, and the head of the loop over its rows, which two braces close."""
+        """C statements with the table and the head of the loop over its rows; two braces close the loop."""
         table, row, index = self.node.table, self.loop.index, self.printer.index
         constants = {name: map(literal, values) for name, values in table.constants.items()}
         columns = {name: [str(index[state]) for state in states] for name, states in table.columns.items()}

@@ -1,8 +1,8 @@
-"""Array namespace over CasADi expressions (Andersson et al. 2019), for nonlinear programs.
+"""Array operations on CasADi expressions (Andersson et al. 2019), for nonlinear programs.
 
-A column is `(time, 1)`: a program is about one trajectory. Kinks of functions are rounded within `ROUNDING`,
-so that Newton's method applies: `abs`, `min`, `max` and `clip`. Steps (`floor`, `sign`) stay exact: their
-derivative is 0. Extra `stlc[mpc]`.
+An array is `(time, 1)`, since a program is about one trajectory. Kinks of functions (`abs`, `min`, `max`,
+`clip`) are rounded within `ROUNDING`, so that Newton's method applies. Step functions (`floor`, `sign`) stay
+exact, with derivative 0. CasADi comes with the extra `stlc[mpc]`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TINY = 1e-12
 @final
 @dataclass(frozen=True, slots=True, eq=False)
 class SymbolicColumn:
-    """A column of expressions.
+    """Time series of symbolic expressions.
 
     Attributes:
         entries: `casadi.SX`, (time, 1).
@@ -43,17 +43,17 @@ class SymbolicColumn:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(time, 1)."""
+        """Shape, (time, 1)."""
         return (int(self.entries.shape[0]), 1)
 
     @property
     def ndim(self) -> int:
-        """2."""
+        """Number of axes, which is 2."""
         return 2
 
     @property
     def T(self) -> SymbolicColumn:  # noqa: N802 - as arrays call it
-        """The transpose of a single entry."""
+        """Transpose; only for a series of length 1, which is its own transpose."""
         assert len(self) == 1
         return self
 
@@ -64,7 +64,7 @@ class SymbolicColumn:
         return SymbolicColumn(self.entries[rows, 0])
 
     def rows(self) -> list[SymbolicColumn]:
-        """Each entry, (1, 1)."""
+        """The expressions at each instant, (1, 1) each."""
         return [self[k] for k in range(len(self))]
 
     def __add__(self, other: Operand) -> SymbolicColumn:
@@ -101,7 +101,7 @@ Operand: TypeAlias = SymbolicColumn | float
 @final
 @dataclass(frozen=True, slots=True)
 class StackedColumns:
-    """Columns along a new first axis, for an extremum over it."""
+    """Several time series, stacked along a new first axis to take an extremum over it."""
 
     parts: tuple[SymbolicColumn, ...]
 
@@ -112,7 +112,7 @@ class StackedColumns:
         return self.parts[index]
 
     def rows(self) -> list[SymbolicColumn]:
-        """The columns."""
+        """The stacked time series."""
         return list(self.parts)
 
 
@@ -121,7 +121,7 @@ def _entries(operand: Operand) -> Any:
 
 
 def _elementwise(function: Any) -> Any:
-    """The method of a function of CasADi that works on each entry."""
+    """Make a method of `CasadiOps` from a CasADi function that works elementwise."""
 
     def method(_: CasadiOps, *operands: Operand) -> SymbolicColumn:
         return SymbolicColumn(casadi.SX(function(*map(_entries, operands))))
@@ -130,13 +130,13 @@ def _elementwise(function: Any) -> Any:
 
 
 def _each(*functions: Any) -> list[Any]:
-    """The methods of some functions."""
+    """Make methods of `CasadiOps` from several elementwise functions."""
     return [_elementwise(function) for function in functions]
 
 
 @final
 class CasadiOps:
-    """`stlc.compile.backends.array.namespace.Ops` over columns of expressions."""
+    """`stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
 
     name = "casadi"
 
@@ -165,24 +165,24 @@ class CasadiOps:
         return b * c * factor + a
 
     def clamp(self, x: SymbolicColumn, low: float | None, high: float | None) -> SymbolicColumn:
-        """`x` clamped to [low, high], rounded at both ends."""
+        """Clamp `x` to [low, high], with rounded kinks at both ends."""
         raised = x if low is None else self.maximum(x, low)
         held: SymbolicColumn = raised if high is None else self.minimum(raised, high)
         return held
 
     def norm(self, *components: Operand) -> SymbolicColumn:
-        """Euclidean length."""
+        """Euclidean norm of a vector given by its components."""
         total = sum(part * part for part in map(_entries, components))
         return SymbolicColumn(casadi.sqrt(total + TINY))
 
     # ------------------------------------------------------------------- truth
 
     def settled(self, weight: SymbolicColumn, mask: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """The weight itself, which is smooth."""
+        """Return `weight` unchanged, since the program must be smooth."""
         return weight
 
     def number(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """The mask, which is 0 or 1."""
+        """Return the mask itself, whose entries are 0 or 1."""
         return mask
 
     def lerp(self, no: Operand, yes: Operand, weight: SymbolicColumn) -> SymbolicColumn:
@@ -190,7 +190,7 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask`, else -inf; plus or minus `GREAT` where the mask depends on data."""
+        """+inf where `mask` is true, else -inf; `GREAT` instead of infinity if the mask depends on data."""
         rows = []
         for each in mask.rows():
             size = math.inf if each.entries.is_constant() else GREAT
@@ -198,21 +198,21 @@ class CasadiOps:
         return self.cat(rows)
 
     def straight_through(self, rho: SymbolicColumn, strict: bool, slope: float) -> SymbolicColumn:  # noqa: ARG002
-        """`(1 + tanh(slope rho)) / 2`: value and gradient are of one function."""
+        """`(1 + tanh(slope rho)) / 2`, so that value and gradient belong to the same function."""
         return SymbolicColumn(0.5 + 0.5 * casadi.tanh(slope * rho.entries))
 
     # -------------------------------------------------------------- along time
 
     def join(self, items: Sequence[SymbolicColumn], pick: Pick) -> SymbolicColumn:
-        """Extremum of one or more columns, rounded."""
+        """Elementwise minimum or maximum of one or more series, with rounded kinks."""
         return reduce(self.minimum if pick == "min" else self.maximum, items)
 
     def amin(self, x: SymbolicColumn) -> SymbolicColumn:
-        """Minimum over time, rounded, (1, 1)."""
+        """Minimum over time with rounded kinks, (1, 1)."""
         return self.join(x.rows(), "min")
 
     def amax(self, x: SymbolicColumn) -> SymbolicColumn:
-        """Maximum over time, rounded, (1, 1)."""
+        """Maximum over time with rounded kinks, (1, 1)."""
         return self.join(x.rows(), "max")
 
     def sum(self, x: SymbolicColumn) -> SymbolicColumn:
@@ -220,15 +220,15 @@ class CasadiOps:
         return SymbolicColumn(casadi.sum1(x.entries))
 
     def cummin(self, x: SymbolicColumn) -> SymbolicColumn:
-        """Running minimum, rounded."""
+        """Running minimum along time, with rounded kinks."""
         return self.cat([self.amin(x[: k + 1]) for k in range(len(x))])
 
     def cummax(self, x: SymbolicColumn) -> SymbolicColumn:
-        """Running maximum, rounded."""
+        """Running maximum along time, with rounded kinks."""
         return self.cat([self.amax(x[: k + 1]) for k in range(len(x))])
 
     def softmax(self, x: SymbolicColumn | StackedColumns, k: float) -> SymbolicColumn | StackedColumns:
-        """`log(sum(exp(k x))) / k` over the first axis, kept with length 1, by pairs."""
+        """`log(sum(exp(k x))) / k` over the first axis, which is kept with length 1; computed pairwise."""
         parts = x.rows()
         while len(parts) > 1:
             pairs = [self.softmax2(a, b, k) for a, b in zip(parts[::2], parts[1::2], strict=False)]
@@ -236,7 +236,7 @@ class CasadiOps:
         return parts[0] if isinstance(x, SymbolicColumn) else StackedColumns((parts[0],))
 
     def softmax2(self, a: SymbolicColumn, b: SymbolicColumn, k: float) -> SymbolicColumn:
-        """`log(exp(k a) + exp(k b)) / k` without overflow; infinite constants fall out or decide."""
+        """`log(exp(k a) + exp(k b)) / k` without overflow, also if an operand is an infinite constant."""
         neutral = -math.inf if k > 0.0 else math.inf
         rows = []
         for one, other in zip(a.rows(), b.rows(), strict=True):
@@ -252,66 +252,69 @@ class CasadiOps:
         return self.cat(rows)
 
     def extrema(self, x: SymbolicColumn, pick: Pick, window: Sliding) -> None:
-        """None: windows are computed by pairwise doubling."""
+        """Return None: there is no special method for windows."""
 
     def until(self, left: SymbolicColumn, right: SymbolicColumn, pick: Pick, window: Sliding) -> None:
-        """None: `until` is computed by other methods."""
+        """Return None: there is no special method for `until`."""
 
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """None: constants are floats."""
+        """Return None: constants are floats for all arrays."""
         return None
 
     def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002
-        """The float itself."""
+        """Return the float itself."""
         return value
 
     def full(self, shape: tuple[int, ...], value: float, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """A constant column."""
+        """Time series of a constant."""
         return SymbolicColumn(casadi.SX([value] * (shape[0] if shape else 1)))
 
     def counted(self, first: int, count: int, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """Integers along time."""
+        """Time series that counts `first`, `first + 1`, …."""
         return SymbolicColumn(casadi.SX([float(k) for k in range(first, first + count)]))
 
     def empty(self, shape: tuple[int, ...], like: SymbolicColumn) -> SymbolicColumn:
-        """Zeros."""
+        """Time series of zeros."""
         return self.full(shape, 0.0, like)
 
     def cat(self, parts: Sequence[SymbolicColumn]) -> SymbolicColumn:
-        """Concatenation along time."""
+        """Concatenate series along time."""
         return SymbolicColumn(casadi.vertcat(*(part.entries for part in parts)))
 
     def stack(self, parts: Sequence[SymbolicColumn]) -> StackedColumns:
-        """Columns stacked along a new first axis."""
+        """Stack series along a new first axis."""
         return StackedColumns(tuple(parts))
 
     def flip(self, x: SymbolicColumn) -> SymbolicColumn:
-        """Reversed in time."""
+        """Reverse `x` in time."""
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: SymbolicColumn, value: float) -> SymbolicColumn:
-        """`x` with `value` in the rows outside `keep`."""
+        """Copy of `x` with `value` in the rows where `keep` is False."""
         blank = casadi.SX(value)
         return SymbolicColumn(casadi.vertcat(*(x[k].entries if keep[k] else blank for k in range(len(x)))))
 
     def columns(self, x: Any) -> Sequence[SymbolicColumn]:
-        """`casadi.SX` (time, dim) -> a column for each dimension."""
+        """Split `casadi.SX` (time, dim) into one time series per state."""
         return [SymbolicColumn(x[:, i]) for i in range(x.shape[1])]
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Empty context: nothing is computed while an expression is built."""
+        """Empty context, since nothing is computed while an expression is built."""
         return nullcontext()
 
 
 def _rounded(a: Any, b: Any, sign: float) -> Any:
-    """Rounded maximum (`sign` 1) or minimum (-1), without error far from the kink's middle."""
+    """Maximum (`sign` 1) or minimum (-1) of two expressions, rounded around the kink.
+
+    The error vanishes far from the kink.
+    """
     return 0.5 * (a + b + sign * casadi.sqrt((a - b) ** 2 + ROUNDING**2))
 
 
 def _is(x: SymbolicColumn, value: float) -> bool:
-    """True for the constant `value`."""
+    """True if `x` is the constant `value`."""
     return bool(x.entries.is_constant()) and float(x.entries) == value
 
 

@@ -1,9 +1,10 @@
-"""Multiple shooting: the plans of a horizon as a nonlinear program, from dynamics and formulas of the IR.
+"""Multiple shooting: planning as a nonlinear program, made from dynamics and formulas of the IR.
 
-All states are variables, tied by the dynamics (Bock & Plitt 1984). A clamped state stays within its range by
-its bounds, and a correction in the dynamics, which costs, stands for what the clamp cuts off. Every condition
-that a formula demands by itself is a constraint `value + shortfall >= margin`; the extrema within one are
-log-sum-exp (Pant et al. 2017). Columns that no control reaches are data.
+All states that controls affect are variables, tied by the dynamics as equality constraints (Bock & Plitt
+1984). A clamped state is bounded to its range, and a penalized correction in the dynamics replaces the part
+that the clamp cuts off. Every condition that a formula requires at a sample is a constraint
+`value + shortfall >= margin`; minima and maxima within a condition are log-sum-exp (Pant et al. 2017). States
+that no control affects are data.
 """
 
 from __future__ import annotations
@@ -39,19 +40,19 @@ Vector: TypeAlias = NDArray[np.float64]
 
 
 class NotSmoothError(Exception):
-    """A number that jumps where a control moves it, or that no expression stands for."""
+    """Error: an expression that depends on the controls is discontinuous, or has no CasADi form."""
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class Eased:
-    """The paper's smooth indicators (Eq. 6), none sharper than `sharpness`."""
+    """Smooth indicators of conditions (Eq. 6 of the paper), whose slope is limited to `sharpness`."""
 
     exact: ClassVar[bool] = False
     sharpness: float
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """`(1 + tanh(w rho)) / 2`."""
+        """Smooth indicator `(1 + tanh(w rho)) / 2` of the margin `rho`, with slope w."""
         width = self.sharpness if sharpness is None else min(self.sharpness, sharpness)
         return ops.sigmoid(rho * (2.0 * width))
 
@@ -66,14 +67,14 @@ class Eased:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Dynamics without clamps.
+    """Dynamics of a system without the clamps of its states.
 
     Attributes:
-        lets: intermediate results of a step, in order.
-        step: moving state -> its value one step later.
-        clamps: state -> its range.
+        lets: intermediate variables of a step as (name, expression), in order.
+        step: state -> expression of its value one step later; states that do not change are absent.
+        clamps: state -> range to which it is clamped.
         bounds: control -> its range.
-        horizon: number of steps.
+        horizon: number of steps of a plan.
     """
 
     lets: Sequence[tuple[str, ir.Num]]
@@ -83,7 +84,7 @@ class Motion:
     horizon: int
 
     def reached(self) -> frozenset[str]:
-        """Columns and intermediate results that controls move."""
+        """Names of the states and intermediate variables that controls affect, and of the controls."""
         found, before = set(self.bounds), -1
         while len(found) > before:
             before = len(found)
@@ -91,7 +92,7 @@ class Motion:
         return frozenset(found)
 
     def needed(self, columns: Iterable[str]) -> frozenset[str]:
-        """Columns and intermediate results on which some columns depend, themselves included."""
+        """Names of the signals and intermediate variables that `columns` depend on, `columns` included."""
         table: dict[str, set[str]] = {}
         for name, num in (*self.lets, *self.step.items()):
             table.setdefault(name, set()).update(_names(num))
@@ -106,34 +107,34 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class ScaledFormula:
-    """A formula to hold at the first sample, and the factor of its robustness."""
+    """A formula that must hold at the first sample, and the factor that scales its robustness."""
 
     formula: ir.Formula
     factor: float
 
 
 class Shooting:
-    """The nonlinear program of a motion and of formulas, for all initial states.
+    """Nonlinear program of planning for given dynamics and formulas; the initial state is data.
 
     Attributes:
-        program: `x`, `p`, `f`, `g` of CasADi: variables, data, cost, constraints.
-        states: columns that are variables.
-        given: columns that are data.
+        program: the program for CasADi: variables `x`, data `p`, cost `f`, constraints `g`.
+        states: names of the states that are variables.
+        given: names of the signals that are data.
     """
 
     def __init__(
         self, motion: Motion, demands: Sequence[ScaledFormula], *, smoothing: float, sharpness: float
     ) -> None:
-        """Write the program.
+        """Build the program.
 
         Args:
-            motion: dynamics.
-            demands: formulas.
+            motion: dynamics of the system.
+            demands: formulas that must hold.
             smoothing: scale of log-sum-exp.
-            sharpness: greatest slope of indicators.
+            sharpness: greatest slope of the smooth indicators of conditions.
 
         Raises:
-            NotSmoothError: a number jumps where a control moves it.
+            NotSmoothError: an expression that depends on the controls is discontinuous.
         """
         self._motion, self._switch = motion, Eased(sharpness)
         self._semantics = LogSumExp(smoothing)
@@ -157,7 +158,7 @@ class Shooting:
         self._write(demands)
 
     def _write(self, demands: Sequence[ScaledFormula]) -> None:
-        """Build variables, data, cost and constraints."""
+        """Build variables, data, cost and constraints of the program."""
         motion, steps = self._motion, self._motion.horizon
         controls = casadi.SX.sym("u", steps, len(motion.bounds))
         later = casadi.SX.sym("x", steps, len(self.states))
@@ -194,7 +195,7 @@ class Shooting:
         self._demands = int(values.shape[0])
 
     def _moved(self, env: Mapping[str, SymbolicColumn]) -> Mapping[str, SymbolicColumn]:
-        """The states one step later: columns `(steps, 1)` -> columns `(steps, 1)`."""
+        """States one step later: name -> series (steps, 1), from series (steps, 1) of states and controls."""
         steps = self._motion.horizon
         known = {**env, ir.ELAPSED: CASADI.counted(0, steps, None)}
         for name, num in self._lets:
@@ -206,7 +207,7 @@ class Shooting:
         return {name: _tall(column, steps) for name, column in moved.items()}
 
     def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
-        """Values of all conditions that the formulas demand, (d, 1)."""
+        """Robustness of all conditions that the formulas require, (conditions, 1)."""
         found = []
         for each in demands:
             for formula, first, last in _conditions(each.formula, 0, 0, self._motion.horizon):
@@ -221,7 +222,10 @@ class Shooting:
     # ------------------------------------------------------------------- numbers
 
     def limits(self, *, maximise: bool) -> dict[str, Vector]:
-        """Bounds `lbx`, `ubx` of the variables and `lbg`, `ubg` of the constraints."""
+        """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), as CasADi expects them.
+
+        With `maximise`, the shortfall may become negative, so that robustness beyond the margin is rewarded.
+        """
         motion, steps = self._motion, self._motion.horizon
         free = (-math.inf, math.inf)
         ranges = [*motion.bounds.values(), *(motion.clamps.get(name, free) for name in self.states)]
@@ -235,18 +239,23 @@ class Shooting:
         }
 
     def guess(self, controls: Vector, columns: Mapping[str, Vector]) -> Vector:
-        """Variables for a plan (T, m) and the columns (T + 1,) that follow from it."""
+        """Initial guess of the variables from a plan (T, m) and the states (T + 1,) that follow from it."""
         states = [columns[name][1:] for name in self.states]
         blank = np.zeros(2 * len(self._clamped) * self._motion.horizon + 1)
         return np.concatenate([controls.T.ravel(), *states, blank])
 
     def data(self, columns: Mapping[str, Vector], margin: float) -> Vector:
-        """Data of a start: its columns (T + 1,) under any plan, and the margin of all conditions."""
+        """Data of the program for one initial state.
+
+        Args:
+            columns: signal name -> values (T + 1,); those of the data must not depend on the plan.
+            margin: robustness that every condition should reach.
+        """
         first = [columns[name][0] for name in self.states]
         return np.concatenate([first, *(columns[name] for name in self.given), [margin]])
 
     def controls(self, values: Vector) -> Vector:
-        """The plan (T, m) of some variables."""
+        """Extract the plan (T, m) from the values of the variables."""
         steps, count = self._motion.horizon, len(self._motion.bounds)
         return values[: steps * count].reshape(count, steps).T
 
@@ -254,7 +263,10 @@ class Shooting:
 def _conditions(
     formula: ir.Formula, first: int, last: int, end: int
 ) -> Iterator[tuple[ir.Formula, int, int]]:
-    """Formulas with the samples, both included, at which `formula` at `first` to `last` demands them."""
+    """Yield conditions that together are equivalent to `formula` at the samples `first` to `last`.
+
+    Each condition is a formula with the first and last sample, both included, at which it must hold.
+    """
     match formula:
         case ir.BoolOp("and", items):
             for item in items:
@@ -269,19 +281,19 @@ def _conditions(
 
 
 def _names(num: ir.Num | ir.Formula) -> set[str]:
-    """Columns that a number reads, but for what it reads of the initial state at any instant."""
+    """Names of the signals that an expression reads, other than at the first sample only."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf != ir.at_first(ir.Signal(leaf.name))}
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Columns of which a number reads the initial value at any instant."""
+    """Names of the signals whose value at the first sample an expression reads at every instant."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 
 
 def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
-    """Raise NotSmoothError where a number jumps at a place that depends on controls."""
+    """Raise NotSmoothError if an expression is discontinuous at a place that depends on the controls."""
     for part in subexpressions(num):
         match part:
             case ir.Op(name) if name in STEPS and _names(part) & reached:
@@ -296,10 +308,10 @@ def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
 
 
 def _holds(row: SymbolicColumn) -> bool:
-    """True for a constant that is not negative."""
+    """True if `row` is a constant that is not negative, so that a condition always holds."""
     return bool(row.entries.is_constant()) and float(row.entries) >= 0.0
 
 
 def _tall(column: SymbolicColumn, rows: int) -> SymbolicColumn:
-    """A constant repeated over time."""
+    """Repeat a constant over `rows` samples; a series of that length is returned unchanged."""
     return column if len(column) == rows else CASADI.cat([column] * rows)
