@@ -226,6 +226,15 @@ def _packed(cells: list[str], width: int) -> list[str]:
 def engine_text(engine: Mapping[str, Any]) -> str:
     """The resolved configuration on a line: method, network, batch, learning rate and margin."""
     network = "x".join(map(str, engine["hidden"]))
+    if "environments" in engine:  # one control a step, learned from rewards
+        parts = (
+            str(engine["method"]),
+            f"one control a step of a network {network}",
+            f"{engine['environments']} episodes side by side",
+            f"rate {engine['lr']:g}",
+            f"reward {engine['reward']}",
+        )
+        return " · ".join(parts)
     count, samples = int(engine["plans"]), int(engine.get("samples") or 0)
     states = f"{engine['batch']} states a step"
     if engine["hard"]:

@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.controller.methods import Learner
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.environments import observe
+from stlc.controller.problem.native import NativeStep
 from stlc.controller.training.config import ResolvedConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from stlc.controller.problem.task import Task
+    from stlc.dynamics.model.system import System
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +45,38 @@ class ActorPolicy(Policy):
     def __init__(self, task: Task, actor: Callable[[Tensor], Tensor]) -> None:
         super().__init__(task)
         self.actor = actor
+        self._compiled: tuple[System, NativeStep | None] | None = None
 
     @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
-        """One plan per state: (B, n) -> (B, 1, T, m)."""
-        system, x, actions = self.task.system, x0, []
-        low, high = system.control_low.to(x0), system.control_high.to(x0)
-        for step in range(self.task.horizon):
-            seen = observe(self.task, x, step).float()
-            actions.append(torch.clamp(self.actor(seen).to(x0), low, high))
-            x = system.step(x, actions[-1])
+        """One plan per state: (B, n) -> (B, 1, T, m) float64; steps are compiled to C where possible."""
+        system, x, actions = self.task.system, x0.double(), []
+        low, high = system.control_low.to(x), system.control_high.to(x)
+        native = self._native(system) if x0.device.type == "cpu" else None
+        seen = observe(self.task, x, 0).float()
+        for step in range(1, self.task.horizon + 1):
+            actions.append(torch.clamp(self.actor(seen).to(x), low, high))
+            if native is not None:
+                x, seen, _ = native.advance(x, actions[-1], step / self.task.horizon)
+            else:
+                x = system.step(x, actions[-1])
+                seen = observe(self.task, x, step).float()
         return torch.stack(actions, 1)[:, None]
+
+    def _native(self, system: System) -> NativeStep | None:
+        """The compiled step of a system; None where torch has to be used."""
+        if self._compiled is None or self._compiled[0] is not system:
+            self._compiled = system, NativeStep.of(system, rewarded=False)
+        return self._compiled[1]
+
+
+class ActorLearner(Learner):
+    """Training of an actor, by rewards."""
+
+    def torch_reasons(self) -> Mapping[str, str]:
+        """Reason why verdicts use torch, or "" where they run as C; no gradient of robustness is needed."""
+        reasons = super().torch_reasons()
+        return {"verdicts": reasons["verdicts"]}
 
 
 def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -19,8 +19,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from stlc.controller.methods import Learner
-from stlc.controller.methods._actor import ActorPolicy, below, optimizer_tensors, restore_optimizer
+from stlc.controller.methods._actor import (
+    ActorLearner,
+    ActorPolicy,
+    below,
+    optimizer_tensors,
+    restore_optimizer,
+)
 from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
@@ -143,7 +148,7 @@ class RandomState:
         self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
 
 
-class SacLearner(Learner):
+class SacLearner(ActorLearner):
     """Training of SAC. The same seed and steps give the same weights on one machine."""
 
     config: SacConfig

@@ -8,6 +8,7 @@ the clipped surrogate objective (Eq. 7), advantages by generalised estimation (S
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -15,9 +16,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.methods import Learner, Method
+from stlc.controller.methods import Method
 from stlc.controller.methods._actor import (
     ActorConfig,
+    ActorLearner,
     ActorPolicy,
     below,
     optimizer_tensors,
@@ -209,7 +211,7 @@ class Episodes:
     rewards: Tensor
 
 
-class PpoLearner(Learner):
+class PpoLearner(ActorLearner):
     """Training of an actor and a critic. The same seed and steps give the same weights on one machine."""
 
     config: PpoConfig
@@ -226,8 +228,9 @@ class PpoLearner(Learner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """The most probable control of every state."""
-        return ActorPolicy(self.task, self.network)
+        """The most probable control of every state, on the CPU."""
+        on_processor = self.device.type == "cpu"
+        return ActorPolicy(self.task, self.network if on_processor else deepcopy(self.network).cpu())
 
     @property
     def rate(self) -> float:

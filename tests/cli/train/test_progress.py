@@ -279,3 +279,11 @@ def test_the_closing_screen_says_what_remains_and_where_it_is_drawn():
     assert "unsolved        7 of 9 starts" in lines
     assert "picture         runs/a/failures.png" in lines
     assert not any(line.startswith(("unsolved", "picture")) for line in final_screen(RESULT))
+
+
+def test_the_engine_of_a_learner_from_rewards() -> None:
+    engine = {"method": "ppo", "hidden": (64, 64), "environments": 512, "lr": 1e-3, "reward": "task"}
+    text = (
+        "ppo · one control a step of a network 64x64 · 512 episodes side by side · rate 0.001 · reward task"
+    )
+    assert engine_text(engine) == text + "· reward task"
