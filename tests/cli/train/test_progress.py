@@ -286,4 +286,4 @@ def test_the_engine_of_a_learner_from_rewards() -> None:
     text = (
         "ppo · one control a step of a network 64x64 · 512 episodes side by side · rate 0.001 · reward task"
     )
-    assert engine_text(engine) == text + "· reward task"
+    assert engine_text(engine) == text
