@@ -1,1 +1,1 @@
-"""Export of a trained controller: as a torch program, as ONNX graphs, or as C."""
+"""Export of a trained controller as a torch program, as ONNX graphs, or as C."""

@@ -43,7 +43,7 @@ IR_VERSION = 8
 
 
 def require_onnx() -> None:
-    """Raise MissingError (R301) unless `onnx` is installed."""
+    """Raise MissingError (R301) if the package `onnx` is not installed."""
     try:
         import onnx  # noqa: F401
     except ImportError:

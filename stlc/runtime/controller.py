@@ -125,7 +125,7 @@ class Controller:
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Names of the controls."""
+        """Names of the controls in order."""
         return tuple(each.name for each in self.facts.controls)
 
     def reset(self) -> None:

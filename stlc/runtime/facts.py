@@ -1,4 +1,4 @@
-"""Description of an exported controller: `controller.json`."""
+"""Description of an exported controller, as stored in `controller.json`."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Facts:
 
     @property
     def added(self) -> tuple[ControllerQuantity, ...]:
-        """The states that the specification adds."""
+        """The states that the specification adds to those of the system: parameters and timers."""
         return tuple(each for each in self.states if each.added)
 
 

@@ -352,7 +352,7 @@ class Gridded:
     _last: float = -math.inf
 
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
-        """Yield the samples on the grid one by one; the first one follows once the time step is known."""
+        """Yield the samples on the grid one by one; the first follows as soon as the time step is known."""
         waiting: list[float] = []
         for moment in chain([first], rest):
             now = self._take(moment)

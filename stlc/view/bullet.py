@@ -112,7 +112,7 @@ class Renderer:
 
     @property
     def open(self) -> bool:
-        """True until the window is closed."""
+        """True as long as the PyBullet window is open."""
         return bool(self.client.isConnected())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Contents of a run's folder that a report shows; every part is optional."""
+"""Contents of a training run's folder that a report shows; every part is optional."""
 
 from __future__ import annotations
 

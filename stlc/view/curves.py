@@ -18,7 +18,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def draw_curves(rows: Rows) -> Picture | None:
-    """Draw the curves of the rows of `train.jsonl`; None before the first measurement."""
+    """Draw learning curves from the rows of `train.jsonl`; None before the first measurement."""
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None
@@ -60,7 +60,7 @@ def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
-    """Draw measurements faintly, and their moving average above them."""
+    """Draw measured shares faintly, and their moving average above them."""
     axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
     axes.plot(seconds, _smoothed(shares), **style)
 

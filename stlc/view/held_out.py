@@ -62,17 +62,17 @@ class HeldOut:
 
     @property
     def unsearched(self) -> int:
-        """Number of failing starts for which no plan was searched."""
+        """Number of starts from which the policy's plan fails and no other plan was searched."""
         return 0 if self.searched is None else int((~self.searched).sum())
 
     @property
     def worst(self) -> int:
-        """Index of the most violated requirement."""
+        """Index of the requirement that is violated from the most starts."""
         return int(np.argmax((self.each < -TOLERANCE).mean(axis=0)))
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Number of failing starts, and how many of these have a known satisfying plan."""
+        """Number of starts from which the plans fail, and for how many a satisfying plan is known."""
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
@@ -269,7 +269,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a failure region: failure rate in it, and its share of all failures."""
+    """Clause on a failure region: share of failures in it, and its share of all failures."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"

@@ -232,7 +232,7 @@ def _across(times: Floats) -> Floats:
 
 
 def _line(times: Floats, values: Floats, limits: tuple[float, float]) -> str:
-    """SVG path of a step function, with gaps at NaN."""
+    """SVG path of the line of a step function, with gaps at NaN."""
     x, words, joined = _across(times), [], False
     for begin, end, y in constant_ranges(_up(values, limits)):
         if np.isfinite(y):

@@ -328,12 +328,12 @@ class MapRegion:
 
     @property
     def title(self) -> str:
-        """The name, truncated if it is a long expression."""
+        """Name of the region for labels; a long expression is truncated."""
         return self.name if len(self.name) <= TITLE else self.name[: TITLE - 1] + "…"
 
     @property
     def role(self) -> Role:
-        """Role of the region: reach, avoid, or both."""
+        """Role of the region in the specification: reach, avoid, or mixed."""
         kinds = {use.negative for use in self.uses}
         return "mixed" if len(kinds) != 1 else "avoid" if kinds.pop() else "reach"
 

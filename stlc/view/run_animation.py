@@ -1,4 +1,7 @@
-"""Animation of a closed-loop run: the world's scene if it draws one, else a map of regions, else signals."""
+"""Animation of a closed-loop run: the drawing of its world (simulated environment), a map, or signals.
+
+The map shows the regions of the specification; signals are the last resort.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +62,9 @@ class AnimationFiles:
 def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
     """Return the animation of the run's latest closed-loop simulation; None if nothing was recorded.
 
-    The world, loaded from the run's folder, draws the scene. Without a world, or if drawing fails, the
-    animation shows the paths of the trace over the regions of its specification, else the signals. The
-    default title consists of specification, scenario and run.
+    The world (simulated environment), loaded from the run's folder, draws the scene. Without a world, or if
+    drawing fails, the animation shows the paths of the trace over the regions of its specification, else the
+    signals. The default title consists of specification, scenario and run.
     """
     title = _title(run) if title is None else title
     return _scene_animation(run, title) or _signal_animation(run, title)
@@ -109,7 +112,7 @@ def current(run: RunDir) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RecordedScene:
-    """A recorded scene with the world that draws it.
+    """A recorded scene with the world (simulated environment) that draws it.
 
     Attributes:
         scene: recorded values stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
@@ -132,7 +135,7 @@ class RecordedScene:
 
     @property
     def own_keys(self) -> Mapping[str, str]:
-        """Legend entries that the world adds: label -> colour."""
+        """Legend entries that the world (simulated environment) adds: label -> colour."""
         return getattr(self.world, "KEYS", {})
 
     @property
@@ -150,9 +153,10 @@ class RecordedScene:
 
 
 def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None:
-    """The recorded scene of the run's latest closed-loop simulation; None without one or without its world.
+    """The recorded scene of the run's latest closed-loop simulation.
 
-    With `guarded` False, the simulation of the same seed without the guard, if it was recorded.
+    None if nothing was recorded, or if its world (simulated environment) cannot be loaded. With `guarded`
+    False, the simulation of the same seed without the guard, if it was recorded.
     """
     from stlc.controller.world import world_type
     from stlc.dynamics.declaration.load import load_system_decl
@@ -244,8 +248,8 @@ WITHOUT, WITH = "without the guard", "with the guard"
 def run_panels(run: RunDir) -> list[RunPanel]:
     """Panels for a page on the latest closed-loop simulation: its first seed without and with the guard.
 
-    One panel if there is no run without the guard; the trace's signals if there is no world; empty without a
-    recording.
+    There is one panel if no simulation without the guard was recorded, or if there is no world (simulated
+    environment) to draw; it then shows the trace. The list is empty without a recording.
     """
     found, other = recorded_scene(run), recorded_scene(run, guarded=False)
     try:

@@ -1,4 +1,7 @@
-"""Animation of a recorded scene: a legend above, the world's drawing, and strip charts below."""
+"""Animation of a recorded scene: a legend above, the drawing by its world, and strip charts below.
+
+A world is the simulated environment of a closed-loop run.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,7 @@ def frames_of(scene: Scene) -> int:
 
 
 def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
-    """Animation of a scene, a dictionary of arrays (frames, …)."""
+    """Animation of a scene, which is a mapping from names to recorded arrays (frames, …)."""
     frames = frames_of(scene)
     keys = keys_of(scene, options.keys)
     plan = _planned(ratio_of(options.draw, scene), 0 if options.strip is None else options.strip.height, keys)
@@ -127,7 +130,7 @@ def _moment(scene: Scene, frames: int) -> int:
 
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
-    """Aspect ratio (height / width) of the picture that the world draws of a scene."""
+    """Aspect ratio (height / width) of the picture that `draw` makes of a scene."""
     with picture_style():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)
@@ -168,7 +171,7 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
 
 
 def keys_of(scene: Scene, own: Mapping[str, str]) -> list[LegendKey]:
-    """Legend entries: recorded sources of decisions, rejected plans, violations, and the world's own."""
+    """Legend entries: recorded sources of decisions, rejected plans, violations, and the entries in `own`."""
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
     keys = [LegendKey(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
     if "rejected" in scene and np.isfinite(scene["rejected"]).any():

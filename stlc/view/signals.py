@@ -79,7 +79,7 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def margin_limits(rho: Floats) -> tuple[float, float]:
-    """Vertical limits for robustness, 0 included; large margins are cut off to keep violations visible."""
+    """Vertical limits of a robustness plot, with 0 inside; large margins are cut off to show violations."""
     finite = rho[np.isfinite(rho)]
     if not len(finite):
         return -1.0, 1.0
@@ -103,7 +103,7 @@ def margin_text(rho: float, unit: str = "") -> str:
 
 
 def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
-    """Draw robustness as a step function, blue where positive, red where negative."""
+    """Draw robustness over time as a step function, blue where positive, red where negative."""
     rho = finite(rho)
     fails = rho < -TOLERANCE
     axes.axhline(0, color=MUTED, lw=0.6)
@@ -188,7 +188,7 @@ def draw_signals(
 
 
 def left_out(trace: Trace) -> list[str]:
-    """Names of the numeric signals without a panel."""
+    """Names of the numeric signals that get no panel in the figure."""
     shown = {name for kind, name in _rows(trace, {}) if kind == "line"}
     return [c.name for c in trace.signature.columns if c.kind in ("real", "int") and c.name not in shown]
 
@@ -303,7 +303,7 @@ class Strip:
 
     @property
     def rows(self) -> list[str]:
-        """Names of the shown requirements, in order."""
+        """Names of the requirements with a strip chart, which are those with the least margins."""
         known = [name for name, rho in self.margins.items() if np.isfinite(rho).any()]
         least = sorted(known, key=lambda name: float(np.nanmin(finite(self.margins[name]))))[:MOST_ROWS]
         return [name for name in known if name in least]
@@ -421,7 +421,7 @@ def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
 
 
 def signal_animation(trace: Trace, *, title: str = "") -> Animation:
-    """Animation of a trace's signals: one panel per signal, with all agents."""
+    """Animation of a trace's signals, for a run without a drawing: one panel per signal, with all agents."""
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 

@@ -69,7 +69,7 @@ def units_of(verdict: Verdict) -> dict[str, str]:
 
 
 def judged_at_start(verdict: Verdict) -> list[str]:
-    """Names of the requirements that are evaluated only at the start of a trace."""
+    """Names of the requirements that are evaluated once, at the start of a trace."""
     planned = verdict.subject.horizon is not None
     return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
 
@@ -90,7 +90,7 @@ def trace_names(trace: Trace) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class SceneVerdicts:
-    """The agents of a scene (those of the first seed), their traces, and the verdicts on them.
+    """Evaluated traces of a scene's agents, which are those of the first seed.
 
     Attributes:
         trace: recorded traces of these agents.
@@ -173,9 +173,9 @@ class Event:
 
     Attributes:
         requirement: name of the requirement.
-        agent: number of the trace.
+        agent: number of the agent's trace.
         sample: first sample of the violation.
-        until: last sample of consecutive violations.
+        until: last sample of the violation, which lasts without interruption.
         start: first sample of the violated window.
         because: cause in one line.
     """

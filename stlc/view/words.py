@@ -86,7 +86,7 @@ def guard_words(name: object) -> GuardWords:
 
 
 def labelled(name: str, unit: str) -> str:
-    """A name with its unit, `v [m/s]`, for axes; the name alone without a unit."""
+    """Format a name with its unit, `v [m/s]`, for axes; the name alone without a unit."""
     return f"{name} [{unit}]" if unit not in ("", "1") else name
 
 

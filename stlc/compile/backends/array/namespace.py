@@ -1,8 +1,8 @@
-"""Array namespace: the operations that the evaluators need from an array library.
+"""The array operations that the evaluators need, as an interface to array libraries.
 
-`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` implement it.
-Operands named `x`, `a`, `b` are arrays; a float is allowed where a method says so. Operators (`a + b`,
-`a * 2.0`) are used directly.
+`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` implement it. Operands named
+`x`, `a`, `b` are arrays; a float is allowed where a method says so. Operators (`a + b`, `a * 2.0`) are used
+directly.
 """
 
 from __future__ import annotations
@@ -205,4 +205,4 @@ class Ops(Protocol):
         """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context in which division by zero and invalid operations give inf and NaN without a warning."""
+        """Context manager: division by zero and invalid operations give inf and NaN without a warning."""

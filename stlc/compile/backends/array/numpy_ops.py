@@ -175,7 +175,7 @@ class NumpyOps:
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context in which numerical exceptions give inf and NaN without a warning."""
+        """Context manager: division by zero and invalid operations give inf and NaN without a warning."""
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
 

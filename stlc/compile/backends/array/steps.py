@@ -333,7 +333,7 @@ def _frozen(node: ir.Freeze, run: IndexRange, machine: Machine) -> Runner:
 def _judge(
     formula: ir.Formula, env: Mapping[str, Array], run: IndexRange, domain: TraceDomain, *, windows: Windows
 ) -> Array:
-    """Robustness of one formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
+    """Robustness of one formula at consecutive instants, which may lie beyond the trace: `(count, batch)`."""
     plan = _scheduled(formula, run, domain)
     return all_values(plan, env, windows)[plan.schedule.roots[0]]
 

@@ -199,7 +199,7 @@ class GradientTape:
     # ---------------------------------------------------------------- choice
 
     def compare(self, margin: Operand, strict: bool) -> int | bool:
-        """Mask `margin > 0` (`strict`) or `margin >= 0`; a difference is compared without computing it."""
+        """Mask `margin > 0` (if `strict`) or `margin >= 0`; for a difference, its operands are compared."""
         if isinstance(margin, float):
             return margin > 0 if strict else margin >= 0
         kernel = "gt" if strict else "ge"

@@ -34,14 +34,14 @@ class Windows:
     ops: Ops
 
     def padded(self, x: Array, rows: int, value: float) -> Array:
-        """First `rows` rows of `x`, padded with `value` where it is shorter."""
+        """The first `rows` rows of `x`; if `x` has fewer, rows of `value` are appended."""
         if x.shape[0] >= rows:
             return x[:rows] if x.shape[0] > rows else x
         missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
         return self.ops.cat([x, missing]) if x.shape[0] else missing
 
     def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
-        """Extrema of `count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
+        """Extrema over `count` sliding windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
         rows = x.shape[0]
         width = min(width, max(rows, 1))
         if tiles := self._tiles(x, count, width):

@@ -188,7 +188,7 @@ class _Planner(Scheduler):
         self._loops = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the step number of a formula, which is placed outside of loops that do not affect it."""
+        """Return the step number of a formula; the step is put outside of loops that do not affect it."""
         node = _split(node)
         depth = self._depth(node)
         around = self.scopes[depth + 1 :]

@@ -298,7 +298,10 @@ class TorchOps:
         return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
-        """One `(time, batch)` tensor for every column of `(batch, time, dim)`, views of one copy."""
+        """Split trajectories `(batch, time, dim)` into tensors `(time, batch)`, one per state.
+
+        The tensors are views of one copy.
+        """
         return x.permute(2, 1, 0).contiguous().unbind(0)
 
     def quiet(self) -> AbstractContextManager[object]:
