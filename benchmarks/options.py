@@ -109,6 +109,92 @@ class Training:
         return Place(store, self.runs, self.jobs, self.threads, self.cluster)
 
 
+PARTS = ("learners", "plans", "drives")
+"""Parts of the comparison of the paper."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparing:
+    """Options of the comparison of the paper."""
+
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            "--methods", metavar="NAMES", help="Such as guided,sac:task,plan:search; all if not given."
+        ),
+    ] = None
+    parts: Annotated[
+        str | None,
+        typer.Option("--parts", metavar="NAMES", help="Of learners,plans,drives; all if not given."),
+    ] = None
+    show: Annotated[
+        bool, typer.Option("--show", help="Measure nothing; write the page from what is stored.")
+    ] = False
+    hour: Annotated[bool, typer.Option("--hour", help="Also train sac for an hour.")] = False
+    plan_time: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--plan-time", metavar="TIME", help="Processor time a plan; repeatable. 1ms, 10ms, 100ms and 1s."
+        ),
+    ] = None
+    starts: Annotated[
+        int, typer.Option("--starts", metavar="N", min=1, help="Starts that planners plan from.")
+    ] = 1000
+    decision: Annotated[
+        str, typer.Option("--decision", metavar="TIME", help="Processor time of a planner in closed loop.")
+    ] = "10ms"
+    drives: Annotated[
+        str, typer.Option("--drives", metavar="SEEDS", help="Worlds in closed loop, such as 0..2.")
+    ] = "0..2"
+    agents: Annotated[
+        int | None, typer.Option("--agents", metavar="N", min=1, help="In each world, at most.")
+    ] = None
+    drive_steps: Annotated[
+        int | None, typer.Option("--drive-steps", metavar="N", min=1, help="Of each drive, at most.")
+    ] = None
+    passes: Annotated[
+        int,
+        typer.Option(
+            "--passes", metavar="N", min=0, help="Searches for feasible states, 20,000 plans a state each."
+        ),
+    ] = 10
+    proof: Annotated[
+        float,
+        typer.Option(
+            "--proof",
+            metavar="SECONDS",
+            min=0.0,
+            help="Processor time a state for a proof that no plan exists (extra `plan`); 0 for none.",
+        ),
+    ] = 5.0
+
+    @property
+    def seconds(self) -> tuple[float, ...]:
+        """Processor times a plan."""
+        from benchmarks.plannings import SECONDS
+
+        return tuple(parse_seconds(text) for text in dict.fromkeys(self.plan_time or ())) or SECONDS
+
+    @property
+    def seconds_of_decision(self) -> float:
+        """Processor time of a planner in closed loop."""
+        return parse_seconds(self.decision)
+
+    @property
+    def worlds(self) -> tuple[int, ...]:
+        """Seeds of the worlds in closed loop."""
+        return parse_seeds(self.drives)
+
+    def check(self) -> None:
+        """Read all options, before anything is measured. Raises UsageError (U101)."""
+        self.asks(PARTS[0])
+        self.seconds, self.seconds_of_decision, self.worlds  # noqa: B018
+
+    def asks(self, part: str) -> bool:
+        """Whether a part is to be measured. Raises UsageError (U101) for an unknown part."""
+        return part in chosen(self.parts, PARTS, "part") and not self.show
+
+
 def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]:
     """Names in a comma-separated list (default: all). Raises UsageError (U101) for unknown ones."""
     if text is None:

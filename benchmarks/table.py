@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -45,8 +46,8 @@ class _Template(Formatter):
     def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
         try:
             return super().get_field(field_name, args, kwargs)
-        except AttributeError:
-            if self.get_value(field_name.split(".")[0], args, kwargs) is not None:
+        except (AttributeError, TypeError):
+            if self.get_value(re.split(r"[.\[]", field_name)[0], args, kwargs) is not None:
                 raise
             return None, field_name
 

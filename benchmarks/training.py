@@ -72,6 +72,7 @@ class Cell:
         axis: hyperparameter that an ablation varies here; "" outside of ablations.
         value: of that hyperparameter.
         overrides: of the system file.
+        options: of the method, as on a command line; `reward` has an option of its own there.
     """
 
     benchmark: str
@@ -82,11 +83,18 @@ class Cell:
     axis: str = ""
     value: str = ""
     overrides: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def contender(self) -> str:
+        """The method with its options, such as `guided` or `sac:task`."""
+        return ":".join((self.method, *self.options.values()))
 
     @property
     def name(self) -> str:
         """Of its result, such as `traffic-guided-60s-seed0`."""
-        first = ("ablation", self.axis, self.value) if self.axis else (self.benchmark, self.method)
+        own = self.contender.replace(":", "-")
+        first = ("ablation", self.axis, self.value) if self.axis else (self.benchmark, own)
         return "-".join([*filter(None, first), self.length.name, f"seed{self.seed}"])
 
     @property
@@ -100,6 +108,7 @@ class Cell:
                 **{"seed": self.seed, "budget": self.length.seconds, "steps": self.length.steps},
                 **{"clock": self.length.clock, "held_out": self.held_out, "held_out_seed": HELD_OUT_SEED},
                 **{"axis": self.axis, "value": self.value, "overrides": dict(self.overrides)},
+                **({"options": dict(self.options)} if self.options else {}),
             },
         )
 
@@ -110,7 +119,7 @@ class Cell:
         length = Length(key["budget"], key["steps"], key["clock"])
         return cls(
             *(key["benchmark"], key["method"], key["seed"], length, key["held_out"]),
-            *(key["axis"], key["value"], key["overrides"]),
+            *(key["axis"], key["value"], key["overrides"], key.get("options", {})),
         )
 
     def config(self) -> TrainConfig:
@@ -277,11 +286,16 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
         arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
     else:
         overrides = [word for key, value in cell.overrides.items() for word in ("--set", f"{key}={value}")]
+        own = [
+            word
+            for key, value in cell.options.items()
+            for word in (("--reward", value) if key == "reward" else ("--option", f"{key}={value}"))
+        ]
         arguments = (
             str(spec_path(cell.benchmark)),
             *("--method", cell.method, "--seed", str(cell.seed), *cell.length.options),
             *("--threads", str(place.threads), "--held-out", str(cell.held_out), "--drives", "0"),
-            *("--runs", str(runs), "--no-pictures", *overrides),
+            *("--runs", str(runs), "--no-pictures", *own, *overrides),
         )
     if place.cluster is None:
         return Job(cell.name, arguments)
@@ -364,7 +378,7 @@ def grouped(results: Iterable[Result]) -> list[SeedGroup]:
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in sorted(results, key=lambda each: int(each["key"]["seed"])):
         cell = Cell.of(result)
-        key = (cell.benchmark, cell.method, cell.length, cell.axis, cell.value, outdated(result))
+        key = (cell.benchmark, cell.contender, cell.length, cell.axis, cell.value, outdated(result))
         groups.setdefault(key, []).append(result)
     return [SeedGroup(tuple(own), key[-1]) for key, own in groups.items()]
 

@@ -1,206 +1,88 @@
-"""The six benchmarks of the paper, by both methods, over seeds and budgets."""
+"""The paper's comparison: six benchmarks by every learner and planner, over seeds and budgets."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
-from typing import Annotated, Any
 
-import typer
-
-from benchmarks.curves import PICTURE, draw_results
-from benchmarks.feasible import PROOF_SECONDS, KnownFeasible, known_feasible, prove_on, search_on
-from benchmarks.options import OnlyOption, Output, Training, chosen
-from benchmarks.store import BENCHMARKS, Result, ResultStore
-from benchmarks.table import Columns, Table, listed, provenance, publish
-from benchmarks.training import OUTDATED_TEXT, Cell, SeedGroup, benchmark_order, filled, grouped, inputs_text
+from benchmarks.cells import Selection
+from benchmarks.drives import DriveRow, budget_text, driven
+from benchmarks.feasible import known_feasible, prove_on, search_on
+from benchmarks.learned import SHOWN, Row, row_of, tables
+from benchmarks.options import Comparing, OnlyOption, Output, Training, chosen
+from benchmarks.page import CLAIMS, Stored, section
+from benchmarks.plannings import PlanRow, planned
+from benchmarks.roster import roster
+from benchmarks.store import BENCHMARKS
+from benchmarks.table import Columns, listed, publish
+from benchmarks.training import filled
 from stlc.cli.framework.program import command
-from stlc.controller.evaluation.held_out import wilson
-from stlc.registry import METHODS
 
-BUDGETS = (60.0, 300.0)
-TEXT = f"""\
-`accuracy` is the mean over seeds with its 95 % Wilson interval, `share of feasible` that mean as a share of
-the known feasible states (in brackets that of the worst seed). `known feasible` is the share of the same
-states for which some satisfying plan is known, a lower bound of the feasible share. From those `proved
-infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, whose encodings are exact).
-{OUTDATED_TEXT}"""
-_TRAINING, _OUTPUT = Training(), Output(Path("docs/results.md"))
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A benchmark by one method for one length, over all seeds.
-
-    Attributes:
-        benchmark: name.
-        method: of training.
-        length: such as `60 s`.
-        seeds: of the trainings, in order.
-        accuracies: one per seed, on the same held-out states.
-        interval: 95 % Wilson interval of the mean, over the states of all seeds.
-        known_feasible: share of those states with a known satisfying plan; None before a search.
-        requirements: share per requirement, mean over seeds.
-        seconds: of training, mean over seeds.
-        steps: mean over seeds.
-        outdated: inputs that have changed since the trainings.
-    """
-
-    benchmark: str
-    method: str
-    length: str
-    seeds: tuple[int, ...]
-    accuracies: tuple[float, ...]
-    interval: tuple[float, float]
-    known_feasible: float | None
-    requirements: Mapping[str, float]
-    seconds: float
-    steps: float
-    outdated: tuple[str, ...] = ()
-
-    @property
-    def accuracy(self) -> float:
-        """Mean over all seeds."""
-        return fmean(self.accuracies)
-
-    @property
-    def share(self) -> float | None:
-        """Accuracy over the known feasible states."""
-        return self.accuracy / self.known_feasible if self.known_feasible else None
-
-    @property
-    def worst_share(self) -> float | None:
-        """Accuracy of the worst seed over the known feasible states."""
-        return min(self.accuracies) / self.known_feasible if self.known_feasible else None
-
-
-def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
-    """The row of the results of a benchmark, method and length."""
-    cell, results = group.cell, group.results
-    found = known.get(cell.benchmark)
-    return Row(
-        *(cell.benchmark, cell.method, cell.length.text, group.seeds, group.accuracies),
-        interval=wilson(group.mean("accuracy"), sum(int(each["key"]["held_out"]) for each in results)),
-        known_feasible=None if found is None else found.share,
-        requirements={
-            name: fmean(each["requirements"][name] for each in results) for name in results[0]["requirements"]
-        },
-        seconds=group.mean("seconds"),
-        steps=group.mean("steps"),
-        outdated=group.outdated,
-    )
-
-
-FIRST: Columns[Row] = {"benchmark": "{benchmark}", "method": "{method}", "budget": "{length}"}
-SHOWN: Columns[Row] = {
-    **FIRST,
-    "seeds": lambda row: ", ".join(map(str, row.seeds)),
-    "accuracy": "{accuracy:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
-    "worst seed": lambda row: f"{min(row.accuracies):.4f}",
-    "known feasible": "{known_feasible:.4f}",
-    "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f} ({row.worst_share:.3f})",
-    "steps": "{steps:,.0f}",
-    "inputs": lambda row: inputs_text(row.outdated),
+__all__ = ["SHOWN", "Row", "paper", "row_of"]
+_TRAINING, _COMPARING, _OUTPUT = Training(clock="processor"), Comparing(), Output(Path("docs/results.md"))
+PLANS: Columns[PlanRow] = {
+    **{"benchmark": "{benchmark}", "planner": lambda row: row.label or row.method},
+    "time a plan": lambda row: budget_text(row.seconds),
+    **{
+        "accuracy": "{accuracy:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]",
+        "no plan exists": "{infeasible:.3f}",
+    },
+    **{"ms a plan": "{mean_ms:.3g}", "ms alone": "{median_ms:.3g}", "99 %": "{p99_ms:.3g}"},
+    "refused": "{refused}",
 }
-REQUIREMENTS: Columns[Row] = {
-    **FIRST,
-    "requirements": lambda row: ", ".join(f"{name} {share:.4f}" for name, share in row.requirements.items()),
+DRIVES: Columns[DriveRow] = {
+    **{"benchmark": "{benchmark}", "policy": lambda row: row.label or row.method, "guard": "{guard}"},
+    **{"size": "{size}", "accuracy": "{accuracy:.3f}", "safe": "{safety:.3f}"},
+    **{"ms a decision": "{median_ms:.3g}", "99 %": "{p99_ms:.3g}", "refused": "{refused}"},
 }
-FEASIBLE: Columns[KnownFeasible] = {
-    "benchmark": "{benchmark}",
-    "known feasible": "{share:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
-    "no plan known": "{open:,}",
-    "proved infeasible": lambda row: "" if row.proved is None else f"{row.proved:,}",
-    "by search alone": "{by_search:,}",
-    "plans tried a state": "{tries:,}",
-}
-
-
-def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dict[str, Table[Any, Any]]:
-    """The table of benchmarks, methods and lengths, and that of the known feasible shares."""
-    groups = sorted(
-        grouped(results),
-        key=lambda group: (
-            *benchmark_order(group.cell.benchmark),
-            METHODS.names.index(group.cell.method),
-            group.mean("seconds"),
-        ),
-    )
-    names = dict.fromkeys(group.cell.benchmark for group in groups)
-    return {
-        "rows": Table("paper", groups, lambda group: row_of(group, known), SHOWN),
-        "known_feasible": listed("known", [known[name] for name in names if name in known], FEASIBLE),
-    }
-
-
-def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], page: Path) -> list[str]:
-    """The section of the page, whose picture is written into the page's folder."""
-    made = tables(results, known)
-    rows = made["rows"].rows
-    names = dict.fromkeys(row.benchmark for row in rows)
-    drawn = draw_results(results, {name: known.get(name) for name in names}, page.parent / PICTURE)
-    return [
-        *("## The six benchmarks", ""),
-        *((f"![Plan accuracy over training time]({PICTURE})", "") if drawn else ()),
-        *(*made["rows"].markdown(), "", TEXT, *made["known_feasible"].markdown(), ""),
-        *("### Requirements", "", "Share of the held-out states per requirement, mean over seeds.", ""),
-        *(*listed("requirements", rows, REQUIREMENTS).markdown(), "", *provenance(results, "trainings")),
-    ]
 
 
 @command(
     "python -m benchmarks paper",
-    "python -m benchmarks paper --only traffic,ship_safe --budget 60s --seeds 0 --jobs 2",
+    "python -m benchmarks paper --only traffic --methods guided,plan:search --budget 60s --seeds 0",
+    "python -m benchmarks paper --parts plans --plan-time 10ms",
+    "python -m benchmarks paper --show",
 )
 def paper(
     only: OnlyOption = None,
-    methods: Annotated[
-        str | None, typer.Option("--methods", metavar="NAMES", help="guided,gradient if not given.")
-    ] = None,
-    passes: Annotated[
-        int,
-        typer.Option(
-            "--passes", metavar="N", min=0, help="Searches for feasible states, 20,000 plans a state each."
-        ),
-    ] = 10,
-    proof: Annotated[
-        float,
-        typer.Option(
-            "--proof",
-            metavar="SECONDS",
-            min=0.0,
-            help="Processor time a state for a proof that no plan exists (extra `plan`); 0 for none.",
-        ),
-    ] = PROOF_SECONDS,
     training: Training = _TRAINING,
+    comparing: Comparing = _COMPARING,
     output: Output = _OUTPUT,
 ) -> None:
-    """Train and validate the six benchmarks of the paper, and write the tables and curves.
+    """Compare every learner and planner on the six benchmarks of the paper; write tables and figures.
 
-    60 s and 300 s if no budget is given. Stored results with the same inputs are reused; interrupted
-    trainings are resumed. Exit code 1 if a training failed.
+    Learners are trained for 60 s and 300 s if no budget is given; planners search for 1 ms to 1 s a plan.
+    Stored results with the same inputs are reused, interrupted trainings resumed, and every result is stored
+    at once. Everything takes many hours; the page names the command of each empty cell. Exit code 1 if a
+    measurement failed.
     """
+    comparing.check()
+    known, place = roster(), training.place("paper")
     names = chosen(only, BENCHMARKS, "benchmark")
-    which = [method for method in METHODS.names if method in chosen(methods, METHODS.names, "method")]
-    cells = [
-        Cell(benchmark, method, seed, length, training.held_out)
-        for seed, length in training.seeds_and_lengths(BUDGETS)
-        for benchmark in names
-        for method in which
-    ]
-    place, found = training.place("paper"), ResultStore("feasible", training.out)
-    filling, page = filled(cells, place), output.page
-    assert page is not None
+    which = [known[name] for name in chosen(comparing.methods, [*known], "method")]
+    wanted, stored = Selection(names, tuple(which), training, comparing), Stored.of(place)
+    filling = filled(wanted.trainings(), place)
     results = place.valid()
-    for name in names:
+    for name in names if comparing.asks("learners") else ():
         own = [each for each in results if each["key"]["benchmark"] == name]
         own = [each for each in own if each["key"]["held_out"] == training.held_out]
         if own:
-            search_on(own, found, passes=passes, run=place.best_run(own))
-            if proof:
-                prove_on(own, found, seconds=proof)
-    known = known_feasible(found, place.all())
-    shown = tables(filling.results, known)
-    publish("paper", output, lambda: section(place.all(), known, page), shown, **filling.facts(len(results)))
+            search_on(own, stored.feasible, passes=comparing.passes, run=place.best_run(own))
+            if comparing.proof:
+                prove_on(own, stored.feasible, seconds=comparing.proof)
+    plans = planned([*wanted.plans(), *wanted.policies(place)], stored.plans)
+    drives = driven(wanted.drives(place), stored.drives)
+    shown = tables(
+        place.all() if comparing.show else filling.results, known_feasible(stored.feasible, place.all())
+    )
+    plan_rows = stored.plan_rows() if comparing.show else [PlanRow.of(each) for each in plans.results]
+    drive_rows = stored.drive_rows() if comparing.show else [DriveRow.of(each) for each in drives.results]
+    shown |= {
+        "plans": listed("plans", plan_rows, PLANS),
+        "drives": listed("drives", drive_rows, DRIVES),
+        "claims": listed("claims", stored.claims(), CLAIMS),
+    }
+    page = output.page
+    assert page is not None
+    facts = filling.facts(len(results), (*plans.failed, *drives.failed))
+    new = {"planned": plans.measured, "driven": drives.driven}
+    publish("paper", output, lambda: section(stored, page), shown, **facts, **new)

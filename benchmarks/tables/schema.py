@@ -10,10 +10,13 @@ from operator import or_
 from types import UnionType
 from typing import Any, Literal, NotRequired, TypedDict, Union, get_args, get_origin, get_type_hints
 
+from benchmarks.claims import Claim
 from benchmarks.deployments import Row as DeploymentRow
+from benchmarks.drives import DriveRow
 from benchmarks.episodes import EpisodeSpeed
 from benchmarks.feasible import KnownFeasible
 from benchmarks.formulas import Timing
+from benchmarks.plannings import PlanRow
 from benchmarks.repairs import Mended
 from benchmarks.steps import Speed, StepTiming
 from benchmarks.tables import ablation, family, latency, paper
@@ -40,11 +43,15 @@ class Facts(TypedDict):
     trained: NotRequired[int]
     kept: NotRequired[int]
     driven: NotRequired[int]
+    planned: NotRequired[int]
     failed: NotRequired[list[FailedTraining]]
 
 
 ROWS: dict[str, dict[str, type]] = {
-    "paper": {"rows": paper.Row, "known_feasible": KnownFeasible},
+    "paper": {
+        **{"rows": paper.Row, "known_feasible": KnownFeasible},
+        **{"plans": PlanRow, "drives": DriveRow, "claims": Claim},
+    },
     "ablation": {"rows": ablation.Row},
     "family": {"rows": family.Row},
     "worlds": {"rows": DeploymentRow},

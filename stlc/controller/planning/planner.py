@@ -25,6 +25,8 @@ from stlc.registry import PLANNERS, closest
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
+PLANNING_VERSION = 1
+"""To be raised with every change of the plans that a planner finds within a budget."""
 SHORT = 64
 """Evaluations of a plan that continues a prefix."""
 SECONDS = 1.0

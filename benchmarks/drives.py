@@ -1,0 +1,236 @@
+"""Closed-loop cells of the paper's comparison: a contender in the world of a benchmark, guarded or not.
+
+The paper's protocol: the size and the replanning of the system's `test:`, without a guard and with the
+paper's backup policy. Each cell is stored when it ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from time import process_time
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.deployments import recorded
+from benchmarks.plannings import PlanCell, reason, time_text
+from benchmarks.store import Key, Result, ResultStore, inputs_of, load
+from benchmarks.timing import Times, one_thread
+from stlc.cli.framework.output import say
+from stlc.controller.deployment.simulator import DeploymentRecording, Setting
+from stlc.controller.evaluation.deployment import decided
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.metrics import METRICS, measure
+from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.guard import GUARD_VERSION, Guard
+from stlc.controller.planning.planner import PLANNING_VERSION, PlanBudget, PlannerPolicy, planner_named
+from stlc.controller.policies.policy import Policy
+from stlc.controller.problem.task import Task
+from stlc.controller.training.run import Run
+from stlc.diagnostics import StlcError, UsageError
+from stlc.provenance import sha256
+
+GUARDS: tuple[Mode, ...] = ("none", "paper")
+DECISIONS = 60
+"""Decisions that are timed, one agent each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One closed-loop measurement.
+
+    Attributes:
+        plan: planner and budget, or the run of a policy.
+        guard: `none` or `paper`.
+        seeds: of the worlds.
+        agents: in each at most; None for the system's number.
+        steps: of each at most; None for the system's number.
+    """
+
+    plan: PlanCell
+    guard: Mode
+    seeds: tuple[int, ...]
+    agents: int | None = None
+    steps: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its result, such as `traffic-plan-search-10ms-paper`."""
+        return f"{self.plan.name}-{self.guard}"
+
+    def setting(self, task: Task) -> Setting:
+        """Size and replanning of the deployment."""
+        test = task.system.decl.test
+        agents, steps = (
+            min(self.agents or test.agents, test.agents),
+            min(self.steps or test.steps, test.steps),
+        )
+        return Setting(self.seeds, agents, steps, test.replan)
+
+    @property
+    def key(self) -> Key:
+        """The key of its result."""
+        task = load(self.plan.benchmark)
+        setting, world = self.setting(task), task.system.decl.test.world
+        planned = {
+            name: value for name, value in self.plan.key.values.items() if not name.startswith("starts")
+        }
+        return Key(
+            self.name,
+            {
+                **planned,
+                **{"guard": self.guard, "guard_version": GUARD_VERSION},
+                **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
+                "world_sha256": None if world is None else sha256(world.path.read_text(encoding="utf-8")),
+            },
+        )
+
+    def policy(self, task: Task) -> Policy:
+        """The policy of the run, or the planner as one. Raises UsageError if it refuses the task."""
+        cell = self.plan
+        if cell.run is not None:
+            return Run.open(cell.run.path).policy.for_task(task)
+        planner = planner_named(cell.contender.method, **cell.contender.options_on(cell.benchmark))
+        return PlannerPolicy(task, planner, PlanBudget(cell.seconds, cell.evaluations))
+
+
+def drive(cell: Drive) -> Result:
+    """Simulate a closed-loop cell.
+
+    Raises:
+        MissingError: R301, a package is missing.
+        RunError, SystemFileError: the run is damaged, or a world fails.
+    """
+    task = load(cell.plan.benchmark)
+    began = process_time()
+    with one_thread():
+        try:
+            policy = cell.policy(task)
+        except UsageError as error:
+            return {"refused": reason(error)}
+        guard = Guard(task, policy, cell.guard, limits=Limits())
+        recording = recorded(guard, cell.setting(task))
+        times = _timed(guard, recording)
+    metrics = measure(recording, judge_executed(task, recording))
+    return {
+        "metrics": {name: metrics[name].summary() for name in METRICS if name in metrics},
+        "acted": 1.0 - decided(recording)["policy"],
+        "decision": {"median": times.median, "p99": times.p99, "samples": times.samples},
+        "seconds": process_time() - began,
+    }
+
+
+def _timed(guard: Guard, recording: DeploymentRecording) -> Times:
+    """Processor time of single decisions in evenly spread visited states."""
+    rows, steps = recording.actions.shape[:2]
+    picked = np.unique(np.linspace(0, rows * steps - 1, DECISIONS).astype(int))
+    seconds = []
+    for row, step in zip(picked // steps, picked % steps, strict=True):
+        before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
+        previous = guard.decide(before).later()
+        begin = process_time()
+        guard.decide(now, previous)
+        seconds.append(process_time() - begin)
+    times = Times.of(seconds)
+    assert times is not None
+    return times
+
+
+@dataclass(frozen=True, slots=True)
+class DriveRow:
+    """A contender in closed loop under a guard.
+
+    Attributes:
+        benchmark: name of the specification.
+        method: name of the contender.
+        label: of a trained policy; "" for a planner.
+        seconds: processor time a plan; None for own settings.
+        guard: name.
+        size: seeds x agents x steps.
+        accuracy: share of the followed plans that satisfy the specification, mean over seeds.
+        accuracy_half: half of its 95 % interval (Student's t); None with one seed.
+        safety: share of agents whose drive was safe from every start; None where nothing is tagged `@safety`.
+        safety_half: half of its interval.
+        median_ms: processor time of a decision for one agent.
+        p99_ms: its 99th percentile.
+        refused: why the planner refuses the task; "" if it does not.
+        outdated: whether specification, system or a version have changed since.
+    """
+
+    benchmark: str
+    method: str
+    label: str
+    seconds: float | None
+    guard: str
+    size: str
+    accuracy: float | None
+    accuracy_half: float | None
+    safety: float | None
+    safety_half: float | None
+    median_ms: float | None
+    p99_ms: float | None
+    refused: str = ""
+    outdated: bool = False
+
+    @classmethod
+    def of(cls, result: Result) -> DriveRow:
+        """The row of a result."""
+        key, metrics, decision = result["key"], result.get("metrics", {}), result.get("decision", {})
+        accuracy, safety = metrics.get("plan_accuracy", {}), metrics.get("executed_safe", {})
+        return cls(
+            *(key["benchmark"], key["contender"], key["label"], key["seconds"], key["guard"]),
+            f"{len(key['seeds'])} x {key['agents']} x {key['steps']}",
+            *(accuracy.get("mean"), _half(accuracy), safety.get("mean"), _half(safety)),
+            *(decision.get("median"), decision.get("p99"), result.get("refused", ""), is_outdated(result)),
+        )
+
+
+def _half(metric: Mapping[str, Any]) -> float | None:
+    high = metric.get("high")
+    return None if high is None else float(high) - float(metric["mean"])
+
+
+def is_outdated(result: Result) -> bool:
+    """Whether the specification, the system or a version has changed since a measurement."""
+    key = result["key"]
+    now = {**inputs_of(load(key["benchmark"])), "planner_version": PLANNING_VERSION}
+    return any(key.get(name) != value for name, value in {**now, "guard_version": GUARD_VERSION}.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """Outcome of closed-loop cells: results in order, number of new ones, name and reason of failures."""
+
+    results: tuple[Result, ...]
+    driven: int
+    failed: tuple[dict[str, str], ...]
+
+
+def driven(
+    cells: Iterable[Drive], store: ResultStore, *, driving: Callable[[Drive], Result] = drive
+) -> Driven:
+    """Results of closed-loop cells, stored or newly simulated, each stored at once; prints progress."""
+    results, failed, new = [], [], 0
+    for cell in cells:
+        key = cell.key
+        kept = store.find(key)
+        if kept is None:
+            say(f"deploying {cell.name}")
+            try:
+                kept = store.put(key, driving(cell))
+            except StlcError as error:
+                if isinstance(error, UsageError):
+                    raise
+                failed.append({"name": cell.name, "why": reason(error)})
+                continue
+            new += 1
+        results.append(kept)
+    return Driven(tuple(results), new, tuple(failed))
+
+
+def budget_text(seconds: float | None) -> str:
+    """The budget of a stored cell, such as `10 ms` or `own settings`."""
+    return time_text(math.inf if seconds is None else seconds)

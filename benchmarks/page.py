@@ -1,0 +1,194 @@
+"""Section of the page on the paper's comparison, from all stored results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from benchmarks.bars import BARS, TIMES, Bar, Facet, Point, draw
+from benchmarks.cells import BUDGETS
+from benchmarks.claims import Claim, claims
+from benchmarks.comparison import (
+    Learned,
+    Line,
+    accuracies,
+    deployments,
+    latencies,
+    markdown,
+    refusals,
+    standings,
+    upsets,
+)
+from benchmarks.drives import DriveRow
+from benchmarks.feasible import known_feasible
+from benchmarks.learned import detailed, learned
+from benchmarks.plannings import ALONE, SEED, STARTS, Ceiling, PlanRow, ceilings
+from benchmarks.roster import roster
+from benchmarks.store import BENCHMARKS, ResultStore
+from benchmarks.table import Columns, listed, provenance
+from benchmarks.training import Place
+
+Row = TypeVar("Row", PlanRow, DriveRow)
+CLAIMS: Columns[Claim] = {"claim": "{claim}", "here": "{here}", "verdict": "{verdict}", "why": "{why}"}
+CEILINGS: Columns[Ceiling] = {
+    **{"benchmark": "{benchmark}", "starts": "{starts:,}"},
+    **{"a plan is known": "{known:.3f}", "proved: no plan exists": "{proved:.3f}"},
+    "neither": lambda row: f"{1.0 - row.known - row.proved:.3f}",
+    "contradictions": "{contradictions}",
+}
+COMPARED = f"""\
+Plan accuracy. Learners, on held-out states: mean over seeds with its 95 % Wilson interval. Planners
+(`plan:`), on {STARTS:,} other starts, the same for all (seed {SEED:,}): share with a satisfying plan within a
+processor time a plan, all starts in one batch. Rows `own settings` end as the authors' scripts do: CEM with
+10,000 samples (manipulation 1,000), 100 elites, a standard deviation of 1 in physical units and at most 10
+rounds (navigation: over the weights of a small network); STL_G with one start, the paper's objective and 50
+Adam steps (ship_safe and manipulation 200). An empty cell is not measured; `no gain`: not measured, as ten
+times the time found no more plans before.
+"""
+DECIDED = f"""\
+Processor time of a decision in milliseconds, median / 99 %, one start at a time on one thread, over {ALONE}
+starts. For a policy: its plan and the verdict on it.
+"""
+DEPLOYED = """\
+Closed loop, by the protocol of the paper: size and replanning of the system, plan accuracy (share of the
+followed plans that satisfy the specification) / safety (share of agents whose whole drive was safe), means
+over the worlds with half of their 95 % intervals (Student's t, none for one world).
+"""
+DRIVES_COMMAND = "`python -m benchmarks paper --parts drives` fills the cells that are missing."
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """All stored results of the comparison.
+
+    Attributes:
+        place: of the trainings.
+        feasible: searches on held-out states.
+        plans: planner cells.
+        drives: closed-loop cells.
+    """
+
+    place: Place
+    feasible: ResultStore
+    plans: ResultStore
+    drives: ResultStore
+
+    @classmethod
+    def of(cls, place: Place) -> Stored:
+        """The stores beside that of the trainings."""
+        folder = place.store.folder
+        return cls(place, *(ResultStore(name, folder) for name in ("feasible", "plans", "drives")))
+
+    def plan_rows(self) -> list[PlanRow]:
+        """Rows of all planner cells."""
+        return _ordered(PlanRow.of(each) for each in self.plans.all().values())
+
+    def drive_rows(self) -> list[DriveRow]:
+        """Rows of all closed-loop cells."""
+        return _ordered(DriveRow.of(each) for each in self.drives.all().values())
+
+    def claims(self) -> list[Claim]:
+        """The paper's claims beside what is measured."""
+        return claims(standings(learned(self.place.all()), self.plan_rows(), self.drive_rows()))
+
+
+def _ordered(rows: Iterable[Row]) -> list[Row]:
+    """Policies first, then planners in the order of the roster, by budget."""
+    names = [*roster()]
+    place = {name: index for index, name in enumerate(names)}
+    return sorted(
+        rows,
+        key=lambda row: (
+            not row.label,
+            place.get(row.method, len(names)),
+            row.label,
+            row.seconds or 0.0,
+            row.benchmark,
+        ),
+    )
+
+
+def section(stored: Stored, page: Path) -> list[str]:
+    """The section; its figures are written into the page's folder."""
+    results = stored.place.all()
+    known = known_feasible(stored.feasible, results)
+    plans, drives, trained = stored.plan_rows(), stored.drive_rows(), learned(results)
+    ceiling = ceilings(stored.plans.all().values())
+    drawn = draw(facets(trained, plans, ceiling), page.parent)
+    pictures = [f"![{what}]({path})" for what, path in zip(_PICTURES, (BARS, TIMES), strict=True) if drawn]
+    contenders = roster().values()
+    lines = accuracies(
+        [each for each in contenders if not each.plans],
+        [each for each in contenders if each.plans],
+        *(trained, plans, BUDGETS),
+    )
+    return [
+        *("## The paper's comparison", ""),
+        *_search_first(plans),
+        *(line for picture in pictures for line in (picture, "")),
+        *("### Plan accuracy", "", COMPARED, *markdown(lines), "", *refusals(plans), ""),
+        *_block(
+            "### Known and proved ceilings", CEILING, listed("c", [*ceiling.values()], CEILINGS).markdown()
+        ),
+        *_block("### A decision", DECIDED, _lines(latencies(plans))),
+        *_block("### Closed loop", DEPLOYED, [*_lines(deployments(drives)), "", DRIVES_COMMAND]),
+        *("### The paper's claims", "", *listed("claims", stored.claims(), CLAIMS).markdown(), ""),
+        *provenance(stored.plans.all().values(), "planner cells"),
+        *(*provenance(stored.drives.all().values(), "closed-loop cells"), ""),
+        *detailed(results, known, page),
+    ]
+
+
+_PICTURES = (
+    "Plan accuracy of all methods, with intervals",
+    "Plan accuracy over the processor time of a plan",
+)
+CEILING = """\
+On the planners' starts: the share for which any cell found a satisfying plan, and the share that `plan:milp`
+proved to have none. A contradiction would be a start with both.
+"""
+
+
+def _block(title: str, text: str, lines: Sequence[str]) -> list[str]:
+    return [title, "", text, *lines, ""]
+
+
+def _lines(lines: Sequence[Line]) -> list[str]:
+    return markdown(lines, filled=False) if lines else ["Nothing is measured yet."]
+
+
+def _search_first(plans: Sequence[PlanRow]) -> list[str]:
+    """Where search beats the policy, before anything else."""
+    found = upsets(plans)
+    if not found:
+        return []
+    return [
+        "**Search without training beats the trained policy here**, on the same starts (its least budget):",
+        *("", *(f"- {each.text}" for each in found), ""),
+    ]
+
+
+def facets(trained: Iterable[Learned], plans: Sequence[PlanRow], ceiling: dict[str, Ceiling]) -> list[Facet]:
+    """A facet of each benchmark: current results, each method at its largest budget."""
+    names = [*roster()]
+    bars: dict[str, dict[str, Bar]] = {name: {} for name in BENCHMARKS}
+    points: dict[str, list[Point]] = {name: [] for name in BENCHMARKS}
+    for each in sorted(trained, key=lambda each: each.seconds):
+        if not each.outdated and each.benchmark in bars:
+            bar = Bar(each.method, each.accuracy, each.interval, plans=False)
+            bars[each.benchmark][each.method] = bar
+    for row in sorted(plans, key=lambda row: row.seconds or 0.0):
+        if row.accuracy is None or row.interval is None or row.outdated or row.benchmark not in bars:
+            continue
+        if not row.label:
+            bars[row.benchmark][row.method] = Bar(row.method, row.accuracy, row.interval, plans=True)
+        points[row.benchmark].append(Point(row.method, row.mean_ms or 0.0, row.accuracy))
+    return [
+        Facet(
+            *(name, tuple(sorted(own.values(), key=lambda bar: names.index(bar.label)))),
+            *(tuple(points[name]), ceiling[name].known if name in ceiling else None),
+        )
+        for name, own in bars.items()
+    ]
