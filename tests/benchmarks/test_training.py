@@ -168,6 +168,7 @@ def test_the_command_from_training_to_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["paper", "--only", "traffic", "--methods", "gradient", "--seeds", "5", "--steps", "2"]
+    words += ["--parts", "learners"]
     words += ["--held-out", "40", "--out", str(tmp_path / "bench"), "--runs", str(tmp_path / "runs")]
     words += ["--page", str(tmp_path / "docs" / "results.md"), "--json"]
 
