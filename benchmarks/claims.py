@@ -189,6 +189,7 @@ class Upset:
         policy_accuracy: of that policy.
         decision_ms: median processor time of the planner's decision.
         policy_ms: that of the policy.
+        overlap: whether the 95 % intervals of the accuracies overlap.
     """
 
     benchmark: str
@@ -199,6 +200,7 @@ class Upset:
     policy_accuracy: float
     decision_ms: float | None
     policy_ms: float | None
+    overlap: bool = False
 
     @property
     def text(self) -> str:
@@ -206,5 +208,7 @@ class Upset:
         first = f"{self.benchmark}: {self.planner} at {self.budget} a plan {self.accuracy:.3f}"
         second = f"{self.policy} {self.policy_accuracy:.3f}"
         if self.decision_ms is None or self.policy_ms is None:
-            return f"{first}, {second}"
-        return f"{first} ({self.decision_ms:.2g} ms a decision), {second} ({self.policy_ms:.2g} ms)"
+            text = f"{first}, {second}"
+        else:
+            text = f"{first} ({self.decision_ms:.2g} ms a decision), {second} ({self.policy_ms:.2g} ms)"
+        return f"{text}; the intervals overlap" if self.overlap else text

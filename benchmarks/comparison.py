@@ -235,6 +235,7 @@ def upsets(plans: Sequence[PlanRow]) -> list[Upset]:
             Upset(
                 *(name, row.method, budget_text(row.seconds), row.accuracy or 0.0),
                 *(best.label, best.accuracy, row.median_ms, best.median_ms),
+                overlap=row.interval is None or best.interval is None or row.interval[0] <= best.interval[1],
             )
             for row in sorted(better, key=lambda row: row.seconds or 0.0)[:1]
         ]

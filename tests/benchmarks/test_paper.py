@@ -221,6 +221,8 @@ def test_where_search_beats_the_policy_its_least_budget_is_told() -> None:
         == "traffic: plan:search at 10 ms a plan 0.980 (2 ms a decision), guided-60s-seed0 0.970 (2 ms)"
     )
     assert upsets([rows[2], policy]) == []
+    (close,) = upsets([rows[0], replace(policy, interval=(0.9, 0.995))])
+    assert close.text.endswith("; the intervals overlap")
     assert upsets([replace(rows[0], outdated=True), policy]) == []
 
 
