@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from difflib import SequenceMatcher
 from importlib import import_module
@@ -141,16 +142,21 @@ class PackageRegistry(Registry[T]):
     @property
     def names(self) -> tuple[str, ...]:
         """The default, then the others in alphabetical order."""
-        root, *inner = self._package.split(".")  # finding an inner package would import those around it
-        package = find_spec(root)
-        roots = (package.submodule_search_locations if package is not None else None) or ()
-        folders = [str(Path(folder, *inner)) for folder in roots]
         found = sorted(
             module.name
-            for module in iter_modules(folders)
+            for module in iter_modules(self._folders())
             if not (module.ispkg or module.name.startswith("_"))
         )
         return tuple(sorted(found, key=lambda name: name != self.default))
+
+    def _folders(self) -> list[str]:
+        """Folders of the package; it is not imported for this, nor are the packages around it."""
+        if self._package in sys.modules:
+            return list(sys.modules[self._package].__path__)
+        root, *inner = self._package.split(".")
+        package = find_spec(root)
+        roots = (package.submodule_search_locations if package is not None else None) or ()
+        return [str(Path(folder, *inner)) for folder in roots]
 
 
 METHODS: PackageRegistry[Any] = PackageRegistry(

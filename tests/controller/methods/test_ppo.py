@@ -82,7 +82,7 @@ def test_the_policy_plays_what_the_environments_play(car_task: Task) -> None:
     network = learner(car_task).network
     made = Environments(car_task, 8, generator=torch.Generator().manual_seed(3))
     seen, actions = made.reset(), []
-    first = made.states
+    first = made.states.float()
     with torch.no_grad():
         for _ in range(made.steps):
             actions.append(network(seen))
