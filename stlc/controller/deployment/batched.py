@@ -1,4 +1,4 @@
-"""Batch of the worlds of all seeds; errors in worlds are reported with their source location."""
+"""The worlds of all seeds as one batch; an error in a world is reported with its source location."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Setting:
     An agent plans at once when a signal of role `env` has changed.
 
     `limit`: seconds per agent for a decision of the full guard; None: no limit. `paper_limit`: the same for
-    the paper's guard. `ceiling`: number of visited states, over all seeds, that are searched for a plan where
-    the followed one fails. `margin`: robustness margin that a guard requires of safety requirements, by their
-    names.
+    the paper's guard. `ceiling`: number of visited states, over all seeds, for which a search looks for a
+    satisfying plan if the followed plan fails. `margin`: name of a safety requirement -> robustness margin by
+    which a plan must satisfy it to be accepted.
     """
 
     seeds: tuple[int, ...]
@@ -54,10 +54,13 @@ class Setting:
 
 
 class Worlds:
-    """Batch of the worlds of all seeds.
+    """The worlds of all seeds as one batch; a row is one agent of one seed.
 
-    Raises SystemFileError with a location in the world's file: S207 where a world fails, S302 for non-finite
-    states. Worlds get copies of states and actions, which they may modify.
+    Every world gets copies of states and actions, which it may modify.
+
+    Raises:
+        SystemFileError: S207, a world fails; S302, it returns states that are not finite. Both have a
+            location in the world's file.
     """
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
@@ -75,14 +78,14 @@ class Worlds:
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
-        """Return the initial states, (rows, n), with parameters drawn and timers at the start of a mission.
+        """Return the initial states, (rows, n), with random parameters and timers at their initial values.
 
-        Where the system admits only starts with a known plan (`test: {starts: …}`), the others are redrawn;
-        `redrawn` counts them.
+        If the system accepts only initial states from which a plan is known (`test: {starts: …}`), the world
+        draws the other ones again; `redrawn` counts them.
 
         Raises:
-            SystemFileError: S211, a world cannot redraw the start of an agent.
-            RunError: R405, none of the drawn starts has a known plan.
+            SystemFileError: S211, a world cannot redraw the initial state of an agent.
+            RunError: R405, no plan is known from any of the drawn initial states.
         """
         given = []
         for world in self.worlds:
@@ -98,7 +101,7 @@ class Worlds:
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
-        """Initial states of a seed, (agents, n), redrawn wherever no plan is known."""
+        """Initial states of a seed, (agents, n), drawn again until a plan is known from each of them."""
         known = viable if self.task.system.decl.test.starts == "savable" else solvable
         good = known(self.task, x)
         for _ in range(REDRAWN):
@@ -118,10 +121,11 @@ class Worlds:
         raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
-        """Advance step number `step`: (rows, n), (rows, m) -> (rows, n).
+        """Advance all worlds by step number `step`: states (rows, n), actions (rows, m) -> (rows, n).
 
-        Worlds do not know parameters and timers: parameters are kept, timers follow from the true states.
-        `eventless` marks the rows without exogenous event: the world moved exactly as the true dynamics.
+        Parameters and timers are no part of a world's states: parameters stay as they are, and timers are
+        updated from the true states. Sets `eventless`, the mask of the rows without exogenous event, in which
+        the world moved exactly as the true dynamics.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -137,7 +141,11 @@ class Worlds:
         return torch.cat((moved, self.system.added_later(x)), 1)
 
     def options(self, x: Tensor) -> Tensor | None:
-        """States under every option, (rows, k, n); None where the worlds offer no choice."""
+        """States under each option (an alternative, such as a goal, that the world offers to its agents).
+
+        Returns:
+            (rows, k, n); None if the worlds offer no options.
+        """
         given = []
         for world in self.worlds:
             if isinstance(world, Choosing):
@@ -157,7 +165,7 @@ class Worlds:
         return given.detach().to(torch.float64)
 
     def choose(self, pick: Tensor, x: Tensor) -> Tensor:
-        """States after every agent has taken its option of `pick`, (rows,): (rows, n)."""
+        """States (rows, n) after every agent has taken the option with the index in `pick`, (rows,)."""
         given = []
         for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):
             if isinstance(world, Choosing):
@@ -166,7 +174,9 @@ class Worlds:
         return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
 
     def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
-        """Concatenate the states that worlds returned, (rows, n) float64, and check that they are finite."""
+        """Concatenate the states that `method` of each world returned, (rows, n), and check that they are
+        finite.
+        """
         found = []
         for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
             x = states_of(world, method, each, self.size)
@@ -191,7 +201,7 @@ class Worlds:
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays for a picture of the first seed; their shapes stay constant."""
+        """Arrays from which a picture of the first seed is drawn; their shapes are the same at every step."""
         world = self.worlds[0]
         with blamed(world, "snapshot", "give a snapshot"):
             given = world.snapshot()
@@ -200,7 +210,7 @@ class Worlds:
 
     @property
     def charting(self) -> bool:
-        """True if plans can be drawn into the picture of the first seed."""
+        """True if the world of the first seed can map planned states to picture coordinates."""
         return isinstance(self.worlds[0], Charting)
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:

@@ -33,10 +33,10 @@ _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
 
 
 class Disturbance:
-    """Disturbance, noise and errors (`disturb`, `noise`, `errors`) of a system's scenario; none without one.
+    """Disturbance, noise and errors of a system's scenario; without scenario there are none.
 
-    `disturb` and `noise` read the present state and the time `t` of the deployment, and may draw random
-    numbers.
+    The scenario's expressions `disturb` and `noise` read the present state and the time `t` since the start
+    of the deployment, and may draw random numbers.
     """
 
     def __init__(self, system: System, generators: Sequence[torch.Generator], agents: int) -> None:
@@ -67,7 +67,7 @@ class Disturbance:
         return given
 
     def truths(self, truth: System) -> list[System]:
-        """True dynamics of each seed: the system `truth` with the seed's parameter errors."""
+        """True dynamics of each seed: the system `truth` with parameter errors that are drawn per seed."""
         off = self._errors.parameters
         loose = perturbable(truth.decl) if off else None
         if loose is None or not loose.numbers:
@@ -76,19 +76,19 @@ class Disturbance:
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets of controls, (rows, m) each; errors of either sign are equally likely."""
+        """Factors and offsets of actuator errors, (rows, m) each; either sign is equally likely."""
         off, angle = self._errors.actuator_gain, self._angle
         signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
-        """Random signs, 1 or -1, (rows, count), each seed's from its own stream."""
+        """Random signs, 1 or -1, (rows, count), drawn for each seed from its random stream number `stream`."""
         shape = (self._agents, count)
         drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
-        """Standard normal numbers, (rows, count), each seed's from its own stream."""
+        """Standard normal numbers, (rows, count), drawn for each seed from its random stream number `stream`."""
         shape = (self._agents, count)
         streams = self._streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
@@ -101,7 +101,7 @@ class Disturbance:
         return self._changed(x, {name: self._scale * value for name, value in added.items()}, clamped=True)
 
     def seen(self, x: Tensor, step: int) -> Tensor:
-        """Measured states, (rows, n); columns beyond the system's own are exact."""
+        """Measured states, (rows, n); timers and other columns that the specification adds have no noise."""
         seen = x
         if self._noises:
             seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
@@ -112,7 +112,7 @@ class Disturbance:
         return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
-        """Values for all rows, drawn from each seed's own generator."""
+        """Values of the assignments `drawings` by name, (rows,) each, with each seed's own generator."""
         parts = []
         for rows, generator in zip(torch.split(x, self._agents), self._generators, strict=True):
             table = dict(zip(self._names, rows.double().unbind(1), strict=False))
@@ -134,7 +134,7 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Errors of a system's scenario, as shares, and the numbers of its dynamics that they affect."""
+    """Errors of the system's scenario as shares, and the `numbers` of its dynamics that they change."""
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
@@ -165,7 +165,7 @@ _CONDITION = "holds"
 
 
 class _Event:
-    """A compiled event."""
+    """Exogenous event of a system file, compiled, with its condition at the previous step."""
 
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
@@ -194,12 +194,12 @@ class _Event:
 
 
 class Events:
-    """The events of a deployment, with the memory that edge triggers need.
+    """The exogenous events of a deployment, with the previous conditions that edge triggers compare.
 
     Args:
-        declared: in file order; later events see the effects of earlier ones.
-        names: columns of a state.
-        dt: step in seconds.
+        declared: events in file order; later ones see the effects of earlier ones.
+        names: names of the state's columns.
+        dt: time step in seconds.
     """
 
     def __init__(self, declared: Sequence[EventDecl], names: Sequence[str], dt: float) -> None:
@@ -207,7 +207,11 @@ class Events:
         self._names, self._dt = tuple(names), dt
 
     def apply(self, x: Tensor, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, int]]:
-        """States (agents, n) after the events of `step`, and the firing count of each conditional event."""
+        """Apply the events of a step to the states (agents, n).
+
+        Returns:
+            The states afterwards, (agents, n), and how often each event that has a condition fired.
+        """
         columns = dict(zip(self._names, x.unbind(1), strict=True))
         counts: dict[str, int] = {}
         for event in self._events:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LiveMonitor:
-    """Online margins of all agents during a deployment; requirements are those of `stlc check`.
+    """Online robustness margins of all agents, for the requirements that `stlc check` reports.
 
     `push` is cheap; margins are computed when they are read.
 
@@ -44,16 +44,16 @@ class LiveMonitor:
 
     @property
     def margins(self) -> dict[str, Margin]:
-        """Margin of every requirement at the present sample."""
+        """Robustness margin of every requirement at the latest sample."""
         return self._margins.evaluate()
 
     @property
     def time(self) -> float:
-        """Time of the present sample in seconds."""
+        """Time of the latest sample in seconds."""
         return (self.moment.step if self.moment else 0) * self.task.system.dt
 
     def decided(self, row: int) -> str | None:
-        """Source of an agent's decision: `policy`, `backup T0=2`, …; None at the end."""
+        """Source of the plan that an agent follows: `policy`, `backup T0=2`, …; None after the last step."""
         decision = self.moment.decision if self.moment else None
         if decision is None:
             return None
@@ -61,7 +61,7 @@ class LiveMonitor:
         return f"{name} T0={t0}" if name == "backup" else name
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Records of the present step, one per agent: the lines of `--robustness`."""
+        """Records of the latest step, one per agent: the lines that `--robustness` writes."""
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):

@@ -1,4 +1,4 @@
-"""Closed-loop simulator: worlds advance seed by seed, decisions are made in one batch over all seeds."""
+"""Closed-loop simulator: worlds advance seed by seed; decisions for all seeds are made in one batch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class DeploymentRecording:
     """Trajectories of `agents` agents per seed; rows are ordered by seed, then by agent.
 
     Attributes:
-        agents: number per seed.
+        agents: number of agents per seed.
         states: (rows, steps + 1, n).
         actions: (rows, steps, m).
         source: (rows, steps), index into `stlc.controller.guard.guard.SOURCES`.
@@ -39,14 +39,15 @@ class DeploymentRecording:
         policy_rho: (rows, steps), robustness of the policy's own plan.
         safe: (rows, steps), whether the followed plan satisfies phi_safe.
         progress: task progress of each seed.
-        units: of entries of `progress`.
+        units: units of the entries of `progress`.
         scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents). For a world
             that maps planned states into its picture also `rejected` and `taken`, float32 (frames, agents,
             horizon + 1, 2 or 3): the policy plan that a guard replaced and the followed plan; NaN without
             intervention.
-        eventless: (rows, steps), whether there was no exogenous event; None where not recorded.
-        options: (rows, steps, k, n), the options of the agents; None where the world offers none.
-        redrawn: number of starts redrawn because no plan is known from them.
+        eventless: (rows, steps), whether there was no exogenous event; None if not recorded.
+        options: (rows, steps, k, n), states under the options (alternatives that a world offers to its
+            agents); None if there are none.
+        redrawn: number of initial states that were drawn again because no plan is known from them.
     """
 
     agents: int
@@ -72,9 +73,9 @@ class DeploymentRecording:
 
 @dataclass
 class Recorder:
-    """Recorder of a deployment, step by step, so that a failure loses nothing that happened before.
+    """Recorder of a deployment that stores every step at once, so that a failure loses no earlier step.
 
-    `pictured`: whether replaced plans are recorded for pictures.
+    `pictured`: whether the plans that a guard replaces are recorded for pictures.
     """
 
     agents: int
@@ -102,12 +103,12 @@ class Recorder:
         self.start(x, frame)
 
     def chosen(self, x: Tensor, options: Tensor) -> None:
-        """Record the options (rows, k, n), and the states `x` (rows, n) that the agents chose."""
+        """Record the states under all options, (rows, k, n), and those under the chosen ones, (rows, n)."""
         self.states[-1] = x
         self.options.append(options)
 
     def recording(self) -> DeploymentRecording | None:
-        """The recording so far, complete steps only; None before the first one."""
+        """Return the recording of all complete steps; None before the first one is complete."""
         steps = min(len(self.actions), len(self.frames) - 1)
         if steps < 1:
             return None
@@ -140,15 +141,15 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class SimulationStep:
-    """One step of a deployment after the decision.
+    """One step of a deployment, after the decision and before the worlds advance.
 
     Attributes:
-        step: its number, from 0; `steps` at the end, where nothing is decided.
+        step: index of the step, from 0; `steps` after the last one, when nothing is decided any more.
         steps: total number of steps.
-        x: the states, (rows, n).
-        decision: the decision; None at the end.
+        x: states, (rows, n).
+        decision: the guard's decision; None after the last step.
         planned: number of rows that replanned.
-        seconds: decision time.
+        seconds: time that the decision took.
     """
 
     step: int
@@ -173,11 +174,13 @@ class _Pilot:
         self.age = torch.zeros(0, dtype=torch.int64)
 
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
-        """Rows that replan now, (k,): all every `replan` steps, and those whose exogenous signals changed.
+        """Indices of the rows (one per agent and seed) that replan at this step, (k,).
 
-        With the full guard also those whose remaining plan violates safety by the model. A plan that ends
-        early is extended by its last action until the next planning instant. The last sample of a plan is not
-        counted: `sweep` would extrapolate from it to states that were not planned.
+        Every `replan` steps these are all rows; at other steps, those whose exogenous signals have changed
+        and, with the full guard, those whose remaining plan violates a safety requirement by the model. A
+        plan that ends before the next regular planning step is checked with its last action held. The last
+        sample of a plan is not checked, because `sweep` would extrapolate from it to states that were not
+        planned.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -186,14 +189,14 @@ class _Pilot:
         return torch.nonzero((x != self.before)[:, self.exogenous].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
-        """Option of each row, (rows,); rows that do not replan keep theirs."""
+        """Index of the option that each row takes, (rows,); 0, no change, for rows that do not replan."""
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
             pick[due] = self.guard.prefer(options[due], self._previous(due, options[:, 0]))
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
-        """Decisions and actions (rows, m); rows `due` replan from the measured states `seen`."""
+        """Return decisions and actions (rows, m); the rows in `due` replan from the measured states `seen`."""
         if len(due):
             new = self.guard.decide(seen[due], self._previous(due, seen))
             whole = self.decision is None or len(due) == len(x)
@@ -205,10 +208,10 @@ class _Pilot:
         return self.decision, action
 
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
-        """Remainders of the previous plans of rows `due`, from measured states `seen` (rows, n).
+        """Remainders of the previous plans of the rows in `due`, for the measured states `seen` (rows, n).
 
-        With `replan` > 1 the policy extends a plan at its end: with the last action held for so many steps
-        the previous plan may violate the specification, and would never be retained.
+        With `replan` > 1 the policy extends the plans at their ends: if the last action were held for that
+        many steps, the previous plan might violate the specification and would never be retained.
         """
         if self.decision is None:
             return None
@@ -219,11 +222,12 @@ class _Pilot:
 def simulate(
     guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, watch: Watch | None = None
 ) -> None:
-    """Simulate fresh worlds, one per seed, into `recorder`; `watch` is called at every step.
+    """Simulate new worlds, one per seed, and record them in `recorder`; `watch` is called at every step.
 
     Raises:
-        SystemFileError: S207, a world fails; S211, it cannot redraw a start; S302, its states are not finite.
-        RunError: R405, no start with a known plan is drawn; R402, an action is not finite.
+        SystemFileError: S207, a world fails; S211, it cannot redraw an initial state; S302, its states are
+            not finite.
+        RunError: R405, no plan is known from any drawn initial state; R402, an action is not finite.
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
@@ -256,9 +260,9 @@ def simulate(
 def _replaced(
     worlds: Worlds, guard: Guard, decision: GuardDecision, seen: Tensor, due: Tensor
 ) -> dict[str, NDArray[np.float32]] | None:
-    """Picture coordinates of the first seed's plans that a guard just replaced, and of their replacements.
+    """Picture coordinates of the first seed's plans that a guard just replaced, and of the new ones.
 
-    None without a guard, and where the world does not map planned states into its picture.
+    None without a guard, and if the world does not map planned states to picture coordinates.
     """
     if guard.backup is None or not worlds.charting:
         return None

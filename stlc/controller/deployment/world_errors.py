@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def blamed(world: object, method: str, what: str) -> Iterator[None]:
-    """Turn any exception of a world's (or world class's) `method` into S207: it cannot `what`."""
+    """Context in which an exception of `method` of a world or its class becomes S207: it cannot do `what`."""
     try:
         yield
     except StlcError:
@@ -40,7 +40,14 @@ def blamed(world: object, method: str, what: str) -> Iterator[None]:
 
 
 def states_of(world: object, method: str, given: object, size: tuple[int, int]) -> Tensor:
-    """Check states from a world's method: float64, (agents, n). Raises SystemFileError (S207)."""
+    """Check that `given`, returned by `method` of a world, is an array of states of shape `size`.
+
+    Returns:
+        The states, (agents, n) float64.
+
+    Raises:
+        SystemFileError: S207, they are not.
+    """
     if not isinstance(given, torch.Tensor):
         raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
     if given.shape != size:
@@ -52,7 +59,7 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
 def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str], when: str) -> None:
     """Raise SystemFileError (S302) where states (agents, n) hold NaN or infinity.
 
-    `names`: column names. `when`: the instant, for the message.
+    `names`: names of the columns. `when`: the instant as a text for the message.
     """
     bad = ~torch.isfinite(x)
     if not bool(bad.any()):
@@ -63,7 +70,11 @@ def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str],
 
 
 def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
-    """Snapshot as plain arrays whose names and shapes are unchanged. Raises SystemFileError (S207)."""
+    """Arrays of the snapshot `given`, checked to have the names and shapes of the snapshot `before`.
+
+    Raises:
+        SystemFileError: S207, they have not.
+    """
     with blamed(world, "snapshot", "give a snapshot"):
         scene = {str(name): np.asarray(value) for name, value in given.items()}
     for name, value in scene.items():
@@ -79,7 +90,7 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
 
 
 def wrong(world: object, method: str, what: str) -> SystemFileError:
-    """S207 for a method of a world that does not keep its contract."""
+    """Return error S207 for `method` of a world, which does not meet the requirements on it as `what` says."""
     message = f"`{method}` of the world {what}"
     return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
 
@@ -106,13 +117,13 @@ def _file_of(world: object) -> str:
 
 
 def _raised_at(error: BaseException, file: str) -> Span | None:
-    """Innermost line of the world's file in the traceback of an error."""
+    """Location of the innermost line of `file` in the traceback of an error; None if there is none."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
     return _line(file, lines[-1]) if lines and lines[-1] else None
 
 
 def _defined_at(world: object, method: str) -> Span | None:
-    """Line of a world's file where a method begins; None for a method of stlc."""
+    """Location of the line where a world's method is defined; None for a method of stlc itself."""
     code = getattr(getattr(_class_of(world), method, None), "__code__", None)
     if not isinstance(code, CodeType) or Path(__file__).parents[1] in Path(code.co_filename).parents:
         return None
@@ -120,7 +131,7 @@ def _defined_at(world: object, method: str) -> Span | None:
 
 
 def _line(file: str, number: int) -> Span | None:
-    """Span of a line of a file without surrounding blanks; None where it cannot be read."""
+    """Location of line `number` of a file, without surrounding blanks; None if the line cannot be read."""
     try:
         text = read_source(Path(file)).text
     except StlcError:

@@ -32,11 +32,12 @@ if TYPE_CHECKING:
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
-    """Traces of all agents of all seeds, with the decisions.
+    """Traces of all agents of all seeds, with the decisions about their plans.
 
-    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest, 3
-    polished), `t0`, `plan_rho` of the followed plan, `policy_rho` of the policy's plan, `foreseen` (1 where
-    the step is model-consistent); and (traces,): `seed`, `agent`.
+    Extras of shape (traces, steps): `action.NAME` for every control; `decision` (0 policy, 1 backup, 2
+    safest, 3 polished); `t0`, prefix length of the backup; `plan_rho`, robustness of the followed plan;
+    `policy_rho`, robustness of the policy's plan; `foreseen`, 1 if the true step equals that of the model.
+    Extras of shape (traces,): `seed`, `agent`.
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
@@ -61,7 +62,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Actuator commands, (rows, steps, m)."""
+    """Recorded actions as commands to the actuators, (rows, steps, m)."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -75,9 +76,13 @@ def save_trace_of(
     *,
     rules: Rules | None = None,
 ) -> list[Path]:
-    """Write the trace into the run folder, and to `also`; return the paths. Raises MissingError.
+    """Write the trace of a deployment into the run folder, and to the path `also`; return the paths.
 
-    `rules` are stored in the trace, so that a later check judges by the same ones.
+    `rules` (the specification of closed-loop runs) are stored in the trace, so that a later check uses the
+    same.
+
+    Raises:
+        MissingError: R201, a file cannot be written.
     """
     trace = trace_of(run, recording, setting, rules)
     paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
@@ -89,7 +94,7 @@ def save_trace_of(
 def save_unguarded(
     run: Run, recording: DeploymentRecording | None, setting: Setting, rules: Rules | None = None
 ) -> None:
-    """Write the first seed's unguarded trajectories, or remove those of an older deployment.
+    """Write the first seed's trajectories without guard; None: remove those of an older deployment.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -135,13 +140,17 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Specification constants changed by the run, its scenario or the deployment."""
+    """Constants of a specification that the run, its scenario or the deployment changes: name -> text."""
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()
     return {name: text for name, text in changed if name in own and name not in run.task.system.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
-    """Write stacked snapshots as `.npz`; object arrays are refused. Raises MissingError (R201)."""
+    """Write snapshots, stacked over time, as `.npz`; arrays of Python objects are refused.
+
+    Raises:
+        MissingError: R201, the file cannot be written.
+    """
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **scene)

@@ -1,11 +1,12 @@
 """Closed-loop satisfaction rate of a trained policy in the declared world, without and with guards.
 
 The accuracy of plans says little about closed-loop behaviour: plans are replaced at every step, a guard
-intervenes, and the visited states differ from the training distribution. So the policy is simulated, with
-seeds that neither training nor `simulate` uses by default, and judged as `simulate` judges.
+intervenes, and the visited states differ from the training distribution. Therefore the policy is simulated
+from random seeds that neither training nor `stlc simulate` uses by default, and the runs are judged as `stlc
+simulate` judges them.
 
-More expensive guards are simulated only where the cheaper one leaves failures, from the same starts; the
-remaining time goes to the guards that may turn out best.
+All guards are simulated from the same initial states. A more expensive guard is simulated only if a cheaper
+one leaves failures; the remaining time is spent on more runs of the guards that may still be the best.
 """
 
 from __future__ import annotations
@@ -55,16 +56,17 @@ FEWER = 4
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """Closed-loop runs under one guard, counted.
+    """Counts of the closed-loop runs under one guard.
 
     Attributes:
-        guard: its name.
-        runs: number of runs, one agent over one seed each.
-        satisfied: runs that satisfy the mission: the system's rules (`test: judge`), else the specification.
-        safe: runs that satisfy its requirements tagged `@safety`; None where it has none.
-        compared: runs that were also made without a guard from the same starts.
-        gained: compared runs satisfied only with the guard.
-        lost: compared runs satisfied only without.
+        guard: name of the guard.
+        runs: number of runs; a run is one agent under one seed.
+        satisfied: number of runs that satisfy the mission: the system's rules (`test: judge`) if it has some,
+            else the specification.
+        safe: number of runs that satisfy the requirements tagged `@safety`; None if there are none.
+        compared: number of runs that were also made without a guard from the same initial states.
+        gained: number of compared runs that satisfy the mission only with the guard.
+        lost: number of compared runs that satisfy the mission only without the guard.
     """
 
     guard: Mode
@@ -86,7 +88,7 @@ class Share:
         return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
-        """True if this guard is better by more than `NEAR`, with high probability where runs are few."""
+        """True if this share exceeds the other by more than `NEAR` (with few runs: if that is very probable)."""
         better = self.share > other.share + NEAR
         return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
@@ -111,10 +113,10 @@ class ClosedLoop:
     """Closed-loop results of a trained policy.
 
     Attributes:
-        shares: result per simulated guard, the cheapest first; empty where no run was completed.
-        steps: length of a run.
-        judge: the specification that judges the runs; None for that of the plans.
-        why: error message, where no run was possible.
+        shares: result of each simulated guard, the cheapest first; empty if no run was completed.
+        steps: length of a run in steps.
+        judge: name of the specification that judges the runs; None if it is that of the plans.
+        why: error message if no run was possible.
     """
 
     shares: tuple[Share, ...]
@@ -147,7 +149,7 @@ class ClosedLoop:
 
 
 def _superiority(first: Share, second: Share, by: float) -> float:
-    """Probability that the first share is larger by more than `by`: beta posteriors from uniform priors."""
+    """Probability that the first share exceeds the second by more than `by`, for uniform priors."""
     grid = np.linspace(0.0, 1.0, 2001)
     mass = []
     for share in (first, second):
@@ -163,9 +165,10 @@ class _LateError(Exception):
 
 @dataclass(slots=True)
 class _Known:
-    """Runs under one guard: start, as (seed, agent) -> satisfied, and safe.
+    """Known runs under one guard: (seed, agent) -> whether the mission, and whether safety, is satisfied.
 
-    `cost`: seconds per seed; 0 before the first. `agents`: per seed. `given_up`: a seed takes too long.
+    `cost`: measured seconds per seed; 0 before the first seed. `agents`: agents per seed. `given_up`: whether
+    simulating a seed takes too long.
     """
 
     agents: int
@@ -189,11 +192,12 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
     Args:
         run: trained run.
         left: remaining seconds; simulation stops once it is 0.
-        most: maximum number of runs per guard.
-        seed: first seed; the others follow.
+        most: maximum number of runs of each guard.
+        seed: first seed; further seeds are the integers after it.
 
     Returns:
-        The completed runs. `why` reports a world that fails, or rules that do not fit.
+        The completed runs; `why` of the result says if the world fails, or if the rules do not fit the
+        system.
     """
     test = run.task.system.decl.test
     try:
@@ -206,10 +210,11 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
 
 
 def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
-    """Simulate at least `runs` runs under one guard without time limit, with the seeds of `simulate`.
+    """Simulate at least `runs` runs under one guard, without time limit, with `stlc simulate`'s seeds.
 
     Raises:
-        SystemFileError: the world fails. SpecError: the rules do not fit.
+        SystemFileError: the world fails.
+        SpecError: the rules do not fit the system.
     """
     trial = _Trial(run, rules_of(run), lambda: 1e9, runs, seed)
     agents = trial.test.agents
@@ -219,7 +224,7 @@ def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
 
 
 class _Trial:
-    """Closed-loop runs under all guards."""
+    """Closed-loop simulation of one policy under all guards, in progress."""
 
     def __init__(
         self, run: Run, rules: Rules | None, left: Callable[[], float], most: int, seed: int
@@ -236,7 +241,7 @@ class _Trial:
             self._more(mode)
 
     def _next(self) -> Mode | None:
-        """The guard to sample next: the one with the widest interval among those that matter."""
+        """Guard to simulate next: of those that may be the best, the one with the widest interval."""
         if self.left() <= 0.0:
             return None
         for mode in GUARDS:
@@ -258,7 +263,7 @@ class _Trial:
         return None if wide[mode] <= 2.0 * NARROW else mode
 
     def _more(self, mode: Mode) -> None:
-        """Simulate more seeds under a guard, doubling their number, if there is time."""
+        """Simulate further seeds under the guard `mode`: as many as before, or as the remaining time permits."""
         known = self.known[mode]
         count = 1
         if known.seeds:
@@ -284,7 +289,11 @@ class _Trial:
         known.seeds += count
 
     def _simulated(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
-        """Completed runs. Raises _LateError where they would take more than `share` of the remaining time."""
+        """Simulate the seeds under the guard `mode` and return the recording.
+
+        Raises:
+            _LateError: this takes more than `share` of the remaining time.
+        """
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
         whole, recorder = self.left(), Recorder(agents, pictured=False)

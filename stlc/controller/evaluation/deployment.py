@@ -43,7 +43,7 @@ class DecisionLatency:
 
 @dataclass(frozen=True, slots=True)
 class Unsafe:
-    """An agent with an unsafe trajectory: its seed (by position), its number, and whether it is viable."""
+    """Agent with an unsafe trajectory: position of its seed, its number, and whether it is viable."""
 
     seed: int
     agent: int
@@ -55,11 +55,13 @@ class Deployment:
     """Results of one guard over all seeds.
 
     Attributes:
-        guard: its name.
+        guard: name of the guard.
         recording: trajectories and decisions.
-        metrics: name -> mean over seeds with its interval; see `metrics.METRICS`. Also `holds.NAME`, the
-            share of starts that satisfy one requirement, and the world's progress.
-        decisions: share of decisions by source; for the backup by T0 ("backup T0=1").
+        metrics: name -> mean over seeds with its confidence interval; see `metrics.METRICS`. Further entries:
+            `holds.NAME`, the share of start instants at which requirement NAME holds, and the world's
+            progress.
+        decisions: share of decisions by source; the backup's plans are counted by prefix length ("backup
+            T0=1").
         latency: time of one decision.
         unsafe: the agents with an unsafe trajectory.
         runs: verdicts of the rules for closed-loop runs.
@@ -75,7 +77,7 @@ class Deployment:
 
 
 class InterruptedDeploymentError(Exception):
-    """Early end of a deployment; carries the recording until then."""
+    """Error that ends a deployment early; it carries the recording of the steps before."""
 
     def __init__(self, recording: DeploymentRecording | None) -> None:
         super().__init__("the deployment ended early")
@@ -91,11 +93,13 @@ def deploy(
     watch: Watch | None = None,
     rules: Rules | None = None,
 ) -> Deployment:
-    """Simulate a policy in the world of its system; `watch` is called every step, `rules` judge the runs.
+    """Simulate a policy in the world of its system under a guard; `watch` is called at every step.
+
+    `rules`: specification that judges the closed-loop runs.
 
     Raises:
-        InterruptedDeploymentError: it ended early; `__cause__` is a SystemFileError or RunError of `drive`,
-            or an interruption, also one during judging.
+        InterruptedDeploymentError: the deployment ended early; `__cause__` is the SystemFileError or RunError
+            of `simulate`, or the interruption by the user.
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
@@ -114,9 +118,10 @@ def deploy(
 def judged(
     guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
 ) -> Deployment:
-    """Evaluate a recorded deployment under a guard; see `feasible_states` for `ceiling`.
+    """Evaluate a recorded deployment under a guard.
 
-    Without `rules` a run is judged by the plans' specification from every start.
+    `ceiling`: number of states to search, see `feasible_states`. Without `rules`, a run is judged by the
+    specification of the plans from every start instant.
     """
     executed = judge_executed(guard.task, recording)
     runs = (
@@ -136,15 +141,16 @@ def judged(
 
 
 def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
-    """Agents with an unsafe trajectory; `agents`: number per seed."""
+    """Agents whose trajectory is unsafe; `agents` is the number of agents per seed."""
     rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
     return tuple(Unsafe(*divmod(row, agents), bool(executed.viable[row])) for row in rows)
 
 
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
-    """Feasibility of `count` visited states, evenly spread: (rows, steps).
+    """Feasibility of `count` visited states, evenly spread over the recording: (rows, steps).
 
-    1: the followed plan satisfies, or a search has found one that does; 0: neither; NaN: not searched.
+    1: the followed plan satisfies the specification, or a search found one that does; 0: no such plan is
+    known; NaN: the state was not searched.
     """
     known = np.full(recording.rho.shape, math.nan)
     if count:
@@ -155,7 +161,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Share of decisions by source."""
+    """Share of the decisions by the source of the followed plan, as in `Deployment.decisions`."""
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
     for length in np.unique(recording.t0[backup]).tolist():
@@ -164,9 +170,9 @@ def decided(recording: DeploymentRecording) -> dict[str, float]:
 
 
 def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
-    """Time single-agent decisions in randomly chosen visited states, for some seconds at most.
+    """Measure the time of single-agent decisions in random visited states, for a few seconds at most.
 
-    Each decision gets a previous plan from the state before, as in the deployment; that one is not timed.
+    As in a deployment, each decision gets a previous plan, made in the state before; making it is not timed.
     """
     rows, steps = recording.actions.shape[:2]
     picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)
@@ -187,7 +193,7 @@ def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY
 def as_json(
     deployments: Mapping[Mode, Deployment], setting: Setting, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The document of `eval/simulate.json`."""
+    """Content of `eval/simulate.json`; `facts` are further entries."""
     return {
         **facts,
         "seeds": list(setting.seeds),

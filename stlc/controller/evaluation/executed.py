@@ -1,4 +1,4 @@
-"""Exact verdicts on simulated trajectories, and the share of them that is model-consistent."""
+"""Exact verdicts on simulated trajectories, and the share of the trajectories that agrees with the model."""
 
 from __future__ import annotations
 
@@ -30,14 +30,17 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Executed:
-    """Verdicts on recorded agents; requirements that mention T are judged at every start with a full window.
+    """Verdicts on recorded trajectories, one row per agent and seed.
+
+    A requirement that mentions T is judged at every start instant from which a whole planning window is
+    recorded; any other requirement is judged once, from the first sample.
 
     Attributes:
-        rules: requirement -> satisfaction, (starts, rows); one start where it does not mention T.
+        rules: requirement -> whether it holds, (starts, rows); one start if it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        consistent: (starts, rows), whether the window is model-consistent.
-        eventless: (starts, rows), whether the window has no exogenous event: the true dynamics alone acted,
-            even if the model is wrong; None where not recorded.
+        consistent: (starts, rows), whether all steps of the window equal those of the model.
+        eventless: (starts, rows), whether the window has no exogenous event: only the true dynamics acted,
+            even if the model differs from them; None if not recorded.
         viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
     """
 
@@ -48,12 +51,15 @@ class Executed:
     eventless: Mask | None = None
 
     def agents(self, names: Sequence[str]) -> Mask:
-        """Agents that satisfy all of `names` at all starts, (rows,)."""
+        """Mask of the agents for which all requirements in `names` hold at all start instants, (rows,)."""
         held = [self.rules[name].all(0) for name in names]
         return np.logical_and.reduce(held) if held else np.ones(self.consistent.shape[1], dtype=bool)
 
     def starts(self, names: Sequence[str]) -> Mask:
-        """Starts where all of `names` hold, (starts, rows); requirements without T count at every start."""
+        """Mask of the start instants at which all requirements in `names` hold, (starts, rows).
+
+        The one verdict of a requirement without T counts for every start instant.
+        """
         held = np.ones_like(self.consistent)
         for name in names:
             held &= self.rules[name][: len(held)] if len(self.rules[name]) > 1 else self.rules[name]
@@ -61,9 +67,9 @@ class Executed:
 
 
 def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask | None = None) -> Executed:
-    """Judge a recording at every sample from which a whole horizon fits; a shorter one has no such sample.
+    """Judge a recording at every sample from which a whole planning window is recorded.
 
-    `viable`: (rows,), starts with a known safe plan; a search finds them if not given.
+    `viable`: (rows,), whether a safe plan from the first state is known; if None, it is found by search.
     """
     columns = dict(
         zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
@@ -81,7 +87,11 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 
 
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """Requirement as it judges a whole run: one on the mission clock is evaluated once, as written."""
+    """Requirement in the form that judges a whole run; one with absolute times is then evaluated once.
+
+    Absolute times (`always@[a, b]`) count from the start of the mission; for single windows they are
+    rewritten.
+    """
     if not rule.absolute:
         return rule
     lowered = lower(from_first_sample(rule.typed.formula), task.compiled.grid, [])
@@ -90,7 +100,7 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 
 
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Satisfaction of one requirement, (starts, rows)."""
+    """Whether one requirement holds, (starts, rows)."""
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
         return _margin(rule, columns, 1) >= -TOLERANCE
@@ -109,7 +119,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
 
 
 def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
-    """Model-consistent steps, (rows, steps) booleans."""
+    """Mask of the steps in which the recorded next state equals that of the model, (rows, steps)."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
@@ -117,7 +127,7 @@ def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
 
 
 def _throughout(right: Mask, task: Task, starts: int) -> Mask:
-    """Starts whose whole window is marked: (rows, steps) -> (starts, rows)."""
+    """Start instants with `right` True at all steps of the window: (rows, steps) -> (starts, rows)."""
     so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
     return whole

@@ -44,20 +44,20 @@ TORCH_CHUNK = 32
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Verdict on a policy on held-out states.
+    """Result of a policy on held-out states (initial states that the training does not use).
 
     Attributes:
-        accuracy: share whose plan satisfies the specification (rho >= -1e-6 in float64).
-        interval: its 95 % Wilson interval.
-        requirements: share per requirement.
-        feasible: share with a known satisfying plan, the policy's or one found by search; where only a random
-            sample of the failing states was searched, it is extrapolated to the others.
+        accuracy: share of states whose plan satisfies the specification (rho >= -1e-6 in float64).
+        interval: 95 % Wilson interval of the accuracy.
+        requirements: share of states whose plan satisfies a requirement, for each requirement.
+        feasible: share of states with a known satisfying plan, the policy's or one found by search; if only a
+            random sample of the failing states was searched, it is extrapolated to the others.
         states: (n, dim), float64.
-        rho: (n,).
-        each: (n, requirements).
+        rho: robustness of each plan, (n,).
+        each: robustness per requirement, (n, requirements).
         known: states with a known satisfying plan, (n,) bool.
-        searched: states solved by the policy or searched, (n,) bool.
-        endless: simulated seconds of missions without end; else None.
+        searched: states that the policy solved or that were searched, (n,) bool.
+        endless: for a mission without end, the simulated duration in seconds; else None.
     """
 
     accuracy: float
@@ -85,7 +85,7 @@ class Score:
 
 
 def silent(_text: str) -> None:
-    """Ignore a report of progress."""
+    """Discard a progress report."""
 
 
 def score(
@@ -97,13 +97,14 @@ def score(
     enough: Stop = never,
     report: Callable[[str], None] = silent,
 ) -> Score:
-    """Judge a policy on `n` held-out states of seed `seed`; for missions, states along held-out missions.
+    """Judge a policy on `n` held-out states, drawn with `seed`; for missions, states along missions.
 
-    At most `MOST_SEARCHED` failing states are searched for a satisfying plan, in random order, until `enough`
-    returns True. A search starts from the policy's plan; if that fails, it continues independently of the
-    policy (in native code, which is fast enough), so that the feasible share hardly depends on how well the
-    policy is trained. States whose search was cut off do not count as searched, unless they are the first. If
-    `enough` is True before that, fewer states are judged. `report` receives the progress as a short text.
+    At most `MOST_SEARCHED` of the states whose plan fails are searched for a satisfying plan, in random
+    order, until `enough` returns True. A search starts from the policy's plan; if that fails, it continues
+    independently of the policy (in native code, which is fast enough), so that the feasible share hardly
+    depends on how well the policy is trained. States whose search was cut off do not count as searched,
+    unless they are the first ones. If `enough` returns True while the policy is still being judged, fewer
+    states are judged. `report` receives the progress as a short text.
     """
     if task.compiled.timers:
         states = visited(task, policy, n, seed, enough)
@@ -150,9 +151,10 @@ def score(
 def _judged(
     policy: Policy, states: Tensor, enough: Stop, report: Callable[[str], None]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Evaluated states (k, dim), the plans followed from there, their robustness, and that per requirement.
+    """Judge the policy's plans in batches of states until `enough` returns True, at least one batch.
 
-    All states, or the first ones, at least one batch, evaluated before `enough` returns True.
+    Returns:
+        The judged states (k, dim), the plans, their robustness, and their robustness per requirement.
     """
     plans: list[Tensor] = []
     rho: list[Tensor] = []
@@ -170,7 +172,10 @@ def _judged(
 
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Mark failing states for which exploration finds a plan; mission starts are tried first."""
+    """Search by exploration for plans from failing states, and mark the solved ones in `known`.
+
+    Starts of missions are tried first.
+    """
     clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
     first = failing[age.argsort(stable=True)[:EXPLORED]]
@@ -180,7 +185,7 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """Estimated share of feasible states: the known ones, and of failing ones the share found by search."""
+    """Estimated share of feasible states; the share of solved searches is applied to all failing states."""
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried
     return (int(known.sum()) + left * found / max(1, tried)) / len(known)

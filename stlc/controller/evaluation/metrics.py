@@ -1,6 +1,6 @@
 """Metrics of a deployment: definition, label, meaning and unit of each.
 
-Terminal, report, JSON documents and benchmark tables derive from `METRICS`.
+The terminal output, the report, the JSON files and the benchmark tables are derived from `METRICS`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """Masks of one seed of a deployment: plans are (agents, steps), closed-loop runs (starts, agents).
+    """Masks of one seed of a deployment; for plans (agents, steps), for closed-loop runs (starts, agents).
 
     Attributes:
         followed: whether the followed plan satisfies the specification.
-        proposed: whether the policy's plan does.
+        proposed: whether the policy's plan satisfies the specification.
         plan_safe: whether the followed plan satisfies the safety requirements.
-        satisfied: whether the run satisfies the specification, from each start.
-        safe: whether it satisfies the safety requirements.
-        satisfied_agents: (agents,), whether every requirement is satisfied at all starts.
-        safe_agents: (agents,), the same for the safety requirements.
+        satisfied: whether the run satisfies the specification from a start instant.
+        safe: whether the run satisfies the safety requirements from a start instant.
+        satisfied_agents: (agents,), whether every requirement holds at all start instants.
+        safe_agents: (agents,), whether every safety requirement holds at all start instants.
         viable: (agents,), whether the run is safe, or a search finds a safe plan from its first state.
-        consistent: whether the window of each start is model-consistent.
-        eventless: whether its window has no exogenous event; None where not recorded.
-        searched: visited states that were searched for a plan; None where none was.
+        consistent: whether the steps of the window from a start instant equal those of the model.
+        eventless: whether the window has no exogenous event; None if not recorded.
+        searched: visited states that were searched for a plan; None if there are none.
         feasible: visited states with a known satisfying plan.
     """
 
@@ -57,22 +57,23 @@ class Seed:
 
     @property
     def of_viable(self) -> Mask:
-        """Starts of viable agents."""
+        """Mask of the start instants of viable agents."""
         return np.broadcast_to(self.viable, self.safe.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric: the share of a population that has a property.
+    """Metric: the share of a population of plans or runs that has a property.
 
     Attributes:
-        key: in JSON documents.
-        label: in tables.
-        meaning: a sentence without its end.
-        mask: the property, as a mask of a seed; None where not recorded.
-        among: the population, as a mask of a seed; None for everything. Undefined ratios are omitted.
-        unit: of the value; shares have none.
-        safety: whether the metric is omitted where no requirement is tagged `@safety`.
+        key: name in JSON files.
+        label: name in tables.
+        meaning: explanation, a sentence without its full stop.
+        mask: function of a seed that gives the mask of the property; None if it was not recorded.
+        among: function of a seed that gives the mask of the population; None for everything. A share of an
+            empty population is omitted.
+        unit: unit of the value; shares have none.
+        safety: whether the metric is omitted if no requirement is tagged `@safety`.
     """
 
     key: str
@@ -230,12 +231,15 @@ def is_progress(key: str) -> bool:
 def measure(
     recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None = None
 ) -> dict[str, MeanInterval]:
-    """Compute all metrics over the seeds that have them, the share per requirement, and the world's progress.
+    """Compute the mean over seeds of every metric, of the share per requirement, and of the world's progress.
+
+    Seeds for which a metric is undefined are left out of its mean.
 
     Args:
         recording: trajectories and decisions.
-        executed: its verdicts.
-        feasible: (rows, steps), 1 with a known satisfying plan, 0 without, NaN where not searched.
+        executed: verdicts on the trajectories.
+        feasible: (rows, steps), 1 if a satisfying plan from the state is known, 0 if not, NaN if not
+            searched.
     """
     rows = [slice(at, at + recording.agents) for at in range(0, len(recording.states), recording.agents)]
     each = [dict(_of_seed(recording, executed, feasible, own)) for own in rows]

@@ -1,8 +1,7 @@
-"""Rules for closed-loop runs: the specification of `test: {judge: …}` and its verdicts.
+"""Rules for closed-loop runs: a second specification, named by `test: {judge: …}`, and its verdicts.
 
-Plans are judged window by window by the specification that they are made for. A closed-loop run is judged
-once, from first to last sample, by this other specification, which may use past operators and describe the
-world.
+The specification of the plans judges each plan over its window. A closed-loop run is judged once, from its
+first to its last sample, by the rules, which may use past operators and describe the world.
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ class Rules:
     """A specification for closed-loop runs.
 
     Attributes:
-        spec: as parsed, with its imported texts.
-        path: the user's path of the file when the run was made.
-        overrides: constants changed by the run or the deployment, as texts.
+        spec: the parsed specification, with the texts of its imports.
+        path: path of the file as the user gave it when the run was made.
+        overrides: constants that the run or the deployment changes: name -> value as a text.
     """
 
     spec: ast.Spec
@@ -72,18 +71,18 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Loss: the instant after which a broken rule could no longer be obeyed, as far as known.
+    """Loss of a run: the instant after which, as far as known, a broken rule could no longer be obeyed.
 
-    A plan is known where the followed plan satisfies the plans' specification (its requirements tagged
-    `@safety`, where such a rule was broken), or a search finds a plan.
+    "A plan is known" means: the followed plan satisfies the specification of the plans (only its requirements
+    tagged `@safety` if a safety rule was broken), or a search finds a plan that does.
 
     Attributes:
-        why: `start`: no plan is known at any instant before. `told`: the followed plan was such a plan; then
-            an exogenous event (an obstacle came into view), and no plan is known since. `later`: the same
-            without an exogenous event: the horizon of plans was too short, or the model is wrong. `missed`: a
-            plan was known, but another one was followed.
-        time: the instant since which no plan is known, seconds from the start; of `missed` the last known
-            one.
+        why: `start`: no plan is known from the first instant on. `told`: a plan was known until an exogenous
+            event (an obstacle came into view); none is known since. `later`: a plan was known, and none is
+            since, without such an event: the horizon of plans was too short, or the model is wrong. `missed`:
+            a plan was known, but another one was followed.
+        time: instant since which no plan is known, in seconds from the start; for `missed`, the last instant
+            at which one was known.
     """
 
     why: Literal["start", "told", "later", "missed"]
@@ -92,13 +91,13 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Broken:
-    """A run that broke rules.
+    """Run that broke rules.
 
     Attributes:
-        row: of the recording.
-        rules: rule -> time of the violation, seconds from the start; None where not located.
-        lost: time and cause of the loss; None where plans were good until a rule was broken, or where not
-            determined.
+        row: index of the run in the recording.
+        rules: rule -> time of the violation, in seconds from the start; None if it has no single instant.
+        lost: time and cause of the loss; None if the followed plans were good until a rule was broken, or if
+            the cause was not determined.
     """
 
     row: int
@@ -107,20 +106,20 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """True if the controller is excused: lost from the start, or by an exogenous event."""
+        """True if the controller is excused: the run was lost from the start or by an exogenous event."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
 @dataclass(frozen=True, slots=True)
 class RunVerdicts:
-    """Verdicts on closed-loop runs, one agent over one seed each.
+    """Verdicts on closed-loop runs; a run is one agent under one seed.
 
     Attributes:
         rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
-        broken: the runs that broke a rule, in order.
-        viable: (rows,), runs that could have obeyed as far as is known: those that did, and those lost
-            neither from the start nor to a later exogenous event. Of inconclusive runs those with a known
-            safe plan from the start.
+        broken: the runs that broke a rule, in the order of their rows.
+        viable: (rows,), mask of the runs that, as far as known, could have obeyed the rules: those that did,
+            those that were lost neither from the start nor by a later exogenous event, and the inconclusive
+            ones with a known safe plan from the start.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -179,7 +178,7 @@ def keep_rules(folder: RunDir, task: Task) -> None:
 
 
 def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
-    """Compile the rules for the recorded states, so that errors are reported before the training."""
+    """Read the rules and compile them for the recorded states, so that errors show before the training."""
     spec, system = read_rules(judge), task.plain
     changed = _own(spec, system.decl.overrides)
     compile_spec(
@@ -189,15 +188,16 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 
 
 def rules_of(run: Run) -> Rules | None:
-    """Rules of a run's system as deployed; None where runs are judged by the plans' specification.
+    """Rules that judge a run under the deployment's settings; None if the specification of the plans judges.
 
-    They are the run's copy of the file that its `system.yaml` names. A file named there later (or with `--set
-    test.judge=…`) is read in place. A run from before `test.judge` existed uses the rules that its system
-    file names now.
+    They are read from the copy in the run folder of the file that the run's `system.yaml` names. A file that
+    is named later (by the scenario or with `--set test.judge=…`) is read at its own path. A run that was
+    trained before `test.judge` existed uses the rules that its system file names today.
 
     Raises:
         RunError: R101, the run's copy is damaged.
-        SystemFileError, SpecError: the file is missing, or not a specification.
+        SystemFileError: the file is missing.
+        SpecError: the file is not a specification.
     """
     decl = run.task.system.decl
     judge, overrides = decl.test.judge, decl.overrides
@@ -244,7 +244,7 @@ def _library_of(name: str) -> str:
 
 
 def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
-    """Overrides of constants that the specification declares."""
+    """The entries of `overrides` that name constants of the specification."""
     own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
     return {name: text for name, text in overrides.items() if name in own}
 
@@ -262,10 +262,10 @@ def judge_runs(
     """Judge every run from its first sample to its last.
 
     Args:
-        rules: specification of the runs.
-        task: gives state names, time step and external functions.
+        rules: specification for closed-loop runs.
+        task: supplies state names, time step and external functions.
         recording: the runs.
-        viable: (rows,), whether a safe plan from the start is known.
+        viable: (rows,), whether a safe plan from the first state is known.
 
     Raises:
         SpecError: the rules do not fit the recording.
@@ -284,7 +284,11 @@ def judge_runs(
 
 
 def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
-    """Verdict on every run from its first sample to its last; raises SpecError like `judge_runs`."""
+    """Evaluate the rules on every run from its first sample to its last.
+
+    Raises:
+        SpecError: the rules do not fit the recording.
+    """
     outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
     decl = task.system.decl
     monitor = Monitor(
@@ -301,7 +305,7 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
 ) -> Lost | None:
-    """Time and cause of a loss, for the first broken rule tagged `@safety`, else the first broken one."""
+    """Time and cause of a loss, for the first broken rule, those tagged `@safety` before others."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
@@ -329,9 +333,10 @@ def _lost(
 def judge_runs_by_plans(
     held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
 ) -> RunVerdicts:
-    """Verdicts where runs are judged by the plans' specification: requirement -> (starts, rows) booleans.
+    """Verdicts on runs by the specification of the plans: `held` maps requirement -> (starts, rows) booleans.
 
-    A requirement is obeyed if it holds at every start; it is broken at the first start where it does not.
+    A requirement is obeyed if it holds at every start instant; it is broken at the first one at which it
+    fails.
     """
     rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
     rules |= {name: np.full(len(viable), "inconclusive") for name, starts in held.items() if not len(starts)}
@@ -359,7 +364,7 @@ def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator
 
 
 def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Times at which a run broke rules: the samples that decide."""
+    """Times at which a run broke the rules `names`: those of the samples that decide the verdicts."""
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}
@@ -372,10 +377,10 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
     """The entry `drives` of a guard in `eval/simulate.json`.
 
-    Of `count` runs `obeyed` satisfy every rule and `undecided` are inconclusive; `lost` of the others were
-    lost (`RunVerdicts.viable`): `told` of them to a later exogenous event, the others from the start.
-    `rules`: the same per rule. `broken`: run, rules and times (seconds from the start, null where not
-    located), and `cause`: since when no plan is known and why (`Lost`).
+    Of `count` runs, `obeyed` satisfy every rule, `undecided` are inconclusive, and `lost` of the others were
+    lost (see `RunVerdicts.viable`): `told` of these by a later exogenous event, the rest from the start.
+    `rules` holds the same numbers per rule. `broken` lists each run that broke rules, with the times (seconds
+    from the start, null if not located) and the `cause`: since when no plan is known, and why (`Lost`).
     """
     obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {

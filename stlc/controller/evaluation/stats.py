@@ -13,7 +13,7 @@ _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 @dataclass(frozen=True, slots=True)
 class MeanInterval:
-    """Mean over seeds with its 95 % confidence interval; a single seed has no `low` and `high`."""
+    """Mean over seeds with its 95 % confidence interval; for a single seed, `low` and `high` are None."""
 
     mean: float
     low: float | None
@@ -22,7 +22,7 @@ class MeanInterval:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> MeanInterval:
-        """Mean of at least one value; without interval where a value is not finite."""
+        """Mean of one or more values; the interval is omitted if a value is not finite."""
         mean = fmean(values)
         if len(values) < 2 or not all(map(math.isfinite, values)):
             return cls(mean, None, None, tuple(values))
