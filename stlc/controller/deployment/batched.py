@@ -174,9 +174,7 @@ class Worlds:
         return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
 
     def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
-        """Concatenate the states that `method` of each world returned, (rows, n), and check that they are
-        finite.
-        """
+        """Concatenate the states that `method` of each world returned, (rows, n); all must be finite."""
         found = []
         for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
             x = states_of(world, method, each, self.size)

@@ -82,13 +82,13 @@ class Disturbance:
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
-        """Random signs, 1 or -1, (rows, count), drawn for each seed from its random stream number `stream`."""
+        """Random signs, 1 or -1, (rows, count), drawn for each seed from its stream number `stream`."""
         shape = (self._agents, count)
         drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
-        """Standard normal numbers, (rows, count), drawn for each seed from its random stream number `stream`."""
+        """Standard normal numbers, (rows, count), drawn for each seed from its stream number `stream`."""
         shape = (self._agents, count)
         streams = self._streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])

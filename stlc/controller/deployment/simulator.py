@@ -196,7 +196,7 @@ class _Pilot:
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
-        """Return decisions and actions (rows, m); the rows in `due` replan from the measured states `seen`."""
+        """Return decisions and actions (rows, m); the rows in `due` replan from measured states `seen`."""
         if len(due):
             new = self.guard.decide(seen[due], self._previous(due, seen))
             whole = self.decision is None or len(due) == len(x)

@@ -90,7 +90,7 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
 
 
 def wrong(world: object, method: str, what: str) -> SystemFileError:
-    """Return error S207 for `method` of a world, which does not meet the requirements on it as `what` says."""
+    """Return error S207 for `method` of a world; `what` says which requirement it does not meet."""
     message = f"`{method}` of the world {what}"
     return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
 

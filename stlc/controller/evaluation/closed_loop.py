@@ -88,7 +88,7 @@ class Share:
         return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
-        """True if this share exceeds the other by more than `NEAR` (with few runs: if that is very probable)."""
+        """True if this share exceeds the other by more than `NEAR`, in few runs with high probability."""
         better = self.share > other.share + NEAR
         return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
@@ -263,7 +263,7 @@ class _Trial:
         return None if wide[mode] <= 2.0 * NARROW else mode
 
     def _more(self, mode: Mode) -> None:
-        """Simulate further seeds under the guard `mode`: as many as before, or as the remaining time permits."""
+        """Simulate further seeds under the guard `mode`: as many as before, if the time permits."""
         known = self.known[mode]
         count = 1
         if known.seeds:
