@@ -54,7 +54,7 @@ class Candidates:
     def judged(
         cls, task: Task, x: Tensor, plans: Tensor, source: int, prefix_length: int = 0, *, cost: bool = False
     ) -> Candidates:
-        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether to compute it."""
+        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether to compute costs."""
         shape, rows = plans.shape[:-2], plans.flatten(0, -3)
         starts = x.repeat_interleave(len(rows) // max(len(x), 1), 0)
         found = task.judge(starts, rows, states=cost)
@@ -70,7 +70,7 @@ class Candidates:
 
     @classmethod
     def unjudged(cls, plans: Tensor) -> Candidates:
-        """Plans (agents, T, m) without verdict, source -1: they rank below all others."""
+        """Plans (agents, T, m) that were not judged; source is -1, and they rank below all judged plans."""
         worst = torch.full(plans.shape[:-2], -torch.inf, dtype=plans.dtype, device=plans.device)
         number = torch.zeros(worst.shape, dtype=torch.int64, device=plans.device)
         return cls(plans.clone(), worst, worst.clone(), torch.zeros_like(worst), number - 1, number)
@@ -86,21 +86,21 @@ class Candidates:
         return self.safe >= -TOLERANCE
 
     def of(self, rows: Tensor) -> Candidates:
-        """Select agents, (k,) indices or (agents,) booleans."""
+        """Select agents by indices (k,) or by a mask (agents,)."""
         return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def pick(self, choice: Tensor) -> Candidates:
-        """Select one choice per agent, (agents,), from (agents, choices)."""
+        """Select for each agent the choice with the index in `choice`, (agents,), from (agents, choices)."""
         rows = torch.arange(len(choice), device=choice.device)
         return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
 
     def put(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite the plans of some agents, (k,) indices, with `other`, (k, …)."""
+        """Overwrite the plans of the agents with indices `rows`, (k,), by those of `other`, (k, …)."""
         for name in _FIELDS:
             getattr(self, name)[rows] = getattr(other, name)
 
     def improve(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite the plans of some agents, (k,) indices, where `other`, (k,), ranks higher."""
+        """Overwrite the plans of the agents with indices `rows`, (k,), where `other`, (k,), ranks higher."""
         better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
         self.put(rows[better], other.of(better))
 
@@ -115,7 +115,7 @@ class Candidates:
         return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
 
     def beside(self, other: Candidates) -> Candidates:
-        """Concatenate the choices of the same agents: (agents, j), (agents, k) -> (agents, j + k)."""
+        """Join two sets of choices of the same agents: (agents, j) and (agents, k) -> (agents, j + k)."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in _FIELDS)
         return Candidates(*(torch.cat(pair, 1) for pair in pairs))
 
@@ -126,9 +126,9 @@ _FIELDS = tuple(each.name for each in fields(Candidates))
 def rank(plans: Candidates) -> Tensor:
     """Rank of plans, (…); larger is better.
 
-    Order: plans that satisfy phi, by robustness; safe plans whose prefix the policy continues, as these
-    return to the training distribution; other safe plans; longest-safe-prefix plans; the rest, by the smaller
-    of both robustness values.
+    The order, from best to worst: plans that satisfy phi, by robustness; safe plans of which the policy
+    continues the prefix, because they return to the training distribution; other safe plans; plans with the
+    longest safe prefix; other plans, by the smaller of the robustness of phi and that of phi_safe.
     """
     good, safe = plans.satisfies, plans.is_safe
     within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
@@ -142,7 +142,7 @@ def rank(plans: Candidates) -> Tensor:
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
-    """Best allowed choice per row by the keys in lexicographic order: (rows, choices) each -> (rows,)."""
+    """Best allowed choice per row, by `keys` in lexicographic order: (rows, choices) -> (rows,) indices."""
     for key in keys:
         value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
         allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
@@ -150,7 +150,7 @@ def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:
-    """Plans (B, T, m) with non-finite entries replaced by the control value nearest to 0."""
+    """Plans (B, T, m) with non-finite entries replaced by the admissible control value nearest to 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
 
@@ -159,14 +159,14 @@ def finite(plan: Tensor, task: Task) -> Tensor:
 
 
 class Deadline:
-    """Deadline of a decision for some agents; none without a limit."""
+    """Time by which a decision for a number of agents must be made; without time limit it never passes."""
 
     def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
         self.until = inf if seconds is None else perf_counter() + seconds * agents
 
     @property
     def over(self) -> bool:
-        """True after the deadline."""
+        """True once the time has passed."""
         return perf_counter() >= self.until
 
 
@@ -175,17 +175,20 @@ class Limits:
     """Computational limits of a decision.
 
     Attributes:
-        seconds: time limit per agent of the full guard, which then takes the best plan so far. None: no
-            limit.
-        tries: evaluations of a local search per starting plan.
-        prefixes: maximum number per length in the paper's rule where nothing safe was found.
-        drawn: maximum number of prefixes per length for sampled shooting; of more a sample.
-        places: number of sampled-shooting plans that local search starts from.
-        again: evaluations of each of these searches.
-        rescue: whether to search for phi_safe alone, without the policy, where nothing else was safe.
-        margin: robustness margins of safety requirements that an accepted plan must have, by their names, in
-            their units; also for the paper's guard.
-        paper: time limit per agent of the paper's guard; none by default.
+        seconds: time limit per agent of the full guard, which then takes the best plan found until then;
+            None: no limit.
+        tries: number of plans that a local search judges per starting plan.
+        prefixes: maximum number of prefixes of each length that the paper's guard compares if it found no
+            safe plan.
+        drawn: maximum number of prefixes of each length for sampled shooting; if there are more, a random
+            sample is used.
+        places: number of plans of sampled shooting from which local searches start.
+        again: number of plans that each of these searches judges.
+        rescue: whether to search for a plan that satisfies phi_safe alone, without the policy, if no other
+            stage found a safe plan.
+        margin: name of a safety requirement -> robustness margin, in its unit, by which an accepted plan must
+            satisfy it; also for the paper's guard.
+        paper: time limit per agent of the paper's guard; None: no limit.
     """
 
     seconds: float | None = 0.1
@@ -200,7 +203,7 @@ class Limits:
 
 
 def grid_of(task: Task) -> PrefixGrid:
-    """Control grid of a system: `levels` of its backup or of a control, else evenly spaced values."""
+    """Control grid of the backup policy: `levels` of the system file, else evenly spaced values."""
     decl = task.system.decl
     values = tuple(
         decl.backup.levels.get(control.name)

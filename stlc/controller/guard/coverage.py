@@ -1,8 +1,8 @@
-"""Probability that the backup policy's grid contains a working plan: the paper's Theorem 1, and exactly.
+"""Probability that the backup policy's grid contains a working plan: Theorem 1 of the paper, and exact.
 
-Assume a prefix u* of T0 actions, uniformly distributed over the control ranges, such that every prefix within
-`radius` of it, in every control at every step, leads to satisfaction. The backup policy finds it if a grid
-point lies within `radius` of it in every control at every step.
+Assumption: a prefix u* of T0 actions is uniformly distributed over the control ranges, and every prefix
+within `radius` of u*, in every control at every step, leads to satisfaction. The backup policy finds such a
+prefix if a grid point lies within `radius` of u* in every control at every step.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Axis:
     """One control of the grid.
 
     Attributes:
-        name: of the control.
+        name: name of the control.
         low: lower end of its range.
         high: upper end of its range.
-        values: grid values, ascending.
+        values: grid values in ascending order.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Axis:
     values: tuple[float, ...]
 
     def covered(self, radius: float) -> float:
-        """Exact share of the range within `radius`, in its unit, of a grid value."""
+        """Exact share of the control's range that lies within `radius` (in its unit) of a grid value."""
         total, reached = 0.0, self.low
         for value in self.values:
             left, right = max(value - radius, reached), min(value + radius, self.high)
@@ -47,22 +47,22 @@ class Axis:
         return total / (self.high - self.low)
 
     def bound(self, radius: float) -> float:
-        """Theorem 1 for this control and one step: (2 L - 4) radius / range, which ignores the ends."""
+        """Bound of Theorem 1 for one step, (2 L - 4) radius / range; it ignores the ends of the range."""
         return max(2 * len(self.values) - 4, 0) * radius / (self.high - self.low)
 
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """Probabilities that the prefixes of `length` steps contain a working one.
+    """Probabilities that the prefixes of one length contain a working one (one that leads to satisfaction).
 
     Attributes:
-        radius: share of each control's range.
-        length: T0.
-        candidates: number of prefixes tried: M = L^(m T0), or a sample of them.
-        theorem: the paper's bound, min{1, product}.
-        bound: the same with the minimum taken per control. The paper's product counts overlapping cover of a
-            control more than once and may exceed the exact value.
-        exact: probability under the same assumptions; a lower bound for a sample.
+        radius: distance in which prefixes work, as a share of each control's range.
+        length: number of actions of a prefix, T0.
+        candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
+        theorem: the paper's bound, min{1, product over controls and steps}.
+        bound: the same with the minimum taken for each control. The paper's product counts overlapping cover
+            of a control more than once and may exceed the exact value.
+        exact: exact probability under the same assumptions; for a sample of the prefixes, a lower bound.
         sampled: whether only a sample of the prefixes is tried.
     """
 
@@ -82,10 +82,11 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 
 
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
-    """Compute the probabilities for one radius, a share of each range, and one prefix length.
+    """Compute the probabilities for one radius, a share of each control's range, and one prefix length.
 
-    From a grid with more than `samples` prefixes that many are drawn with replacement: any given prefix is
-    among them with probability 1 - (1 - 1 / M)^samples, so a working one is with at least this probability.
+    If the grid has more than `samples` prefixes, that many are drawn with replacement. A given one of the M
+    prefixes is then tried with probability 1 - (1 - 1 / M)^samples, so this is a lower bound on the
+    probability that a tried prefix works if some prefix of the grid does.
     """
     radii = [radius * (axis.high - axis.low) for axis in axes]
     bounds = [axis.bound(each) for axis, each in zip(axes, radii, strict=True)]

@@ -40,23 +40,24 @@ def solve(
     generator: torch.Generator | None = None,
     stop: Stop = never,
 ) -> SearchResult:
-    """Search for a satisfying plan from each state; the same arguments give the same plans.
+    """Search for a satisfying plan from each state; equal arguments give equal plans.
 
-    The first pass of local search starts from `start`, each later one, for unsolved states, from plans of the
-    library. Found plans are exact verdicts; a state without one may still be feasible.
+    The first pass of local search starts from `start`; each later pass treats the unsolved states and starts
+    from random plans of the library. A returned robustness is exact; a state without a satisfying plan may
+    still be feasible.
 
     Args:
         task: specification and system.
         x0: states, (B, n).
-        start: plans, (B, T, m); the middle of every control if None.
-        library: plans that the search also recombines, (k, T, m); `extremes` if None.
-        passes: maximum number.
-        tries: evaluations per pass and state.
+        start: starting plans, (B, T, m); the middle of every control range if None.
+        library: plans from which the search also takes parts, (k, T, m); those of `extremes` if None.
+        passes: maximum number of passes.
+        tries: number of plans judged per pass and state.
         generator: random numbers of the search; seed 0 if None.
         stop: ends the search early.
 
     Returns:
-        Plans and their robustness in float64; -inf where the search was stopped before it began.
+        Plans and their robustness in float64; -inf for states whose search was stopped before it began.
     """
     generator = generator or torch.Generator().manual_seed(0)
     if library is None:

@@ -1,4 +1,4 @@
-"""Runtime guard for receding-horizon deployment: plan, judge and execute the first action at every step."""
+"""Runtime guard for receding-horizon deployment: plans are judged before an action is executed."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class GuardDecision:
         source: (agents,) int64, an index into `SOURCES`.
         t0: (agents,) int64, prefix length of the backup policy; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
-        safe: (agents,) bool, whether `plan` satisfies phi_safe.
+        safe: (agents,) bool, whether `plan` satisfies phi_safe (the requirements tagged `@safety`).
         policy_rho: (agents,) float64, robustness of the policy's plan; -inf where that is not finite.
-        proposed: (agents, T, m), the policy's plan, followed or not.
+        proposed: (agents, T, m), the policy's plan, whether it is followed or not.
     """
 
     action: Tensor
@@ -49,9 +49,9 @@ class GuardDecision:
     proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> GuardDecision:
-        """The decision some steps later, (agents,) or one number: the remainders of the plans.
+        """The decision after `steps` further steps, one number or (agents,): the remainders of the plans.
 
-        Their last actions are held.
+        A remainder is filled up to the length of a plan by holding its last action.
         """
         agents, length, controls = self.plan.shape
         ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
@@ -64,7 +64,7 @@ class GuardDecision:
         return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
-        """The decision with the rows of some agents, (k,) indices, replaced by `new`."""
+        """The decision in which the agents with indices `rows`, (k,), have the entries of `new`."""
         pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
         return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
 
@@ -73,16 +73,16 @@ _FIELDS = tuple(each.name for each in fields(GuardDecision))
 
 
 class Guard:
-    """Runtime safety filter: judges every plan of a policy and replaces violating ones.
+    """Runtime safety filter: judges every plan of a policy and replaces plans that violate the specification.
 
     Args:
         task: specification and system.
         policy: proposes plans.
-        mode: for rejected plans "paper" calls the paper's backup policy, "full" the stages of plan repair;
-            "none" only records.
-        grid: control values of the backup; by default those of the system file.
-        limits: of a decision. A margin changes which plans are accepted; reported robustness and verdicts
-            stay those of the task without margin.
+        mode: how a rejected plan is replaced: "paper" by the paper's backup policy, "full" by the stages of
+            `stlc.controller.guard.stages`; "none": plans are judged but not replaced.
+        grid: control values of the backup policy; by default those of the system file.
+        limits: computational limits and robustness margins of a decision. A margin changes which plans are
+            accepted; reported robustness and verdicts are those of the task without margin.
     """
 
     def __init__(
@@ -105,18 +105,18 @@ class Guard:
 
     @torch.no_grad()
     def decide(self, x: Tensor, previous: GuardDecision | None = None) -> GuardDecision:
-        """Decide for (agents, n) states; verdicts are computed in float64.
+        """Decide which plans the agents follow from states (agents, n); verdicts are computed in float64.
 
-        The previous plan is retained where it still satisfies the specification and the new plan ranks no
-        higher; otherwise an agent could postpone a goal at every step. It is also retained where its next
-        step increases the margin of a pending goal (`stlc.controller.problem.pending_goals`).
+        The previous plan is retained if it still satisfies the specification and the new plan ranks no
+        higher; otherwise an agent could postpone a goal at every step. It is also retained if its next step
+        increases the robustness margin of a pending goal (`stlc.controller.problem.pending_goals`).
 
         Args:
             x: (agents, n) states.
             previous: remainder of the previous decision; see `GuardDecision.later`.
 
         Returns:
-            The decision. Mode "none" passes a non-finite plan on, with robustness -inf.
+            The decision. With mode "none", a plan that is not finite is followed, with robustness -inf.
         """
         x = x.to(torch.float64)
         fresh, judged = self.policy.plan_judged(x)
@@ -138,14 +138,17 @@ class Guard:
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
-        """The decision with the verdicts of the task without margin."""
+        """The decision with robustness and verdicts of the task without margins.
+
+        `fresh`: the policy's plans.
+        """
         taken = self.task.judge(x, decision.plan, states=False)
         policy_rho = self.task.judge(x, fresh, states=False).rho
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
     @torch.no_grad()
     def endangered(self, x: Tensor, previous: GuardDecision, steps: int | Tensor) -> Tensor:
-        """Agents whose previous plan, by the model, violates safety requirements in its next steps.
+        """Mask of the agents whose previous plan, by the model, is unsafe in its next steps.
 
         Args:
             x: (agents, n) states.
@@ -153,7 +156,7 @@ class Guard:
             steps: number of steps to check, one number or (agents,).
 
         Returns:
-            (agents,) booleans; all False without the full guard: the paper's judges new plans only.
+            (agents,) booleans. Only the full guard checks previous plans; for the others all are False.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
         if self.mode != "full" or not formulas:
@@ -163,10 +166,12 @@ class Guard:
 
     @torch.no_grad()
     def prefer(self, options: Tensor, previous: GuardDecision | None = None) -> Tensor:
-        """Option with the best plan for each agent; the first of equals.
+        """Index of the option (alternative that the world offers) with the best plan for each agent.
+
+        Of equally good options the first is taken.
 
         Args:
-            options: (agents, k, n) states; option 0 is the present state.
+            options: (agents, k, n), states under the options; option 0 is the present state.
             previous: remainder of the previous decision, which belongs to option 0.
 
         Returns:
@@ -186,9 +191,10 @@ class Guard:
 
     @torch.no_grad()
     def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
-        """Remainders of plans for (agents, n) states, extended by the policy at their ends.
+        """Remainders of plans in states (agents, n), extended at their ends by the policy.
 
-        `taken`: executed steps per agent, (agents,); as many held actions at the end are replaced.
+        `taken`: number of executed steps per agent, (agents,). As many actions at the end of a remainder,
+        where the last action is held, are replaced by the policy's.
         """
         x, plan = x.to(torch.float64), previous.plan.clone()
         length = plan.shape[1]
@@ -205,7 +211,7 @@ class Guard:
     def _with_previous(
         self, x: Tensor, previous: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
-        """The policy's plans; previous plans in place of those that rank no higher."""
+        """The policy's plans `fresh` with verdicts; previous plans replace those that rank no higher."""
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
         if previous is None:
@@ -218,7 +224,7 @@ class Guard:
         return found
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Agents whose remaining plan increases the margin of a reached goal, (agents,) booleans."""
+        """Mask of the agents whose remaining plan increases the margin of a reached goal, (agents,)."""
         if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
         return self.task.pending_goals.deepened(rest.columns)

@@ -1,9 +1,10 @@
-"""Robustness margins of guards: requests, calibration, and tightened tasks.
+"""Robustness margins of guards: requests on the command line, calibration, tightened tasks.
 
-A guard accepts a plan that is safe by the model. By its next judgement the true dynamics and the true initial
-state have reduced the plan's robustness. If its margin was larger than this loss, its remainder is still safe
-by the model, so a safe plan exists. Calibration measures the loss: the policy's plans, from training starts,
-are executed on the scenario's true dynamics until the next judgement, and by the model from there.
+A guard accepts a plan that is safe by the model. When it judges the plan again, the true dynamics and the
+true initial state have reduced the plan's robustness. If the margin was larger than this loss, the remainder
+of the plan is still safe by the model, so a safe plan exists. Calibration measures the loss: the policy's
+plans from training states are executed on the scenario's true dynamics until the guard judges again, and
+their rest on the model.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
-    """The task with tightened safety requirements: their robustness is reduced by their `margin`.
+    """The task whose safety requirements are tightened: their robustness is reduced by their margins.
 
-    Time tests and constants, which never limit a robustness, are unchanged.
+    Predicates on time and constants, which never determine a robustness, are unchanged.
     """
     if not any(margin.values()):
         return task
@@ -49,7 +50,7 @@ def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
 
 
 def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
-    """The formula with its robustness reduced by `margin`, everywhere and exactly."""
+    """The formula whose robustness is that of `formula` minus `margin`, for every trajectory."""
     if isinstance(formula, ir.Predicate):
         less = add(formula.num, ir.Const(-formula.sign * margin))
         return formula if formula.guard else replace(formula, num=less)
@@ -64,16 +65,16 @@ SEED = 20_251
 
 @torch.no_grad()
 def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
-    """Quantile of the robustness loss of safe plans, for each safety requirement.
+    """Margin of each safety requirement: a quantile of the robustness that safe plans lose.
 
     Args:
-        task: under its scenario with errors, disturbances and noise.
-        policy: planner.
-        steps: number between two judgements of the guard; the full guard judges at every step.
-        share: share of plans whose loss the margin covers.
+        task: specification and system, with the scenario whose errors, disturbances and noise cause the loss.
+        policy: policy that makes the plans.
+        steps: number of steps between two judgements of the guard; the full guard judges at every step.
+        share: share of the plans whose loss the margin exceeds or equals.
 
     Returns:
-        Requirement -> margin, at least 0 each; empty where the scenario has no error, or the policy no safe
+        Requirement -> margin, at least 0; empty if the scenario has no errors or the policy makes no safe
         plan.
     """
     x0 = task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
@@ -93,7 +94,7 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
 
 
 def _followed(task: Task, disturbance: Disturbance, x: Tensor, plan: Tensor, steps: int) -> Tensor:
-    """States (B, T+1, n) under plans on the true dynamics for some steps, then on the model."""
+    """States (B, T+1, n) under plans: the first `steps` steps on the true dynamics, the rest on the model."""
     (truth,) = disturbance.truths(task.plain.truth)
     count, states = len(task.plain.names), [x]
     for step in range(steps):
@@ -124,9 +125,10 @@ class MarginRequest:
     share: float | None = None
 
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
-        """Margins of a task under its scenario, where agents replan every `replan` steps.
+        """Margins of the safety requirements of a task, whose agents replan every `replan` steps.
 
-        Raises UsageError (U101) where a name is not a safety requirement.
+        Raises:
+            UsageError: U101, a name is not that of a safety requirement.
         """
         names = [rule.name for rule in task.compiled.safety]
         for name in self.named:
@@ -146,7 +148,7 @@ class MarginRequest:
 
 
 def parse_margins(texts: Sequence[str]) -> MarginRequest:
-    """Parse margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; the last of a kind counts.
+    """Parse margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; a later one replaces an earlier one.
 
     Raises:
         UsageError: U101, a text is not a margin.

@@ -17,10 +17,11 @@ BEYOND = "#beyond"
 
 
 def open_ended(formula: ir.Formula) -> ir.Formula:
-    """The formula with every predicate true where the column `BEYOND` is positive.
+    """The formula in which every predicate holds at samples where the column `BEYOND` is positive.
 
-    In negation normal form robustness grows with that of each predicate, so this is the upper bound over all
-    continuations of the trace: negative exactly where the known samples already violate the formula.
+    In negation normal form the robustness of a formula does not decrease with that of its predicates. So,
+    with `BEYOND` positive after the known samples, it is the upper bound over all continuations of the trace;
+    it is negative exactly if the known samples already violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -28,10 +29,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """The formula with predicates on the initial state as conditions that do not limit the margin.
+    """The formula whose predicates on the initial state decide truth but do not bound the robustness.
 
-    All plans share the initial state, so plans that violate `a -> always b` are compared by the violation of
-    b, not by the robustness of a.
+    All plans share the initial state. For `a -> always b`, plans that violate it are therefore compared by
+    the violation of b, not by the robustness of a.
     """
     match formula:
         case ir.Predicate():
@@ -45,9 +46,10 @@ def anchored(formula: ir.Formula) -> ir.Formula:
 def robustness_until(
     formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
 ) -> Tensor:
-    """Minimum over formulas of the robustness upper bound given the samples 0 to `last`: (batch,).
+    """Minimum over formulas of the upper bound on robustness given only the samples 0 to `last`: (batch,).
 
-    `columns`: name -> (time, batch), as long as the formulas' horizon. `last`: one number, or (batch,).
+    `columns`: name -> samples (time, batch), as long as the formulas' horizon. `last`: one index, or
+    (batch,).
     """
     like = next(iter(columns.values()))
     index = torch.arange(len(like), device=like.device)[:, None].expand(like.shape)
@@ -57,14 +59,14 @@ def robustness_until(
 
 
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """Minimum over the anchored formulas of the exact robustness upper bound given each prefix.
+    """Minimum over the `anchored` formulas of the upper bound on robustness given each prefix of a trace.
 
     Args:
         formulas: the safety requirements.
-        columns: name -> (time, batch).
+        columns: name -> samples, (time, batch).
 
     Returns:
-        (time, batch), non-increasing over time: entry k is that of the samples 0 to k.
+        (time, batch); entry k is the bound given the samples 0 to k, so entries do not increase over time.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

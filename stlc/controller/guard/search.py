@@ -29,8 +29,8 @@ class StagedSearch:
         task: specification and system.
         policy: continues prefixes.
         guard: name of the guard: "paper" or "full".
-        grid: values of the controls; by default those of the system file.
-        limits: of a decision; those of `Limits` if None.
+        grid: values of the controls in prefixes; by default those of the system file.
+        limits: computational limits of a decision; the defaults of `Limits` if None.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class StagedSearch:
             previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            The highest-ranked proposal of any stage, one plan per agent.
+            The plan that ranks highest among the proposals of all stages, one per agent.
         """
         deadline = Deadline(self.seconds, len(x))
         plan = finite(plan.to(x.dtype), self.task)
@@ -76,17 +76,17 @@ class StagedSearch:
 
 
 class RelaxedSearch:
-    """Full guard with margins; where no plan has them, the safe plan with the largest margin is taken.
+    """Full guard with margins; if no plan has them, the safe plan with the largest margin is taken.
 
-    A safe plan with a smaller margin is preferred to a prefix that has the full margin for some steps and
-    then violates: a rover beside a wall can stay there.
+    A safe plan with a smaller margin is better than a prefix that has the full margin for some steps and is
+    then unsafe: a rover beside a wall can stay there.
 
     Args:
-        task: without margins.
+        task: specification without margins, and system.
         strict: the task with margins.
         policy: continues prefixes.
-        grid: values of the controls; by default those of the system file.
-        limits: of a decision.
+        grid: values of the controls in prefixes; by default those of the system file.
+        limits: computational limits of a decision.
     """
 
     def __init__(
@@ -111,9 +111,9 @@ class RelaxedSearch:
             previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan per agent: that of the full guard; where its margin is too small, the safe plan with the
-            largest margin found. Where already the present state lacks the margin, so does every plan, and
-            this search starts from plans that satisfy or are safe without margin.
+            One plan per agent: that of the full guard, or if its margin is too small, the safe plan with the
+            largest margin that was found. If already the present state has less than the margin, so has every
+            plan; the search then starts from plans that satisfy, or are safe, without margin.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -130,12 +130,12 @@ class RelaxedSearch:
         return found
 
     def _lacking(self, x: Tensor, plan: Tensor) -> Tensor:
-        """Agents whose present state lacks the margin, (agents,)."""
+        """Mask of the agents whose present state has less than the required margin, (agents,)."""
         columns = self.task.system.rollout_columns(x, plan)
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """Plans of the guard without margin for agents that lack it now; unjudged plans for others."""
+        """Plans of the guard without margins for agents `lacking` the margin; unjudged plans for others."""
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]
         if len(rows):
@@ -148,7 +148,7 @@ class RelaxedSearch:
         return found
 
     def _closer(self, found: Candidates, rows: Tensor, x: Tensor, start: Tensor) -> Tensor:
-        """Search from `start`, (rows, T, m), and store safe plans; return the rows without one."""
+        """Search from `start`, (rows, T, m), put safe plans into `found`; return the rows without one."""
         if not len(rows):
             return rows
         climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)

@@ -1,8 +1,8 @@
 """Training methods and planners, one per file, named as in `--method` and `train: {method: …}`.
 
-A file holds an object `METHOD` of a subclass of `Method`; `stlc.registry.METHODS` finds it. Schema, command
-line and tables read the names from there, without torch. Code shared by several methods lies in files whose
-names begin with `_`.
+A file holds an object `METHOD` of a subclass of `Method`; `stlc.registry.METHODS` finds it. The schema of
+system files, the command line and tables of options read the names from there, without loading torch. Code
+shared by several methods lies in files whose names begin with `_`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Method(ABC):
     """A training method or planner.
 
     Attributes:
-        options: the type of its resolved options; a method with numbers of its own derives one whose
-            further fields are int or float, with defaults.
+        options: type of the resolved options; a method with further options derives a type whose added fields
+            are int or float, with defaults.
     """
 
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
@@ -56,7 +56,7 @@ class Method(ABC):
         device: torch.device,  # noqa: ARG002
         ranks: Ranks,  # noqa: ARG002
     ) -> Learner | None:
-        """The initial state of a training; None for a planner, which has nothing to learn."""
+        """The learner before the first training step; None for a planner, which has nothing to learn."""
         return None
 
     @abstractmethod
@@ -64,21 +64,23 @@ class Method(ABC):
         """Load the policy of a run.
 
         Raises:
-            RunError: R101, the run is damaged or has no checkpoint yet; R102, it is of another task.
+            RunError: R101, the run is damaged or has no checkpoint yet; R102, its checkpoint belongs to
+                another task.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Shares and counts on fresh states, over all ranks.
+    """Results of judging and searching on newly drawn states, over all ranks (processes that train together).
 
     Attributes:
-        accuracy: share whose plan satisfies the specification.
-        requirements: share per requirement, in the order of the task's rules.
-        feasible: share for which a satisfying plan is known after the search (None: no search was made).
-        failing: number of states searched.
-        repaired: number of them solved.
-        explored: plans found by exploration, including those from states on their way.
+        accuracy: share of states whose plan satisfies the specification.
+        requirements: share of states whose plan satisfies a requirement, in the order of the task's rules.
+        feasible: share of states for which a satisfying plan is known after the search; None if there was
+            none.
+        failing: number of states that were searched.
+        repaired: number of searched states for which a satisfying plan was found.
+        explored: number of plans found by exploration, including those from states along other plans.
     """
 
     accuracy: float
@@ -90,7 +92,7 @@ class Validation:
 
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
-        """Shares of satisfying plans among those judged."""
+        """Shares of satisfying plans among the judged plans."""
         shares = satisfied(judged.requirements).double().mean(0)
         return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
 
@@ -112,24 +114,24 @@ class Validation:
 class Learner(ABC):
     """State of a training, which the training loop advances, validates and saves step by step.
 
-    A subclass gives the steps, the policy and what a checkpoint holds. The attributes and methods of search
-    and exploration describe work beside the steps, of which there is none by default.
+    A subclass supplies the steps, the policy and the contents of a checkpoint. The attributes and methods for
+    search and exploration describe work that runs concurrently with the steps; by default there is none.
 
     Attributes:
         task: problem of the training.
-        config: its resolved options.
+        config: resolved options of the training.
         steps: planned total number of steps; the loop changes it.
-        device: of torch.
+        device: torch device.
         ranks: processes that train together.
         step: number of completed steps.
         next_validation: step of the next validation.
-        generator: of all random numbers of this rank.
-        margin: the objective's gamma.
-        loss: of the last step; NaN before the first.
-        searches: whether failing states are repaired concurrently with the steps.
-        searching: whether such a search runs now.
+        generator: source of all random numbers of this rank (process).
+        margin: gamma of the objective.
+        loss: loss of the last step; NaN before the first.
+        searches: whether plans of failing states are repaired by a search concurrently with the steps.
+        searching: whether such a search is running.
         solved: whether a search has found a satisfying plan.
-        exhausted: whether exploration with the largest effort has found nothing.
+        exhausted: whether exploration with the largest effort has found no plan.
     """
 
     searches: bool = False
@@ -149,12 +151,12 @@ class Learner(ABC):
 
     @abstractmethod
     def advance(self) -> float:
-        """Make one step and return its loss; NaN and no step if loss or gradient is not finite."""
+        """Make one step and return its loss; NaN, and no change, if loss or gradient is not finite."""
 
     @property
     @abstractmethod
     def policy(self) -> Policy:
-        """The resulting policy, on the CPU."""
+        """The policy learned until now, on the CPU."""
 
     @property
     def rate(self) -> float:
@@ -162,47 +164,47 @@ class Learner(ABC):
         return self.config.lr
 
     def validate(self) -> Validation:
-        """Judge the policy on fresh states."""
+        """Judge the policy's plans from newly drawn states."""
         x0 = self.task.sample(self.config.pool, generator=self.generator)
         self.next_validation = self.step + self.config.every
         return Validation.of(self.policy.plan_judged(x0)[1]).mean(self.ranks)
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption, bit for bit; on the first of several ranks, of all ranks.
+        """Tensors from which training resumes exactly, bit for bit; on the first rank, those of all ranks.
 
-        All ranks have to call this at the same time.
+        All ranks (processes that train together) must call this at the same time.
         """
         return {"generator": self.generator.get_state()}
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars stored with `tensors`."""
+        """Scalars that are stored together with `tensors`."""
         last = {"loss": self.loss} if math.isfinite(self.loss) else {}
         facts = {"step": self.step, "steps": self.steps, "margin": self.margin}
         return last | facts | {"next_look": self.next_validation}
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
         self.loss = float(facts.get("loss", math.nan))
         self.generator.set_state(tensors["generator"].cpu())
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step on any rank, and whether the weights before it give finite plans."""
+        """Cause of a non-finite step on any rank, and whether the weights before it gave finite plans."""
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
         return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Part of the training -> reason why torch is used, or "" where it runs as C."""
+        """Part of the training -> reason why it runs in torch; "" if it runs in C."""
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Search for plans by exploration where that is due; False where `stop` came first."""
+        """Search for plans by exploration if that is due; return False if `stop` ended it."""
         return True
 
     def wait(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Wait for the end of the concurrent search; False where `stop` came first."""
+        """Wait for the end of the concurrent search; return False if `stop` ended the waiting."""
         return True
 
     def close(self) -> None:  # noqa: B027
-        """End the work beside the steps."""
+        """End the work that runs concurrently with the steps."""

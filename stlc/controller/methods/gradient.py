@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class Gradient(NetworkMethod):
-    """Gradient descent on log-sum-exp robustness with tanh switching; one plan, no search, no mirror."""
+    """Gradient descent on log-sum-exp robustness with tanh switching; one plan per state, no search."""
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Options for fresh states, or the fixed training set of `train: {samples: …}`."""
+        """Options of the paper: new states in every step, or a fixed training set, `train: {samples: …}`."""
         found = base_config(task, config, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 

@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 
 class Guided(NetworkMethod):
-    """Gradient descent on exact robustness, supported by local search; best of several plans."""
+    """Gradient descent on exact robustness, supported by local search; the best of several plans is used."""
 
     searches = True
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Options for four plans, and as many hard states per step as fresh ones."""
+        """Options; by default four plans, and in each step as many previously failing states as new ones."""
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Exact operators and a saturating hinge at a feasible margin."""
+        """Objective with exact min and max and a saturating hinge, at a margin that search can reach."""
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance
         )

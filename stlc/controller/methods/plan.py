@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PlanConfig(ResolvedConfig):
-    """Options of a run that plans.
+    """Options of a run that plans instead of training.
 
     Attributes:
         planner: name of the planner.
-        options: its options, as `NAME=VALUE,NAME=VALUE`.
-        seconds: processor time of a plan.
-        evaluations: judged plans of a plan; 0 for no limit.
+        options: options of the planner, as `NAME=VALUE,NAME=VALUE`.
+        seconds: processor time per plan.
+        evaluations: maximum number of plans judged in search of one; 0 for no limit.
     """
 
     planner: str = PLANNERS.default
@@ -34,12 +34,12 @@ class PlanConfig(ResolvedConfig):
 
 
 class Plan(Method):
-    """Receding-horizon planning: `stlc simulate SPEC --method search`."""
+    """Receding-horizon planning without a trained policy: `stlc simulate SPEC --method search`."""
 
     options = PlanConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PlanConfig:
-        """The options of the planner are those of `config.planner`."""
+        """Resolve the options; those of the planner are taken from `config.planner`."""
         found = base_config(task, config, kind=PlanConfig)
         assert isinstance(found, PlanConfig)
         asked = config.planner
@@ -56,7 +56,11 @@ class Plan(Method):
         )
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> PlannerPolicy:  # noqa: ARG002
-        """The planner as a policy. Raises UsageError (U101) where it cannot plan for the task."""
+        """Return the planner as a policy.
+
+        Raises:
+            UsageError: U101, the planner cannot plan for the task.
+        """
         assert isinstance(config, PlanConfig)
         given = dict(each.split("=", 1) for each in config.options.split(",") if each)
         planner = planner_named(config.planner, **given)

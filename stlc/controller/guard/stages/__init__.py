@@ -1,8 +1,8 @@
-"""Stages of guards, one per file; each declares the guards it belongs to and its place in their order.
+"""Stages of guards, one per file; each declares to which guards it belongs and its position in their order.
 
-A guard runs its stages in order. Each proposes plans for the agents that it may still help, and the
-highest-ranked plan (`stlc.controller.guard.candidates.rank`) is kept. A file holds a class `STAGE`; files
-whose names begin with `_` hold none.
+A stage is one method to find a better plan. A guard runs its stages in order; each proposes plans for the
+agents that it may still help, and the highest-ranked plan (`stlc.controller.guard.candidates.rank`) of each
+agent is kept. A file holds a class `STAGE`; files whose names begin with `_` hold shared code.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Setup:
     Attributes:
         task: specification and system.
         policy: continues prefixes.
-        grid: values of the controls, and lengths of prefixes.
-        limits: of a decision.
+        grid: values of the controls in prefixes, and lengths of prefixes.
+        limits: computational limits of a decision.
         guard: name of the guard.
         generator: random numbers for the searches of all stages.
     """
@@ -56,14 +56,14 @@ class Setup:
 
 @dataclass(slots=True)
 class Rejected:
-    """Agents whose plans the monitor has rejected, and the best plans so far.
+    """Agents whose plans the guard has rejected, and the best plans found for them until now.
 
     Attributes:
         x: states, (agents, n) float64.
         plan: the policy's plans, (agents, T, m); finite.
         previous: remainders of the previous plans, (agents, T, m), or None.
-        best: the best plans so far, (agents,).
-        tried: plans judged by the previous stage, by groups of agents, where it keeps them.
+        best: the best plans of the stages that have run, (agents,).
+        tried: plans that the previous stage judged, by groups of agents; empty if it keeps none.
     """
 
     x: Tensor
@@ -75,34 +75,39 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """Judged plans of a group of agents: rows (k,) among the rejected ones, candidates (k, choices)."""
+    """Judged plans of a group of agents.
+
+    Attributes:
+        rows: indices of the agents among the rejected ones, (k,).
+        candidates: the plans with their verdicts, (k, choices).
+    """
 
     rows: Tensor
     candidates: Candidates
 
 
 class GuardStage(ABC):
-    """A stage of a guard: one method to find a better plan.
+    """Stage of a guard: one method to find a better plan.
 
     Attributes:
-        turns: name of a guard -> place of the stage in its order.
+        turns: name of a guard -> position of the stage in the guard's order.
     """
 
     turns: ClassVar[Mapping[str, int]]
 
     @abstractmethod
     def __init__(self, setup: Setup) -> None:
-        """Prepare everything that is independent of the state."""
+        """Prepare everything that does not depend on the agents' states."""
 
     @abstractmethod
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents that the stage may help, given their best plans so far: (agents,) booleans."""
+        """Mask of the agents that the stage may help, given their best plans until now: (agents,)."""
 
     @abstractmethod
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Propose a plan for some of the rejected agents: rows (k,) -> candidates (k,).
+        """Propose a plan for each of the rejected agents with indices `rows`, (k,): candidates (k,).
 
-        Judged plans may be left in `rejected.tried` for the next stage.
+        The stage may store the plans that it judged in `rejected.tried` for the next stage.
         """
 
 

@@ -1,10 +1,10 @@
 """Gradient refinement: gradient ascent on the exact robustness, for a batch of plans per state.
 
 A gradient changes a whole plan at once, and a few steps repair most plans with a small violation. Gradients
-do not lead across an obstacle, so ascent starts from a batch: the given plans, and copies perturbed over a
-stretch of time. If none of these satisfies, the best are perturbed and refined again, together with plans
-that hold each control at an end of its range. A repaired plan is moved back towards the policy's plan as far
-as the target robustness allows.
+do not lead across an obstacle, so ascent starts from a batch: the policy's plan, the previous plan, and
+copies of these that are perturbed over an interval of time. If none of these satisfies, the best are
+perturbed and refined again, together with plans that hold each control at an end of its range. A repaired
+plan is moved back towards the policy's plan as far as the target robustness allows.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ Pull: TypeAlias = Callable[[Numbers], Numbers]
 
 
 class GradientAscent:
-    """Gradient ascent on plans of one task; deterministic in states and plans.
+    """Gradient ascent on plans of one task; the result depends on states and plans alone.
 
     Args:
         task: specification and system.
         generator: random numbers of the perturbations, which are drawn once.
-        enough: target robustness; a state is done once one of its plans has it.
+        enough: target robustness; the search for a state ends once one of its plans has it.
     """
 
     def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
@@ -85,12 +85,12 @@ class GradientAscent:
 
     @torch.no_grad()
     def rise(self, x: Tensor, places: Tensor, until: float = math.inf) -> Tensor:
-        """Refine plans and return the best, best first, (agents, 2, T, m) float64.
+        """Refine plans and return the two best of each agent, the best first, (agents, 2, T, m) float64.
 
         Args:
-            x: (agents, n) float64.
+            x: states, (agents, n) float64.
             places: starting plans, (agents, places, T, m); finite.
-            until: deadline on the clock `perf_counter()`.
+            until: deadline, as a reading of `perf_counter()`.
         """
         if len(x) == 0:
             return places.new_zeros(0, KEPT, *places.shape[2:], dtype=torch.float64)
@@ -115,13 +115,16 @@ class GradientAscent:
         return best
 
     def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Best plans of one round, (agents, KEPT, T, m), and their values, best first."""
+        """The best plans of one round of ascent, (agents, KEPT, T, m), and their values, the best first."""
         plans, value = self._raised(x, plans, rate, until)
         order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
         return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
-        """Plan (agents, T, m) on the way to the repaired one: the first of target robustness."""
+        """Plans (agents, T, m) on the line from the policy's plans `own` to the repaired plans `found`.
+
+        Taken is the one nearest to the policy's plan that has the target robustness.
+        """
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
         each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))
@@ -131,7 +134,7 @@ class GradientAscent:
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Best iterate of every plan (agents, k, T, m) and its value, (agents, k)."""
+        """Ascend from plans (agents, k, T, m); return the best iterate of each and its value, (agents, k)."""
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
         best, value = rows.copy(), np.full(len(rows), -np.inf)
@@ -158,7 +161,11 @@ class GradientAscent:
         return best.reshape(plans.shape), value.reshape(agents, count)
 
     def _worth(self, each: Numbers) -> Numbers:
-        """Robustness of phi, plus `APART` where phi holds; that of phi_safe minus `APART` where it fails."""
+        """Values by which plans are compared, from their robustness per requirement, (rows, R) -> (rows,).
+
+        Robustness of phi plus `APART` if phi holds; robustness of phi if only phi_safe holds; else robustness
+        of phi_safe minus `APART`.
+        """
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
         below = np.where(safe >= -TOLERANCE, rho, safe - APART)
@@ -166,9 +173,10 @@ class GradientAscent:
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        """Scaled robustness per requirement, (rows, R), and its vector-Jacobian product by plans.
+        """Scaled robustness per requirement, (rows, R), and a function for its gradient by the plans.
 
-        NaN counts as -inf. The product is a function of weights (rows, R).
+        NaN counts as -inf. The function maps weights (rows, R) to the gradient of the weighted sum
+        (vector-Jacobian product), (rows, T, m).
         """
         if self._native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
@@ -187,7 +195,7 @@ class GradientAscent:
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
-        """The same in torch."""
+        """Robustness per requirement, (rows, R), and its vector-Jacobian product, as `_judged`, in torch."""
         with torch.enable_grad():
             u = u.requires_grad_()
             columns = self.task.system.rollout_columns(x, u, StraightThrough(SLOPE))
@@ -209,7 +217,7 @@ class GradientAscent:
         return changed.reshape(agents, -1, *shape)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
-        """Perturbations of plans, (count, T, m), the first zero: shifts or noise over stretches of time."""
+        """Random perturbations of plans, (count, T, m): shifts or noise over a time; the first is zero."""
         steps, controls = self.task.horizon, len(self._low)
         begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()
         length = torch.randint(1, steps + 1, (count, 1, controls), generator=generator).numpy()
@@ -232,7 +240,7 @@ class GradientAscent:
 
 
 class GradientRefine(GuardStage):
-    """Gradient ascent from the policy's plan and from the previous plan, within half of the time."""
+    """Gradient ascent from the policy's plan and from the previous plan, within half of the decision time."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 10}
 
@@ -241,11 +249,11 @@ class GradientRefine(GuardStage):
         self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """All agents."""
+        """All agents are helped."""
         return torch.ones_like(best.is_safe)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best refined plan; the two best are left for the next stage."""
+        """The best refined plan of each agent; the two best are left for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
         raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))

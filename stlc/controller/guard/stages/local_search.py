@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LocalSearch(GuardStage):
-    """Local search for phi; for phi_safe alone where that finds nothing safe."""
+    """Local search for a plan that satisfies phi, or if nothing safe is found, phi_safe alone."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 20}
 
@@ -31,11 +31,11 @@ class LocalSearch(GuardStage):
             self._safe = Searcher(safety_task(task), generator, enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents whose plan's robustness is below the target."""
+        """Mask of the agents whose plan has less than the target robustness."""
         return best.rho < self.whole.enough
 
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
-        """The best plan over all starts."""
+        """The best plan that the searches from all starting plans have found."""
         x, found = rejected.x[rows], rejected.best.of(rows)
         every = torch.arange(len(rows), device=rows.device)
         found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))
@@ -50,9 +50,9 @@ class LocalSearch(GuardStage):
 def best_climbed(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """Best plan per agent of local searches from each start: (agents, k, T, m) -> (agents,).
+    """Best plan per agent of local searches from all starting plans: (agents, k, T, m) -> (agents,).
 
-    `task`: judges the plans; that of the searcher if None.
+    `task`: task whose specification judges the plans found; that of `searcher` if None.
     """
     found = climbed_from(searcher, x, starts, tries, task)
     return found.pick(rank(found).argmax(1))
@@ -61,14 +61,20 @@ def best_climbed(
 def climbed_from(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """Results of local search from each start: (agents, k, T, m) -> candidates (agents, k)."""
+    """Results of local searches from each starting plan: (agents, k, T, m) -> candidates (agents, k).
+
+    `task`: task whose specification judges the plans found; that of `searcher` if None.
+    """
     rows = x.repeat_interleave(starts.shape[1], 0)
     plans = searcher.at_once(rows, starts.flatten(0, 1), tries=tries).plans.to(x.device)
     return Candidates.judged(task or searcher.task, x, plans.view(starts.shape), REPAIRED)
 
 
 def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
-    """Starting plans: those tried by the previous stage, else the given ones: (k, starts, T, m)."""
+    """Starting plans for the agents with indices `rows`, (k, starts, T, m).
+
+    They are the plans that the previous stage tried for all agents; else the policy's and the previous plan.
+    """
     if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
         order = rejected.tried[0].rows.argsort()
         return rejected.tried[0].candidates.plans[order][rows]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LongestSafePrefix(GuardStage):
-    """Plan with the longest safe prefix; ties: the most robust, then the latest violation."""
+    """Plan with the longest safe prefix; ties are broken by robustness, then by the latest violation."""
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
 
@@ -29,18 +29,18 @@ class LongestSafePrefix(GuardStage):
         self._shooting = PrefixShooting(setup)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents without a safe plan."""
+        """Mask of the agents without a safe plan."""
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """One plan per agent, chosen among those of prefix shooting."""
+        """One plan per agent, chosen among the plans of prefix shooting."""
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
         return found.of(rows)
 
     def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
-        """Plans of prefix shooting for all rows: stored ones, and the others recomputed."""
+        """Plans of prefix shooting for the agents `rows`: stored ones, others recomputed."""
         missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
         missing[rows] = True
         for tried in rejected.tried:

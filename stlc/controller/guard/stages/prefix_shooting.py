@@ -1,9 +1,10 @@
 """Prefix shooting: sampled prefixes, continued by the policy (the paper, section "MPC-based Deployment").
 
-For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a sample of
-them if that is too many, is applied from the present state, and the policy plans from its end. The first T0
-with a plan that satisfies phi, or else phi_safe, is chosen. One addition to the paper (decision 37): the
-remainder of the previous plan is a candidate too, so that a safe plan is not lost after its first action.
+For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a random
+sample of them if these are too many, is applied from the present state, and the policy plans from its end.
+The first T0 with a plan that satisfies phi, or else phi_safe, is chosen. One addition to the paper (decision
+37): the remainder of the previous plan is a candidate too, so that a safe plan is not lost after its first
+action.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ HANDED_ON = 65_536
 
 
 class PrefixShooting(GuardStage):
-    """Stage: the shortest prefix with a satisfying plan, else the shortest with a safe plan.
+    """Plan with the shortest prefix that allows it to satisfy phi, or else phi_safe.
 
-    Ties are broken by robustness, then by the performance terms of the objective, because robustness is flat
-    where a deadline cannot be met, then by closeness to the policy.
+    Among prefixes of that length the order is by robustness, then by the performance terms of the objective
+    (because robustness does not differ where a deadline cannot be met), then by closeness to the policy's
+    plan.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
@@ -42,11 +44,11 @@ class PrefixShooting(GuardStage):
             self.grid = replace(grid, lengths=few or grid.lengths[:1])
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents without a safe plan."""
+        """Mask of the agents without a safe plan."""
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan of the first T0 that has one; agents without one get an unjudged plan."""
+        """The best plan of the smallest T0 that has a satisfying or safe one; else an unjudged plan."""
         deadline = Deadline() if self.patient else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
         todo = torch.arange(len(rows), device=rows.device)
@@ -71,9 +73,11 @@ class PrefixShooting(GuardStage):
     def candidates(
         self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
     ) -> Iterator[tuple[Tensor, Candidates]]:
-        """Candidates of one T0 for agents `rows[todo]`, group by group: positions (k,) and (k, choices).
+        """Candidate plans of one prefix length T0 for the agents `rows[todo]`, group by group.
 
-        Choice 0 has the prefix of the policy's own plan; the last one is the remainder of the previous plan.
+        Yields:
+            Positions of the group's agents, (k,), and their candidates, (k, choices). Choice 0 has the prefix
+            of the policy's own plan; the last choice is the remainder of the previous plan.
         """
         prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
         for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
@@ -88,9 +92,9 @@ class PrefixShooting(GuardStage):
             yield group, found
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
-        """Judged plans of one T0, in batches of at most `grid.batch` trajectories.
+        """Plans that continue prefixes, with verdicts, in batches of at most `grid.batch` trajectories.
 
-        For a single agent the deadline is checked after each batch.
+        If there is a single agent, the deadline is checked after each batch.
         """
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)

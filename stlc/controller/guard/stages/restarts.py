@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Restarts(GuardStage):
-    """Plans of `feasibility.solve` until the deadline."""
+    """Plans from `feasibility.solve` with random starting plans, until the deadline."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 30}
 
@@ -24,11 +24,11 @@ class Restarts(GuardStage):
         self._safety = safety_task(setup.task) if setup.task.compiled.safety else setup.task
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents without a safe plan."""
+        """Mask of the agents without a safe plan."""
         return ~best.is_safe & self.rescue
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The plan of the search, safe or not."""
+        """The best plan that the search has found for each agent, safe or not."""
         x = rejected.x[rows]
         plans = solve(self._safety, x, stop=lambda: deadline.over).plans
         return Candidates.judged(self.task, x, plans.to(x.device), REPAIRED)

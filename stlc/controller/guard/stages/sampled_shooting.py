@@ -30,9 +30,9 @@ class SampledPrefixes:
 
     Args:
         task: specification and system.
-        policy: continues them.
-        grid: values of the controls, and lengths.
-        most: maximum number per length; a larger grid is sampled.
+        policy: continues the prefixes.
+        grid: values of the controls, and lengths of prefixes.
+        most: maximum number of prefixes per length; if the grid has more, a random sample is used.
     """
 
     def __init__(self, task: Task, policy: Policy, grid: PrefixGrid, most: int) -> None:
@@ -48,7 +48,10 @@ class SampledPrefixes:
         self._most = max(grid.batch // max(len(self.heads), 1), 1)
 
     def finished(self, x: Tensor) -> Candidates:
-        """Judged plans of all prefixes from states (agents, n) float64: (agents, k); by `grid.batch`."""
+        """Plans that continue all prefixes from states (agents, n) float64, with verdicts: (agents, k).
+
+        They are computed in batches of at most `grid.batch` trajectories.
+        """
         return Candidates.concatenated([self._finished(part) for part in torch.split(x, self._most)])
 
     def _finished(self, x: Tensor) -> Candidates:
@@ -70,7 +73,7 @@ class SampledPrefixes:
 
 
 class SampledShooting(GuardStage):
-    """Best of sampled prefixes and of local searches from some of them, for agents with a plan only safe."""
+    """Best plan of sampled prefixes, and of local searches from some of these plans."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 40}
 
@@ -80,12 +83,15 @@ class SampledShooting(GuardStage):
         self._searcher = Searcher(setup.task, setup.generator, enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Agents whose plan does not satisfy phi; after a search for phi_safe, only those with a safe one."""
+        """Mask of the agents whose plan does not satisfy phi.
+
+        After a search for phi_safe alone, only the agents with a safe plan remain.
+        """
         none = len(self.prefixes.heads) == 0
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan; unsafe plans are left unjudged."""
+        """The best plan per agent; an unsafe one is returned unjudged, so that it replaces nothing."""
         found = Candidates.unjudged(rejected.plan[rows])
         if deadline.over:
             return found

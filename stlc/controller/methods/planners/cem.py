@@ -26,16 +26,16 @@ SAME = 1e-5
 
 
 class _Space(Protocol):
-    """What the method samples: vectors that stand for plans."""
+    """Space of the vectors that the method samples; each vector stands for a plan."""
 
     def centre(self, start: Tensor) -> Tensor:
-        """Mean of the first population from initial guesses: (k, T, m) -> (k, d)."""
+        """Mean of the first population, from initial guesses of plans: (k, T, m) -> (k, d)."""
 
     def deviation(self, x0: Tensor) -> Tensor:
         """Standard deviation of the first population: (d,)."""
 
     def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
-        """Plans of sampled vectors: (k, n), (k, p, d) -> (k, p, T, m)."""
+        """Plans that the sampled vectors stand for: states (k, n), vectors (k, p, d) -> (k, p, T, m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +43,14 @@ class Cem:
     """Cross-entropy method: a Gaussian is fitted to the most robust of its samples.
 
     Attributes:
-        population: samples of a round.
-        elites: of which the Gaussian is fitted to this many.
+        population: number of samples per round.
+        elites: number of samples, the most robust ones, to which the Gaussian is fitted.
         deviation: standard deviation of the first population, in half-widths of the control ranges.
         physical: whether `deviation` is in physical units instead.
         floor: least standard deviation, in the units of `deviation`.
-        rounds: after which a start is begun anew, at most.
+        rounds: maximum number of rounds, after which the search from an initial state begins anew.
         over: `plan` samples plans, `policy` the weights of a network with `hidden` ReLU units.
-        hidden: of the network.
+        hidden: number of hidden units of the network.
     """
 
     population: int = 1_000
@@ -63,7 +63,11 @@ class Cem:
     hidden: int = 16
 
     def prepare(self, task: Task) -> Solver:
-        """The space to sample. Raises UsageError (U101) for another `over` than `plan` and `policy`."""
+        """Return the solver, with the space that is sampled.
+
+        Raises:
+            UsageError: U101, `over` is neither `plan` nor `policy`.
+        """
         if self.over not in ("plan", "policy"):
             raise UsageError(
                 Diagnostic("U101", f"`over={self.over}` of planner `cem` is neither `plan` nor `policy`")
@@ -78,7 +82,7 @@ class Cem:
                 self._climb(search, part, space)
 
     def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
-        """Rounds for some starts, until the last of them has converged or is not open."""
+        """Rounds for some initial states until each has converged, reached its target or spent its budget."""
         mean = space.centre(search.start[rows])
         wide = space.deviation(search.states[rows]).expand_as(mean).clone()
         least = wide * self.floor / self.deviation
@@ -124,7 +128,7 @@ class _Plans:
 
 
 class _Policies:
-    """Weights of a network from the observation to the controls, with one hidden layer, as vectors."""
+    """Weights of a network from the observation to the controls, with one hidden layer, as a vector."""
 
     def __init__(self, task: Task, how: Cem) -> None:
         self._task, self._hidden, self._std = task, how.hidden, how.deviation

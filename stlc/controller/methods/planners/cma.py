@@ -47,7 +47,7 @@ class Cma:
                 restarts += 1
 
     def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
-        """One run of the strategy, until it converges or the start is not open."""
+        """One run of CMA-ES for one initial state, until it converges or reaches the target or the budget."""
         system, rows = search.task.system, torch.tensor([row])
         low, high = system.control_low.double(), system.control_high.double()
         middle, half = 0.5 * (low + high), 0.5 * (high - low)

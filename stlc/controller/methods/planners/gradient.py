@@ -1,4 +1,4 @@
-"""`gradient`: gradient steps on the robustness of the plan itself (STL_G of the paper)."""
+"""`gradient`: gradient steps on the robustness of a plan, without a policy (STL_G of the paper)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Gradient:
-    """Adam on latent plans, mapped to the control ranges as the policy's outputs are.
+    """Adam on latent plans, which are mapped to the control ranges like the outputs of a policy network.
 
     Attributes:
         objective: `exact`, by the generated adjoint, or `paper`: smooth robustness with tanh switching.
-        steps: after which a start is begun anew from random latent plans.
-        starts: latent plans of each start; the first is 0, the others are drawn.
-        rate: of Adam.
-        slope: backward slope of conditions for `exact`, per unit.
+        steps: number of gradient steps, after which the search begins anew from random latent plans.
+        starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
+        rate: learning rate of Adam.
+        slope: slope, per unit, that replaces the derivative of jumps and conditions for `exact`.
     """
 
     objective: str = "exact"
@@ -36,7 +36,7 @@ class Gradient:
     slope: float = 2.0
 
     def prepare(self, task: Task) -> Solver:
-        """The objective, without performance terms."""
+        """Return the solver for the objective, which has no performance terms."""
         if self.objective == "paper":
             return partial(self._run, objective=paper_objective(task))
         gamma = task.system.decl.objective.gamma
@@ -50,7 +50,7 @@ class Gradient:
             first = False
 
     def _descend(self, search: PlanSearch, rows: Tensor, objective: Objective, *, first: bool) -> None:
-        """Gradient steps for some starts, from random latent plans; the `first` time one of them is 0."""
+        """Gradient steps for some initial states, from random latent plans; if `first`, one of these is 0."""
         task, controls = search.task, search.task.system.decl.controls
         shape = (len(rows), self.starts, task.system.horizon, raw_width(controls))
         raw = torch.randn(shape, generator=search.generator)

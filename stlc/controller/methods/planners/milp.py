@@ -1,6 +1,6 @@
 """`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018); extra `stlc[plan]`.
 
-For piecewise linear systems, after the big-M encodings of Karaman et al. (2008) and Raman et al. (2014). The
+For piecewise linear systems, with the big-M encodings of Karaman et al. (2008) and Raman et al. (2014). The
 only planner that can prove that a start is infeasible.
 """
 
@@ -32,21 +32,23 @@ MOST_RHO = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Milp:
-    """One model per start; a model of all satisfying plans without a solution proves a start infeasible.
+    """Mixed-integer linear program for each initial state, solved by HiGHS.
+
+    If the program whose solutions include all satisfying plans has no solution, the state is infeasible.
 
     Attributes:
         gap: relative gap at which the maximisation of robustness ends.
-        prove: whether to prove starts without a plan infeasible, by a second model.
+        prove: whether to prove states without a plan infeasible, by a second program.
     """
 
     gap: float = 1e-3
     prove: bool = True
 
     def prepare(self, task: Task) -> Solver:
-        """Encode one start, to learn whether that is possible.
+        """Return the solver, after encoding one initial state to find out whether that is possible.
 
         Raises:
-            UsageError: U101, an expression has no mixed-integer linear form; the finding shows it.
+            UsageError: U101, an expression has no mixed-integer linear form; the message shows it.
             MissingError: R301, HiGHS is not installed.
         """
         try:
@@ -67,7 +69,7 @@ class Milp:
                 return
 
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
-        """Plan from one start, or prove that there is no plan."""
+        """Find a plan for the initial state with index `row`, or prove that there is none."""
         task, state, target = search.task, search.states[row], search.budget.target
         found, plan = self._solved(task, state, target, search.budget.seconds, highs, tight=True)
         search.evaluations[row] += 1
@@ -81,7 +83,7 @@ class Milp:
     def _solved(
         self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Whether a model has a solution, and its plan, (T, m)."""
+        """Solve the program for one state: whether it has a solution, and the plan, (T, m), or None."""
         encoding, cost = _encoded(task, state, target, tight=tight)
         if not encoding.model.feasible:
             return IMPOSSIBLE, None
@@ -111,7 +113,9 @@ def _at(form: Affine, values: Any) -> float:
 
 
 def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[Encoding, Affine]:
-    """The model of the plans from a state with a robustness of at least `target`, and the cost to minimise.
+    """Program whose solutions are plans from a state with a robustness of at least `target`, and its cost.
+
+    If `target` is inf, robustness is maximised. `tight`: see `Encoding`.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.
@@ -145,7 +149,7 @@ def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[
 
 
 def _program(arrays: Arrays, highs: Any) -> Any:
-    """The model in the form of the solver."""
+    """The program, given as arrays, in the form that HiGHS reads."""
     program, inf = highs.HighsLp(), highs.kHighsInf
     program.num_col_, program.num_row_ = len(arrays.lower), len(arrays.row_lower)
     program.col_cost_, program.col_lower_, program.col_upper_ = arrays.cost, arrays.lower, arrays.upper

@@ -1,4 +1,4 @@
-"""`policy`: the plans of a trained policy, a run's."""
+"""`policy`: the plans of the trained policy of a run."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PolicyPlans:
-    """The plan that a trained policy selects; one evaluation per start, whatever the budget.
+    """The plan that a trained policy selects; one evaluation per initial state, whatever the budget.
 
     Attributes:
-        run: folder, number, words or specification of a run, or `latest`.
+        run: which run: its folder, number, name or specification, or `latest`.
         runs: folder of all runs.
     """
 
@@ -28,7 +28,11 @@ class PolicyPlans:
     runs: str = "runs"
 
     def prepare(self, task: Task) -> Solver:
-        """Load the policy. Raises RunError: R101, the run is damaged; U101, it is of another system."""
+        """Load the policy and return the solver.
+
+        Raises:
+            RunError: R101, the run is damaged; U101, it was trained for another system.
+        """
         policy = Run.open(self.run, root=Path(self.runs)).policy
         return partial(self._run, policy=policy.for_task(task))
 

@@ -19,15 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Local search: the best of a batch of changed plans is kept, generation by generation.
+    """Local search: in every generation the best of a batch of changed plans is kept.
 
-    Changes are noise over a stretch of time, a shift of a stretch, a stretch held at one level, and parts of
-    plans that solved other starts. Each round restarts from such plans, alternating with the best so far.
+    A change is noise over an interval of time, a shift of an interval, an interval held at one level, or a
+    part of a plan that solved another initial state. Each round restarts alternately from such plans and from
+    the best plan until then.
 
     Attributes:
-        tries: plans of a start in the first round; each later round has twice as many, up to `longest`.
-        longest: plans of a start in a round at most.
-        library: plans of solved starts that are kept for the other starts.
+        tries: number of plans tried per initial state in the first round; each later round tries twice as
+            many, up to `longest`.
+        longest: maximum number of plans tried per initial state and round.
+        library: number of plans of solved initial states that are kept for the other ones.
     """
 
     tries: int = 2_000
@@ -35,7 +37,7 @@ class Search:
     library: int = 2_048
 
     def prepare(self, task: Task) -> Solver:
-        """The library of piecewise constant plans, common to all starts."""
+        """Return the solver, with the library of piecewise constant plans that all initial states share."""
         return partial(self._run, library=extremes(task, torch.Generator().manual_seed(0)).double())
 
     def _run(self, search: PlanSearch, library: torch.Tensor) -> None:
