@@ -379,7 +379,7 @@ def deepened(task: Task, states: States) -> Value:
 
 
 def falls(task: Task, start: States, plans: Value) -> Value:
-    """Robustness of the safety requirements on every prefix of each plan: (T + 1, batch).
+    """Robustness of the safety requirements on every prefix (first steps) of each plan: (T + 1, batch).
 
     It equals `stlc.controller.guard.safe_prefix.prefix_robustness`. Every prefix is treated as a separate
     trajectory: values are (T + 1, prefixes * batch).
@@ -526,7 +526,9 @@ def judging(task: Task) -> dict[str, Value]:
 
 
 def falling(task: Task) -> dict[str, Value]:
-    """Graph from `state` and `plan` to `falls` (batch, T + 1), the safety robustness on every prefix.
+    """Graph from `state` and `plan` to `falls` (batch, T + 1).
+
+    `falls` is the robustness of the safety requirements on every prefix (first steps) of the plan.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.

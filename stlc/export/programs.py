@@ -1,8 +1,8 @@
 """Torch modules of a controller and of the paper's guard, for export with any number of agents.
 
-`stlc.controller.guard.shooting` tries a longer prefix length T0 only if no plan was found with a shorter one.
-An exported program has no such branches: it tries every T0, costs as much as the longest prefixes do, and
-gives the same plans.
+The guard takes the first T0 steps of a plan from a grid. `stlc.controller.guard.shooting` tries a longer T0
+only if no plan was found with a shorter one. An exported program has no such branches: it tries every T0,
+costs as much as the longest one does, and gives the same plans.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ _NOTHING: tuple[Tensor, ...] = ()
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans with one prefix length T0, and their verdicts, (states, choices, …) each.
+    """Plans whose first T0 steps are a prefix from a grid, and their verdicts, (states, choices, …) each.
 
     `falls`, the safety robustness on every prefix, is computed for the last T0 only.
     """
@@ -117,8 +117,9 @@ class Guarding(nn.Module):
     """Module from states (B, n) and the policy's plans (B, T, m) to the plans of the paper's guard; float64.
 
     The outputs are plan (B, T, m), rho and safe (B,), and requirements (B, R); as int64, source (1: the plan
-    satisfies the specification or the safety requirements, 2: it has the longest safe prefix) and t0 (B,),
-    the length of its prefix, as in `stlc.controller.guard.candidates.Candidates`.
+    satisfies the specification or the safety requirements, 2: it keeps the safety requirements longest) and
+    t0 (B,), the number of first steps taken from the grid, as in
+    `stlc.controller.guard.candidates.Candidates`.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
@@ -153,7 +154,11 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans with one prefix length, and verdicts; the first plan begins as the policy's own plan."""
+        """All plans for one prefix length T0, with verdicts.
+
+        The first T0 steps are a prefix from the grid (in the first plan: those of the policy's own plan), the
+        others come from the policy.
+        """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
         pieces = [self._finished(x, some, falls=falls) for some in torch.split(heads, size, 1)]
@@ -178,9 +183,9 @@ class Guarding(nn.Module):
 
 
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """Index of the plan with the longest safe prefix.
+    """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
 
-    Among equal ones, that of highest robustness, then with the latest violation.
+    Among equal plans the one of highest robustness is taken, then the one with the latest violation.
     """
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)

@@ -129,7 +129,7 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Yield records whose batch holds the samples around several instants, and the number of instants."""
+    """Yield pieces of the trace around several instants as the batch of a record, and their number."""
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]

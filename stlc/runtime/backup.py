@@ -18,7 +18,10 @@ POLICY, BACKUP, SAFEST = range(3)
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Plan found for one state: `source` is the rule that chose it, `t0` the length of its prefix."""
+    """Plan found for one state.
+
+    `source` is the rule that chose it; `t0` is the number of its first steps taken from a grid of controls.
+    """
 
     judged: JudgedPlans
     source: int
@@ -28,8 +31,9 @@ class Found:
 def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
     """Search a plan for a state in which the policy's plan violates the specification.
 
-    The prefix length T0 grows until a plan satisfies the specification or at least its safety requirements;
-    if none does, the plan with the longest safe prefix is returned.
+    The first T0 steps of a plan are taken from a grid. T0 grows until a plan satisfies the specification or
+    at least its safety requirements; if none does, the plan that keeps the safety requirements longest is
+    returned.
 
     Args:
         graphs: graphs of the controller.
@@ -58,7 +62,11 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 
 
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
-    """All plans with one prefix length, and verdicts; the first plan begins as the policy's own plan."""
+    """All plans for one prefix length T0, with verdicts.
+
+    The first T0 steps are a prefix from the grid (in the first plan: those of the policy's own plan), the
+    others come from the policy.
+    """
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))
     parts = []
@@ -75,9 +83,9 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
 
 
 def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
-    """Index of the plan with the longest safe prefix.
+    """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
 
-    Among equal ones, that of highest robustness, then with the latest violation.
+    Among equal plans the one of highest robustness is taken, then the one with the latest violation.
     """
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(

@@ -34,7 +34,8 @@ class ControlDecision:
         safe: robustness of the safety requirements alone.
         robustness: robustness of each requirement, by name.
         source: the rule by which the plan was first chosen.
-        t0: length of the prefix that the backup policy chose; 0 for the policy's own plan.
+        t0: number of first steps of the plan that the backup policy took from a grid; 0 for the policy's own
+            plan.
         policy_rho: robustness of the policy's plan; -inf if it is not a number.
     """
 

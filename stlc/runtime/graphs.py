@@ -63,7 +63,7 @@ class Graphs:
         self._decide, self._follow = self._session(DECIDE), self._session(FOLLOW)
 
     def prepare(self) -> None:
-        """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
+        """Load the graphs of the backup policy now, so that its first decision does not wait for this."""
         _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
@@ -82,7 +82,10 @@ class Graphs:
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
-        """Return the robustness of the safety requirements on every prefix, (rows, T + 1); +inf if none."""
+        """Return the safety robustness on every prefix (first steps) of the plans, (rows, T + 1), or +inf.
+
+        It is +inf if there are no safety requirements.
+        """
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)
         return _run(self._fall, {"state": x, "plan": plans})["falls"]

@@ -1,4 +1,4 @@
-"""Prefixes of controls for the backup policy: all of a grid, or a sample if these are too many.
+"""Prefixes (first controls of a plan) for the backup policy: all of a grid, or a sample of too many.
 
 Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. A
 "lattice" is Richtmyer's sequence of low discrepancy: entry d of point k is k sqrt(p_d) mod 1 with the d-th
@@ -27,7 +27,7 @@ _WORD = 1 << 64
 
 @dataclass(frozen=True, slots=True)
 class PrefixGrid:
-    """Grid of control prefixes.
+    """Grid of prefixes: sequences of the first T0 controls of a plan, each control from a set of values.
 
     Attributes:
         values: values of each control.

@@ -125,9 +125,10 @@ def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
 
 
 def along_roots(plan: Plan, form: str) -> list[str]:
-    """Return C statements of the form `form` for every requirement, filled with its index and robustness.
+    """Return the C statements for all requirements, made from the template `form`.
 
-    `{i}` stands for the index, `{value}` for the C expression of the robustness.
+    In `form`, `{i}` stands for the index of a requirement and `{value}` for the C expression of its
+    robustness.
     """
     lines = []
     for first, root, rows in _side_by_side(plan):

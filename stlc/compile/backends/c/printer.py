@@ -558,7 +558,7 @@ class _TableLoop(_Repeated):
         return [*self._head(), *self.printer.forward(self.loop.steps), *gathered, "}}"]
 
     def backward(self) -> list[str]:
-        """For each row: recompute its value, then propagate where the row is the extremum."""
+        """For each row: recompute its value, then propagate the gradient where the row is the extremum."""
         if self.node.pick is None:
             own, body = self.out[self.loop.index], self.root[0]
             seeds = f"LANE {{ g{body} += g{own}; matters[j] += fabs(g{own}); }}"

@@ -281,13 +281,13 @@ def _conditions(
 
 
 def _names(num: ir.Num | ir.Formula) -> set[str]:
-    """Names of the signals that an expression reads, other than at the first sample only."""
+    """Names of the signals that an expression reads, except those read at the first sample only."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.Signal | ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf != ir.at_first(ir.Signal(leaf.name))}
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals whose value at the first sample an expression reads at every instant."""
+    """Names of the signals that an expression reads at the first sample, whatever the instant."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 
