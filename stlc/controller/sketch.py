@@ -1,6 +1,6 @@
 """Drawing tools of worlds: colours by the source of a decision, past paths, plans, violations.
 
-Only NumPy is needed here; axes are those of matplotlib that `World.draw` is given.
+They need only NumPy; `axes` are the matplotlib axes that `World.draw` receives.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FADED = 0.75
 
 
 def deciders(scene: Scene, index: int, agents: int) -> NDArray[np.int64]:
-    """Decision sources at frame `index`, (agents,); the policy where none was recorded."""
+    """Source of each agent's decision at frame `index`, (agents,); the policy if none was recorded."""
     if "decision" not in scene:
         return np.zeros(agents, dtype=np.int64)
     return np.asarray(scene["decision"][index], dtype=np.int64)
@@ -43,7 +43,7 @@ def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, fr
     Args:
         axes: to draw on.
         paths: picture coordinates of agents, (frames, agents, 2); NaN breaks a path.
-        scene: for its `decision`.
+        scene: recorded snapshots; `decision` is read.
         index: the present frame.
         frames: number of past frames.
     """
@@ -69,9 +69,10 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
 
     Args:
         axes: to draw on.
-        scene: for its `rejected` and `taken`, (frames, agents, k, 2 or 3), where they were recorded.
+        scene: recorded snapshots; `rejected` and `taken`, (frames, agents, k, 2 or 3), are read if present.
         index: the present frame.
-        placed: map from world (agents, k, 2 or 3) to picture coordinates (agents, k, 2); NaN breaks a line.
+        placed: function from world coordinates (agents, k, 2 or 3) to picture coordinates (agents, k, 2); NaN
+            breaks a line.
     """
     if "rejected" not in scene:
         return
@@ -86,7 +87,7 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
 
 
 def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int) -> None:
-    """Draw a ring and the number on each agent in violation, at places (agents, 2)."""
+    """Draw a ring around each agent that violates a requirement, and its number, at `places` (agents, 2)."""
     if "violated" not in scene:
         return
     for agent in np.flatnonzero(scene["violated"][index]):
@@ -97,7 +98,7 @@ def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int)
 
 
 def scale_bar(axes: Any, left: float, height: float, length: float, unit: str = "m") -> None:
-    """Draw a scale bar of that length, in picture units, from (left, height), with its length above."""
+    """Draw a scale bar from (left, height) with the given length, in picture units, and its label above."""
     ends = (left, left, left, left + length, left + length, left + length)
     axes.plot(ends, height + 0.09 * length * np.array([-1, 1, 0, 0, 1, -1]), color=NOTE, lw=1.2, zorder=5)
     words = {"ha": "center", "va": "bottom", "size": 7.5, "color": NOTE}
@@ -110,7 +111,7 @@ NUMBERED = 8
 
 
 def numbers(axes: Any, places: NDArray[np.float64]) -> None:
-    """Label agents at (agents, 2) with their numbers, where there are few."""
+    """Label agents at `places`, (agents, 2), with their numbers, if there are only few."""
     if len(places) <= NUMBERED:
         for agent, (x, y) in enumerate(places):
             words = {"ha": "center", "va": "center", "size": 6.5, "weight": "bold", "color": "white"}
@@ -139,5 +140,5 @@ def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) ->
 def pieces(
     axes: Any, places: NDArray[np.float64], piece: NDArray[np.float64], color: str, width: float
 ) -> None:
-    """Draw one short line `piece` (2, 2) at many places (k, 2); kept for the worlds in older run folders."""
+    """Draw the short line `piece` (2, 2) at many places (k, 2); needed by worlds in older run folders."""
     segments(axes, places[:, None] + piece, color, width)

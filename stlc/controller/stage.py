@@ -1,4 +1,4 @@
-"""Three-dimensional scenes: robots as bodies with their links, and balls for goals and obstacles."""
+"""Three-dimensional scenes for PyBullet: robots with their links, and balls for goals and obstacles."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class Ball:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Robots of one kind, each with the balls around it.
+    """Robots of one kind for a three-dimensional picture, each with the balls around it.
 
     Attributes:
-        urdf: the description of the robot.
-        joints: angles of the movable joints in file order, radians, (frames, agents, joints).
+        urdf: robot description.
+        joints: angles of the movable joints in file order, in radians, (frames, agents, joints).
         balls: goals and obstacles.
-        reach: radius of the visible space around the base, metres.
-        meshes: link -> mesh file of PyBullet, for a description without meshes.
+        reach: radius of the visible space around the base, in metres.
+        meshes: link -> mesh file of PyBullet, for a description that contains no meshes.
     """
 
     urdf: Path
@@ -49,8 +49,8 @@ class Stage:
 
 @runtime_checkable
 class Staged(Protocol):
-    """World whose agents are robots with a description (URDF)."""
+    """World whose agents are robots with a description (URDF), which can be shown in three dimensions."""
 
     @staticmethod
     def stage(scene: Scene) -> Stage:
-        """The robots of stacked snapshots, (frames, …)."""
+        """The robots to show, from snapshots that are stacked over time, (frames, …)."""

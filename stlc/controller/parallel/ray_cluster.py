@@ -75,7 +75,7 @@ class _Sent:
 
 
 def _connected(address: str) -> Any:
-    """The module `ray`, connected."""
+    """Connect to the cluster at `address` and return the module `ray`."""
     os.environ.update({key: value for key, value in _QUIET.items() if key not in os.environ})
     try:
         ray = import_module("ray")
@@ -110,7 +110,7 @@ def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
 
 
 def _call_back(ray: Any, going: dict[Any, _Sent]) -> None:
-    """Ask every job to save and stop, and fetch what it saved."""
+    """Ask all jobs that are still running to save and stop, and store the runs that they saved."""
     for each, sent in going.items():
         sent.bundle.close()
         with suppress(Exception):

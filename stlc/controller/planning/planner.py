@@ -1,7 +1,7 @@
-"""Planners: a plan for each given initial state of a task, the best so far at any time.
+"""Planners: the best plan found for each given initial state of a task.
 
-A planner proposes plans; `PlanSearch` judges them exactly in float64, keeps the best of each start, and
-measures time and evaluations against the budget. A planner is one file in
+A planner proposes plans; `PlanSearch` judges them exactly in float64, keeps the best plan of each initial
+state, and measures time and evaluations against the budget. A planner is one file in
 `stlc.controller.methods.planners`.
 """
 
@@ -35,13 +35,14 @@ SECONDS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class PlanBudget:
-    """Limits of a search for plans; all but `stop` hold for each start by itself.
+    """Limits of a search for plans; all but `stop` apply to each initial state by itself.
 
     Attributes:
-        seconds: processor time, in seconds; a batch shares its time evenly among the starts in it.
-        evaluations: judged plans; None for no limit.
-        target: robustness at which the search of a start ends; inf to maximise until the budget is spent.
-        stop: ends the whole search early; the best plans so far remain.
+        seconds: processor time in seconds; the time of a batch is shared evenly among its initial states.
+        evaluations: number of plans that are judged; None for no limit.
+        target: robustness at which the search for an initial state ends; inf to maximise it until the budget
+            is spent.
+        stop: condition that ends the whole search early; the best plans until then are returned.
     """
 
     seconds: float = SECONDS
@@ -52,15 +53,15 @@ class PlanBudget:
 
 @dataclass(frozen=True, slots=True)
 class PlanResult:
-    """Plans from given states, judged exactly in float64.
+    """Plans from given initial states, judged exactly in float64.
 
     Attributes:
         states: initial states, (B, n).
-        plans: the best plan of each, physical units, (B, T, m).
-        rho: its robustness, (B,); -inf where no plan was found whose states stay finite.
-        infeasible: True where the planner proved that no plan satisfies the specification, (B,).
-        seconds: processor time of each start, (B,).
-        evaluations: judged plans of each start, (B,) int64.
+        plans: the best plan found for each state, in physical units, (B, T, m).
+        rho: robustness of that plan, (B,); -inf if no plan was found for which the states stay finite.
+        infeasible: True if the planner proved that no plan satisfies the specification, (B,).
+        seconds: processor time spent on each state, (B,).
+        evaluations: number of plans judged for each state, (B,) int64.
     """
 
     states: Tensor
@@ -72,25 +73,25 @@ class PlanResult:
 
     @property
     def satisfied(self) -> Tensor:
-        """Mask of the starts whose plan satisfies the specification, (B,)."""
+        """Mask of the initial states whose plan satisfies the specification, (B,)."""
         return self.rho >= -TOLERANCE
 
 
 class PlanSearch:
-    """The state of a search for plans: the best plan of each start, and what it cost.
+    """Search for plans in progress: the best plan of each initial state, and what was spent on it.
 
     Attributes:
         task: specification and system.
         states: initial states, (B, n) float64.
-        budget: limits.
+        budget: limits of the search.
         generator: random numbers of the planner.
-        start: initial guess, (B, T, m); the middle of every control if none was given.
-        plans: the best plans so far, (B, T, m).
-        rho: their robustness, (B,); -inf before the first plan.
-        infeasible: starts from which no plan satisfies the specification, proved, (B,).
-        ended: starts for which the planner has nothing more to try, (B,).
-        seconds: processor time so far, (B,).
-        evaluations: judged plans so far, (B,) int64.
+        start: initial guesses of plans, (B, T, m); the middle of every control range if none were given.
+        plans: the best plans found, (B, T, m).
+        rho: robustness of these plans, (B,); -inf before the first plan.
+        infeasible: initial states from which, as was proved, no plan satisfies the specification, (B,).
+        ended: initial states for which the planner has nothing more to try, (B,).
+        seconds: processor time spent, (B,).
+        evaluations: number of plans judged, (B,) int64.
     """
 
     def __init__(
@@ -118,11 +119,11 @@ class PlanSearch:
 
     @property
     def result(self) -> PlanResult:
-        """The best plans so far."""
+        """The best plans found until now."""
         return PlanResult(self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
 
     def open(self) -> Tensor:
-        """Indices of the starts to go on with, (k,): below the target, within the budget, not ended."""
+        """Indices of the states to continue with, (k,): below the target, within the budget, not ended."""
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
         target = min(self.budget.target - TOLERANCE, torch.inf)
@@ -132,7 +133,7 @@ class PlanSearch:
         return going.nonzero()[:, 0]
 
     def affordable(self, rows: Tensor, most: int) -> int:
-        """Evaluations per start that the budget of all `rows` leaves, at most `most`, at least 1."""
+        """Number of plans per initial state in `rows` that the budgets still allow, from 1 to `most`."""
         left = float(most)
         if self.budget.evaluations is not None:
             left = min(left, self.budget.evaluations - int(self.evaluations[rows].max()))
@@ -142,12 +143,14 @@ class PlanSearch:
         return max(1, int(left))
 
     def offer(self, rows: Tensor, plans: Tensor, *, evaluations: int | None = None) -> Tensor:
-        """Judge plans and keep those that are better than the best so far.
+        """Judge plans and keep those that are better than the best plans before.
 
         Args:
-            rows: indices of the starts, (k,).
-            plans: physical units, (k, T, m), or several of each start, (k, p, T, m); clipped to the bounds.
-            evaluations: to count for each start, if the planner judged others; by default those judged here.
+            rows: indices of the initial states, (k,).
+            plans: plans in physical units, (k, T, m), or p plans per state, (k, p, T, m); clipped to the
+                control bounds.
+            evaluations: number of evaluations to count per state, if the planner has judged other plans
+                itself; by default the number of plans judged here.
 
         Returns:
             Robustness of the plans, (k,) or (k, p).
@@ -167,7 +170,7 @@ class PlanSearch:
 
     @contextmanager
     def charged(self, rows: Tensor) -> Iterator[None]:
-        """Charge the processor time of the block to the starts `rows`, (k,), evenly, and report progress."""
+        """Charge the block's processor time evenly to the states `rows`, (k,), and report progress."""
         before = process_time()
         try:
             yield
@@ -185,23 +188,23 @@ class Planner(Protocol):
     """A planner: a dataclass whose fields are its options."""
 
     def prepare(self, task: Task) -> Solver:
-        """Prepare the planner for a task, once for all starts.
+        """Return a function that searches for plans, prepared once for all initial states of a task.
 
         Raises:
-            UsageError: U101, the planner cannot plan for this task; the finding says why.
+            UsageError: U101, the planner cannot plan for this task; the message says why.
             MissingError: R301, a package is missing.
         """
 
 
 def planner_named(name: str, **options: Any) -> Planner:
-    """The planner `name` with the given options.
+    """Return the planner `name` with the given options.
 
     Args:
-        name: of a file in `stlc.controller.methods.planners`.
+        name: name of a file in `stlc.controller.methods.planners`.
         options: fields of the planner; values may be texts, as on a command line.
 
     Raises:
-        UsageError: U101, there is no such planner or option, or the value does not fit.
+        UsageError: U101, there is no such planner or option, or a value has the wrong type.
     """
     kind = PLANNERS.get(name)
     known = {each.name: each for each in fields(kind)}
@@ -218,7 +221,7 @@ def planner_named(name: str, **options: Any) -> Planner:
 
 
 def _value(name: str, key: str, value: object, kind: type) -> Any:
-    """An option's value, converted from text."""
+    """Value of an option, converted from text to its type `kind`."""
     if not isinstance(value, str) or kind is str:
         return value
     try:
@@ -274,7 +277,7 @@ def plan(
 
 
 class PlannerPolicy(Policy):
-    """A planner as a policy: it plans anew from each state, within its budget."""
+    """Policy that calls a planner for each state, within the planner's budget."""
 
     def __init__(self, task: Task, planner: Planner, budget: PlanBudget, *, seed: int = 0) -> None:
         super().__init__(task)
@@ -289,7 +292,7 @@ class PlannerPolicy(Policy):
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a short local search, whatever the planner: (B, n) -> (B, T, m)."""
+        """Plans by a short local search, whichever the planner is: (B, n) -> (B, T, m)."""
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
-    """The predicted trajectories of plans, one trace per start.
+    """Predicted trajectories of plans as a trace file's content, one trace per initial state.
 
-    Extras: `action.NAME`, (traces, steps), for every control, in actuator units; (traces,): `plan_rho`, and
-    `infeasible`, 1 where the planner proved that there is no satisfying plan.
+    Extras of shape (traces, steps): `action.NAME` for every control, in actuator units. Extras of shape
+    (traces,): `plan_rho`, the plan's robustness; `infeasible`, 1 if the planner proved that no plan
+    satisfies.
     """
     states = task.rollout(result.states, result.plans).numpy()
     commanded = task.system.commanded(

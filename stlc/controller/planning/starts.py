@@ -1,4 +1,4 @@
-"""Initial states of plans: drawn at random, written as `x=1, v=2 m/s`, or the first samples of a trace."""
+"""Initial states for planning: random, written as `x=1, v=2 m/s`, or the first samples of traces."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ RANDOM = "random"
 
 
 def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
-    """Initial states, (B, n) float64.
+    """Initial states for planning, (B, n) float64.
 
     Args:
         task: specification and system.
-        text: `random`; assignments such as `x=1, v=2 m/s`, other columns as in a random start; or the path of
-            a trace, of whose traces each first sample is a start.
-        count: number of starts; of a trace, at most this many.
-        seed: of random columns.
+        text: `random`; or assignments such as `x=1, v=2 m/s`, where states that are not assigned are random;
+            or the path of a trace file, in which the first sample of each trace is an initial state.
+        count: number of initial states; for a trace file, the maximum number.
+        seed: seed of random states.
 
     Raises:
-        UsageError: U101, the text is neither; U102, there is no such file.
-        TraceError: the file cannot be read, or lacks a column.
+        UsageError: U101, the text is none of these; U102, there is no such file.
+        TraceError: the file cannot be read, or lacks a state.
     """
     if text == RANDOM:
         return task.sample(count or 1, seed=seed, dtype=torch.float64)
@@ -45,7 +45,7 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
 
 def _assignment(task: Task, part: str) -> tuple[str, float]:
-    """Column and value in SI units of `v = 2 m/s`."""
+    """Name of a state and its value in SI units, from a text such as `v = 2 m/s`."""
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
         near = closest(name, task.system.names)
@@ -66,7 +66,7 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
 
 
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
-    """First samples of the traces in a file; timers start as at random starts."""
+    """First samples of the traces in a file; timers have the values of random initial states."""
     if not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))

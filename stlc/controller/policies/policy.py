@@ -1,7 +1,8 @@
 """Policies from states to plans: a set of candidate plans per state, of which exact verdicts select one.
 
-A continuous function cannot jump from left to right of an obstacle; a set of several can, and judging a few
-plans exactly costs well under a millisecond. Planners and actors of one action a step propose a single plan.
+A continuous function cannot jump from a path left of an obstacle to one right of it; a set of several plans
+can, and judging a few plans exactly costs well under a millisecond. Planners, and actors that give one action
+per step, propose a single plan.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Policy(ABC):
         return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans from the predicted ends of many prefixes: as `plan`, at less effort if planning is costly."""
+        """Plans from the predicted ends of many prefixes; like `plan`, but cheaper if planning is slow."""
         return self.plan(x0)
 
     def __call__(self, x0: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ class Policy(ABC):
 
     @torch.no_grad()
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan, as `plan` returns it, and its verdicts over (B,)."""
+        """The selected plan, as `plan` returns it, and its verdicts, one row per state."""
         return self._best(x0, self.candidates(x0).to(x0.dtype))
 
     def _best(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, PlanVerdicts]:
@@ -107,12 +108,12 @@ class ModelRollout(Policy):
 class PlanNetwork(nn.Module):
     """MLP from the observation to `plans` open-loop plans over the horizon.
 
-    Where the system declares a mirror symmetry, states of the other side are mirrored, and so are their
-    plans.
+    If the system declares a mirror symmetry, states on one side of it are mirrored before the network is
+    evaluated, and their plans are mirrored back.
 
     Attributes:
         plans: number of plans.
-        mirror: the system's symmetry; None where it has none, or where the method does not use it.
+        mirror: the system's symmetry; None if it has none or the method does not use it.
         centre: mean of the observations over initial states, (k,).
         spread: their standard deviation, (k,).
     """
@@ -136,9 +137,10 @@ class PlanNetwork(nn.Module):
         self.register_buffer("spread", torch.ones(widths[0]))
 
     def normalise(self, x0: Tensor) -> None:
-        """Set the centre and the spread of the inputs from a sample of states, (n, dim).
+        """Set the mean and the deviation of the inputs from a sample of states, (n, dim).
 
-        For timers they come from their ranges: early in training missions end early.
+        For timers they are computed from the timers' ranges, because early in training missions end soon, so
+        that the sample does not contain late times.
         """
         observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)
@@ -160,7 +162,10 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """States mirrored onto one side, and a mask of the mirrored, (B,); unchanged without a mirror."""
+        """States mirrored onto one side of the symmetry, and the mask of the mirrored ones, (B,).
+
+        Without a symmetry the states are unchanged, and the mask is None.
+        """
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 
 

@@ -1,8 +1,8 @@
-"""Episodes of a task on its model, many side by side: the environment of learners of one action a step.
+"""Episodes of a task on its model, in one batch: the environment of learners that choose an action per step.
 
-An episode begins at a random initial state and has as many steps as a plan. Rewards are those that the paper
-compares: the declared one of every step (RL_R), the robustness of an episode (RL_S), or whether it satisfies
-the specification (RL_A), at its end.
+An episode begins at a random initial state and has as many steps as a plan. There are the three rewards that
+the paper compares: the one that the system declares for every step (RL_R), the robustness of the episode at
+its end (RL_S), and at its end whether it satisfies the specification (RL_A).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MOST = 10.0
 
 
 def require_reward(task: Task, reward: str) -> None:
-    """Raise UsageError (U101) where there is no such reward, or the system declares none for `task`."""
+    """Raise UsageError (U101) if no reward has that name, or it is `task` and the system declares none."""
     if reward not in REWARDS:
         raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(REWARDS)}")
     if reward == "task":
@@ -39,7 +39,7 @@ def require_reward(task: Task, reward: str) -> None:
 
 
 def reward_at_end(reward: Reward, rho: Tensor) -> Tensor:
-    """Reward of episodes at their end, by their robustness: (N,) -> (N,); 0 for `task`."""
+    """Reward of episodes at their end, computed from their robustness: (N,) -> (N,); 0 for reward `task`."""
     match reward:
         case "task":
             return torch.zeros_like(rho)
@@ -54,13 +54,13 @@ class Transition:
     """Result of one step of all environments.
 
     Attributes:
-        observation: after the step; where an episode ended, of the next one's initial state, (N, k).
-        reward: (N,).
-        done: where an episode ended, (N,) bool.
+        observation: observation after the step, (N, k); if an episode ended, that of the next initial state.
+        reward: reward of the step, (N,).
+        done: whether the episode ended, (N,) bool.
         final: observation after the step, before any reset, (N, k).
-        rho: robustness of the episodes that ended, (N,); NaN elsewhere.
+        rho: robustness of the episodes that ended, (N,); NaN for others.
         verdicts: exact verdicts on the episodes; None before their end.
-        states: after the step, before any reset, (N, n).
+        states: states after the step, before any reset, (N, n).
     """
 
     observation: Tensor
@@ -84,23 +84,24 @@ def observe(task: Task, states: Tensor, step: int) -> Tensor:
 
 
 class Environments:
-    """Episodes of one task, side by side in one batch; all begin and end together.
+    """Episodes of one task in one batch; all begin and end together.
 
-    Steps are compiled to C where possible. States are float64, what a learner reads is float32.
+    Steps are compiled to C if possible. States are float64, observations float32.
 
     Args:
         task: specification and system.
         count: number of episodes, N.
-        reward: of learners.
-        generator: of initial states.
-        ahead: number of initial states to draw at a time, which makes short batches faster; 0: `count`.
+        reward: name of the reward.
+        generator: random numbers for the initial states.
+        ahead: number of initial states that are drawn at a time, since drawing few is slow; 0: `count`.
 
-    Raises UsageError (U101) for reward `task` where the system declares none, or for another name.
+    Raises:
+        UsageError: U101, there is no such reward, or it is `task` and the system declares none.
 
     Attributes:
         task: specification and system.
         count: number of episodes, N.
-        steps: of an episode: the horizon of a plan.
+        steps: number of steps of an episode: the horizon of a plan.
         states: present states, (N, n).
     """
 
@@ -129,28 +130,28 @@ class Environments:
         return self.task.system.observed_count + 1
 
     def observe(self, states: Tensor, step: int) -> Tensor:
-        """Inputs of the policy and the elapsed share of the episode: (B, n) -> (B, k)."""
+        """Observations: the inputs of a policy, and the elapsed share of the episode: (B, n) -> (B, k)."""
         return observe(self.task, states, step)
 
     @torch.no_grad()
     def reset(self, states: Tensor | None = None) -> Tensor:
-        """Begin all episodes, at new initial states or at `states` (N, n); return observations (N, k)."""
+        """Begin all episodes at new initial states, or at `states` (N, n), and return observations (N, k)."""
         self._begin(self._starts() if states is None else states.double())
         if self._native is not None:
             return self._native.look(self.states, 0.0)
         return self.observe(self.states, 0).float()
 
     def seed(self, seed: int) -> None:
-        """Seed the initial states from the next reset on, and forget those drawn ahead."""
+        """Set the seed of the initial states from the next reset on; states drawn ahead are discarded."""
         self._generator.manual_seed(seed)
         self._drawn = self._drawn[:0]
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> Transition:
-        """Advance all episodes by one step; episodes that end begin anew.
+        """Advance all episodes by one step; those that end are restarted.
 
         Args:
-            actions: in physical units, clipped to their ranges, (N, m).
+            actions: actions in physical units, (N, m); clipped to their ranges.
         """
         held = torch.clamp(actions.double(), self._low, self._high)
         self._actions[:, self._step] = held
@@ -165,7 +166,7 @@ class Environments:
         return Transition(self.reset(), reward, done, final, verdicts.rho.float(), verdicts, states)
 
     def _moved(self, held: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States after a step, their observations, and the declared rewards, 0 unless asked for."""
+        """States after a step, their observations, and declared rewards (0 unless the reward is `task`)."""
         share = self._step / self.steps
         if self._native is not None:
             after, seen, reward = self._native.advance(self.states, held, share)
@@ -183,7 +184,7 @@ class Environments:
         self._actions = self._blank()
 
     def _blank(self) -> Tensor:
-        """Actions of an episode, (N, T, m)."""
+        """Empty array for the actions of an episode, (N, T, m)."""
         return torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
 
     def _starts(self) -> Tensor:

@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 def load_task(
     spec: Path | str, system: Path | str | None = None, overrides: Mapping[str, str] | None = None
 ) -> Task:
-    """Load a specification and a system, and compile the one for the other.
+    """Load a specification and a system, and compile the specification for the system.
 
     Args:
-        spec: a file, as `find_spec` finds it.
-        system: a file, as `find_system` finds it; by default the one that the specification names.
-        overrides: constants of the specification and keys of the system to change, name -> text.
+        spec: specification file, searched by `find_spec`.
+        system: system file, searched by `find_system`; by default the one that the specification names.
+        overrides: constants of the specification and keys of the system file to change, name -> text.
 
     Raises:
         UsageError: U101, no system is named; U102, there is no such file.
-        SpecError, SystemFileError: a file is invalid, or they do not fit.
+        SpecError: the specification is invalid or does not fit the system.
+        SystemFileError: the system file is invalid.
     """
     path = find_spec(Path(spec))
     parsed = parse(read_source(path))

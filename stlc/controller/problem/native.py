@@ -1,8 +1,8 @@
 """Native code of a task, from its dynamics and requirements: verdicts, local search, gradients, steps.
 
 Verdicts equal those of the torch graph and are tens of times faster: a training step in torch is about a
-thousand small array operations, here two calls. Without a compiler, on another device, or for formulas
-without C form, torch is used, and `torch_reasons` gives the reason.
+thousand small array operations, in native code two calls. Without a compiler, on a GPU, or for formulas that
+cannot be written in C, torch is used, and `torch_reasons` gives the reason.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Options of a native local search.
+    """Options of a native local search; a row is one initial state.
 
     Attributes:
         generations: number of generations of changed plans per row.
-        enough: target robustness of a row.
-        seed: of the random changes.
+        enough: robustness at which the search for a row ends.
+        seed: seed of the random changes.
         threads: number of threads; the result does not depend on it.
-        stop: ends the search before all rows are done.
+        stop: condition that ends the search before all rows are done.
     """
 
     generations: int
@@ -48,17 +48,17 @@ class Effort:
 
 
 def motion_of(system: System) -> Motion:
-    """One exact step of a system, in the form that the C emitters read."""
+    """The exact step of a system, in the form from which C code is generated."""
     step = system.exact_step
     return Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
 
 
 class NativeJudge:
-    """Native robustness kernel of one task on the CPU.
+    """Native kernel that computes the robustness of plans of one task, on the CPU.
 
     Attributes:
-        kernel: built for the task's dynamics and requirements.
-        names: of the state columns.
+        kernel: library built from the task's dynamics and requirements.
+        names: names of the state columns.
     """
 
     def __init__(self, kernel: Kernel, system: System, rules: Sequence[CompiledRequirement]) -> None:
@@ -73,7 +73,7 @@ class NativeJudge:
 
     @classmethod
     def of(cls, system: System, rules: Sequence[CompiledRequirement]) -> NativeJudge | None:
-        """Build the kernel of a system and its requirements; None where torch has to be used."""
+        """Build the kernel for a system and requirements; None if torch has to be used."""
         try:
             library = load(emit(motion_of(system), [rule.formula for rule in rules]))
         except Untranslatable:
@@ -114,7 +114,7 @@ class NativeJudge:
         Args:
             x0: (B, n).
             plans: initial plans, (B, T, m).
-            bank: plans that solved other states, (k, T, m); may be empty.
+            bank: library of plans that solved other states, (k, T, m); may be empty.
             effort: options of the search.
 
         Returns:
@@ -135,7 +135,7 @@ class NativeJudge:
 
 
 class NativeGradient:
-    """Robustness and states of one task's plans, differentiable with respect to the plans.
+    """Native kernel for robustness and states of a task's plans, differentiable with respect to the plans.
 
     Attributes:
         judge: computes the values.
@@ -150,7 +150,7 @@ class NativeGradient:
     def of(
         cls, system: System, rules: Sequence[CompiledRequirement], judge: NativeJudge | None
     ) -> NativeGradient | None:
-        """Build for a system and its requirements; None where torch has to differentiate."""
+        """Build the kernel for a system and requirements; None if torch has to differentiate."""
         if judge is None:
             return None
         fixed = [timer.name for timer in system.timers]
@@ -166,14 +166,14 @@ class NativeGradient:
         Args:
             x0: (B, n), not differentiated.
             u: (B, T, m).
-            slope: backward slope of conditions, per unit.
+            slope: slope, per unit, that replaces the derivative of jumps and conditions.
         """
         each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
         return each, dict(zip(self.judge.names, columns.unbind(0), strict=True))
 
 
 class _Judged(torch.autograd.Function):
-    """Autograd function: values from `judge`, gradients from `pull`."""
+    """Autograd function whose values come from `judge` and whose gradients come from `pull`."""
 
     @staticmethod
     def forward(
@@ -205,10 +205,10 @@ class _Judged(torch.autograd.Function):
 
 
 class NativeStep:
-    """One exact step of a system with its observation and declared reward, on the CPU.
+    """Native functions for one exact step of a system, its observation and declared reward, on the CPU.
 
     Attributes:
-        compiled: the two functions.
+        compiled: the compiled functions `advance` and `look`.
     """
 
     def __init__(self, compiled: Advance) -> None:
@@ -216,9 +216,10 @@ class NativeStep:
 
     @classmethod
     def of(cls, system: System, *, rewarded: bool) -> NativeStep | None:
-        """Build for a system; None where torch has to be used.
+        """Build the functions for a system; None if torch has to be used.
 
-        Raises UsageError (U101) where a reward is wanted (`rewarded`) and the file declares none.
+        Raises:
+            UsageError: U101, a reward is wanted (`rewarded`), but the system file declares none.
         """
         reward = system.require_reward() if rewarded else None
         given = commands(system.decl)
@@ -232,24 +233,27 @@ class NativeStep:
         )
 
     def advance(self, x: Tensor, u: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor | None]:
-        """States (B, n), observations (B, k + 1) float32 with `share` last, and rewards (B,) after a step.
+        """Advance states by one step, and return the new states, observations and rewards.
 
         Args:
             x: states, (B, n) float64.
-            u: plans, (B, m) float64.
-            share: elapsed share of the episode after the step.
+            u: controls, (B, m) float64.
+            share: elapsed share of the episode after the step, the last entry of each observation.
+
+        Returns:
+            States (B, n), observations (B, k + 1) float32, rewards (B,) or None.
         """
         after, seen, reward = self.compiled.advance(x.contiguous().numpy(), u.contiguous().numpy(), share)
         earned = None if reward is None else torch.from_numpy(reward)
         return torch.from_numpy(after), torch.from_numpy(seen), earned
 
     def look(self, x: Tensor, share: float) -> Tensor:
-        """Observations of states (B, n) float64 with `share` last, (B, k + 1) float32."""
+        """Observations of states (B, n) float64, with `share` as the last entry: (B, k + 1) float32."""
         return torch.from_numpy(self.compiled.look(x.contiguous().numpy(), share))
 
 
 def reason(text: Callable[[], str]) -> str:
-    """Reason why a C text has no library."""
+    """Reason why the C code that `text` returns could not be compiled or loaded."""
     if compiler() is None:
         return "there is no C compiler"
     try:

@@ -1,9 +1,9 @@
-"""Robustness margins of pending `eventually@` goals on the mission clock.
+"""Robustness margins of pending `eventually@` goals (whose times count from the start of the mission).
 
 A goal such as `eventually@[0 s, 18 s] [x, y] in b` is reached at the first sample that satisfies it, with
-almost no margin; from then on the guidance cost draws plans to the next goal. Therefore plans that reach a
-pending goal are compared by their margin, up to gamma, and a previous plan that reaches it is retained while
-its margin increases.
+almost no margin; from then on the guidance cost (distance to the next goal) draws plans away. Therefore plans
+that reach a pending goal are compared by their margin, up to gamma, and a previous plan that reaches it is
+retained while its margin increases.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ HELD = 0.5
 
 @dataclass(frozen=True, slots=True)
 class PendingGoal:
-    """An `eventually@` of a state formula.
+    """Goal `eventually@[a, b]`: a state formula to be satisfied once in steps a to b of a mission.
 
     Attributes:
-        status: column of its status.
-        body: state formula to be satisfied once.
-        first: first step of the mission at which it counts.
-        last: the last such step.
+        status: name of the column (samples of one state over time) that holds whether it is satisfied.
+        body: the state formula.
+        first: first step of the mission at which satisfaction counts.
+        last: last such step.
     """
 
     status: str
@@ -52,8 +52,8 @@ class PendingGoals:
     """The pending goals of a mission.
 
     Attributes:
-        clock: column of the mission clock; empty where there is none.
-        items: requirements that are a single goal; goals nested in other formulas are ignored.
+        clock: name of the column that holds the time since the start of the mission; "" if there is none.
+        items: goals that are requirements by themselves; goals nested in other formulas are ignored.
     """
 
     def __init__(self, compiled: Compiled, gamma: float) -> None:
@@ -69,10 +69,10 @@ class PendingGoals:
         self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Shortfall of the margins of pending goals below gamma, summed over goals: (batch,).
+        """Sum over pending goals of the amount by which their margins are below gamma: (batch,).
 
         Args:
-            columns: predicted states, name -> (time, batch); differentiable in them.
+            columns: predicted states, name -> (time, batch); the result is differentiable by them.
         """
         clock = columns[self.clock]
         lack = torch.zeros_like(clock[0])
@@ -84,7 +84,7 @@ class PendingGoals:
         return lack
 
     def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Plans whose next step increases the margin of a goal that is reached now: (batch,) booleans.
+        """Mask of the plans whose next step increases the margin of a goal that is satisfied now: (batch,).
 
         Args:
             columns: predicted states, name -> (time, batch).

@@ -1,4 +1,4 @@
-"""Task: specification and system joined; initial states, rollouts, robustness and verdicts."""
+"""Task: a specification compiled for a system; initial states, rollouts, robustness and verdicts."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PlanVerdicts:
     columns: Mapping[str, Tensor]
 
     def of(self, index: Tensor) -> PlanVerdicts:
-        """The verdicts at `index`, (k,) positions along the batch."""
+        """The verdicts on the plans with indices `index`, (k,)."""
         columns = {name: column[:, index] for name, column in self.columns.items()}
         return PlanVerdicts(
             self.rho[index], self.safe[index], self.requirements[index], self.plans[index], columns
@@ -72,10 +72,10 @@ class PlanVerdicts:
 
 
 def satisfied(rho: Tensor) -> Tensor:
-    """Return whether rho >= -1e-6, with tolerance for float32 rounding.
+    """Return whether rho >= -1e-6, with a tolerance for rounding if rho is float32.
 
     Args:
-        rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
+        rho: robustness, any shape; for float32 the tolerance is larger than for float64.
 
     Returns:
         A boolean tensor of the same shape.
@@ -85,14 +85,14 @@ def satisfied(rho: Tensor) -> Tensor:
 
 
 class Task:
-    """A specification compiled for a system: the problem that a policy is trained for.
+    """A specification compiled for a system: the problem for which a policy is trained.
 
     Attributes:
-        compiled: the specification in discrete time, with its timers.
+        compiled: the specification in discrete time, with the timers that it adds to the state.
         plain: the system without timers.
         system: the system with the timers as its last columns.
-        graph: robustness of the whole specification.
-        safety: robustness of phi_safe.
+        graph: function for the robustness of the whole specification.
+        safety: function for the robustness of phi_safe (the requirements tagged `@safety`).
     """
 
     def __init__(self, compiled: Compiled, system: System) -> None:
@@ -115,10 +115,10 @@ class Task:
         """Compile a specification for a system.
 
         Args:
-            spec: as parsed.
-            system: plant of the specification.
+            spec: parsed specification.
+            system: system that the specification is about.
             overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
-            values: parameters with one fixed value in all trajectories, still observed by the policy.
+            values: parameters that get one fixed value in all trajectories; the policy still observes them.
 
         Raises:
             UsageError: a value does not fit.
@@ -133,12 +133,12 @@ class Task:
 
     @property
     def horizon(self) -> int:
-        """Steps of a plan."""
+        """Number of steps of a plan."""
         return self.system.horizon
 
     @property
     def rules(self) -> tuple[CompiledRequirement, ...]:
-        """The compiled requirements, in order."""
+        """The compiled requirements, in the order of the specification."""
         return self.compiled.requirements
 
     @cached_property
@@ -155,7 +155,7 @@ class Task:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Initial states, (n, dim). See `System.sample`."""
+        """Random initial states, (n, dim), as `System.sample` draws them."""
         return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
@@ -173,7 +173,7 @@ class Task:
         return torch.stack([columns[name][: u.shape[1] + 1].t() for name in self.system.names], 2)
 
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
-        """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4); `smoothing` is the paper's k (Eq. 7)."""
+        """Robustness at time 0: (B, T+1, n) -> (B,); exact (Eq. 4), or smoothed by k (Eq. 7)."""
         rho: Tensor = self.graph.robustness(x, smoothing)
         return rho
 
@@ -184,23 +184,23 @@ class Task:
 
     @cached_property
     def native(self) -> NativeJudge | None:
-        """The native kernel for work without gradient; None where torch is used."""
+        """Native kernel for verdicts and local search, which need no gradient; None if torch is used."""
         return NativeJudge.of(self.system, self.rules)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
-        """Native robustness and states, differentiable with respect to plans; None where torch is used."""
+        """Native kernel for robustness and states, differentiable by the plans; None if torch is used."""
         return NativeGradient.of(self.system, self.rules, self.native)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Reason why torch is used, for each part of a training; "" where it runs as C.
+        """Part of a training -> reason why it runs in torch; "" if it runs in C.
 
-        The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.
+        The parts are `verdicts` of plans, `search` for better ones, and the `gradient` of robustness.
 
         Args:
-            device: of torch, by its type.
+            device: type of the torch device.
             searches: whether the training searches for plans.
-            smooth: whether its objective is smooth, for which there is no native gradient.
+            smooth: whether its objective uses smooth robustness, for which there is no native gradient.
         """
         if device != "cpu":
             return dict.fromkeys(("verdicts", "search", "gradient"), f"the device is {device}")
@@ -238,7 +238,7 @@ class Task:
         return PlanVerdicts(rho, safe, each, u, columns)
 
     def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement and states, by the native kernel where possible."""
+        """Robustness per requirement, and predicted states, computed by the native kernel if possible."""
         if x0.device.type == "cpu" and self.native is not None:
             return self.native.judge(x0, u, columns=states)
         rows = max(1, MOST_VALUES // self._values_of_a_row)
@@ -259,17 +259,18 @@ class Task:
 
     @cached_property
     def _values_of_a_row(self) -> int:
-        """Approximate number of values that torch holds per judged plan: all subformulas."""
+        """Approximate number of values that torch holds per judged plan, those of all subformulas."""
         parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
         return (self.horizon + 1) * (
             2 * len(self.system.names) + 2 * len(self.system.control_names) + 4 * parts
         )
 
     def cost(self, judged: PlanVerdicts) -> Tensor:
-        """Cost to choose among satisfying plans, without gradient: (batch,).
+        """Cost by which satisfying plans are compared, without gradient: (batch,).
 
-        The performance terms as if every plan were satisfying. On a mission the guidance cost of the next
-        goal draws plans to the boundary of the present constraints, so a margin below gamma costs too.
+        It consists of the performance terms, which count for every plan here. In a mission the guidance cost
+        (distance to the next goal) draws plans to the boundary of the present constraints; therefore
+        robustness margins below gamma cost too.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)
@@ -279,7 +280,7 @@ class Task:
             return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Performance terms as if every plan were satisfying, with a mission's goals and guidance: (batch,).
+        """Performance terms, here of every plan, with the goals and the guidance of a mission: (batch,).
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -296,12 +297,12 @@ class Task:
 
     @cached_property
     def pending_goals(self) -> PendingGoals:
-        """Pending goals of the mission with their required margin."""
+        """Pending goals of the mission, with the margin that they require."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _guidance(self) -> ArrayProgram | None:
-        """Guidance cost: distance to the next goal of the mission, per sample."""
+        """Guidance cost at each sample: distance to the next goal of the mission."""
         return (
             None
             if self.compiled.guidance_cost is None
@@ -316,16 +317,16 @@ class Task:
 
 
 def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
-    """Rank plans: the cheapest satisfying one, else the most robust, safe ones first.
+    """Values that rank plans: satisfying ones by cost, others by robustness; unsafe ones below all safe ones.
 
     Args:
         rho: robustness, any shape.
         cost: performance terms, the same shape.
-        safe: robustness of phi_safe, the same shape; without it safety is not considered.
+        safe: robustness of phi_safe, the same shape; if None, safety is not considered.
 
     Returns:
-        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and
-        where that is flat falling with cost), 2 less where unsafe.
+        Larger is better. For satisfying plans above 1, decreasing with cost; for others below 1, increasing
+        with robustness (and for equal robustness, decreasing with cost). For unsafe plans 2 is subtracted.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))

@@ -1,9 +1,9 @@
 """Time budget of a training: the number of steps is replanned while it runs.
 
-The duration of a step is known only from measurement, and the machine's load may change. So the number of
-steps is replanned whenever the measured pace would miss the budget. The learning rate depends only on the
-step and on the number of steps planned at that moment: the seed and the recorded `StepSchedule` determine the
-weights, independently of the clock.
+The duration of a step is known only from measurement, and the machine's load may change. Therefore the number
+of steps is planned again whenever the measured pace would miss the budget. The learning rate depends only on
+the step and on the number of steps planned at that moment: the seed and the recorded `StepSchedule` determine
+the weights, independently of the clock.
 """
 
 from __future__ import annotations
@@ -43,15 +43,16 @@ FIRST_SEARCH = 1.0
 
 
 def cores() -> int:
-    """Number of cores available to this process: its share, where several train on this machine."""
+    """Number of cores that this process may use: its share if several trainings run on this machine."""
     found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def processor() -> float:
-    """Seconds of work, as on an idle machine.
+    """Processor time in seconds, comparable with wall time on an idle machine.
 
-    The larger of this thread's time and all threads' time per core, plus the time of compilers.
+    It is the larger of this thread's time and the time of all threads divided by the cores, plus compilers'
+    time.
     """
     ended = os.times()
     mine = max(time.thread_time(), time.process_time() / cores())
@@ -78,10 +79,10 @@ class TimeBudget:
     """Time budget of a training.
 
     Attributes:
-        now: the clock, in seconds.
-        started: its reading at the start, moved back by the time of earlier sessions of the run.
+        now: function that reads the clock, in seconds.
+        started: clock reading at the start, reduced by the time of earlier sessions of a resumed run.
         allowed: the user's budget in seconds; 0: unlimited.
-        seconds: the part of it available to the training.
+        seconds: part of the budget that is available to the training.
     """
 
     now: Callable[[], float]
@@ -97,7 +98,7 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Budget reduced by the predicted overrun `late` of what surrounds the training, in seconds."""
+        """Budget reduced by `late`, the predicted seconds by which work around the training exceeds it."""
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
 
@@ -109,7 +110,7 @@ class TimeBudget:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A planning: from `step` on, the run has `steps` steps in total."""
+    """Entry of a schedule: from `step` on, the run has `steps` steps in total."""
 
     step: int
     steps: int
@@ -120,10 +121,11 @@ _TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
 
 @dataclass(frozen=True, slots=True)
 class StepSchedule:
-    """The plannings of a run in order; with the seed they determine the weights.
+    """Numbers of steps planned in the course of a run; with the seed they determine the weights.
 
     Attributes:
-        plannings: the first is at step 0; of two at the same step the later one applies.
+        plannings: entries in order; the first is at step 0, and of two at the same step the later one
+            applies.
     """
 
     plannings: tuple[Planned, ...]
@@ -157,25 +159,25 @@ class StepSchedule:
         return ",".join((str(first.steps), *(f"{each.steps}@{each.step}" for each in later)))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
-        """The schedule with a further planning."""
+        """The schedule with a further entry: from `step` on, `steps` steps in total."""
         return StepSchedule((*self.plannings, Planned(step, steps)))
 
     @property
     def steps(self) -> int:
-        """Steps of the whole run."""
+        """Number of steps of the whole run."""
         return self.plannings[-1].steps
 
     def at(self, step: int) -> int:
-        """Planned number of steps of the run after `step` steps."""
+        """Total number of steps of the run as planned after `step` steps."""
         return [each.steps for each in self.plannings if each.step <= step][-1]
 
 
 class Pace:
-    """Measured pace of a run, and the number of steps that fit into the budget.
+    """Measured pace of a run, and the number of steps that fit into its budget.
 
-    The search runs concurrently with the steps; the next round, or a checkpoint, waits for its end. The
-    durations of searches and rounds are measured in steps: a machine that becomes twice as slow is assumed to
-    be so in everything.
+    A search round judges new states and starts a search that runs concurrently with the steps; the next
+    round, or a checkpoint, waits for its end. The durations of searches and rounds are measured in steps: if
+    the machine becomes twice as slow, all of them are assumed to take twice as long.
     """
 
     def __init__(self, *, every: int, searching: bool, now: float, seconds: float = 0.0) -> None:
@@ -185,7 +187,7 @@ class Pace:
             every: steps between search rounds.
             searching: whether searches run concurrently with the steps.
             now: reading of the clock used for all times, in seconds.
-            seconds: the budget; 0 without one.
+            seconds: the budget; 0 if there is none.
         """
         self._every = every
         self._searching = searching
@@ -201,7 +203,7 @@ class Pace:
         self._left: float | None = None
 
     def stepped(self, step: int, now: float, *, search_runs: bool) -> None:
-        """Record the end of gradient step `step` at `now`, and whether the search still runs."""
+        """Record the end of gradient step `step` at time `now`, and whether the search is still running."""
         self._marks.append((step, now - self._started - self._apart))
         least = max(WINDOW * self._seconds, 1.0)
         while len(self._marks) > FIRST + 1 and self._marks[-1][1] - self._marks[1][1] >= least:
@@ -210,7 +212,7 @@ class Pace:
             self.searched(step, 0.0)
 
     def searched(self, step: int, waited: float) -> None:
-        """Record the end of the search at `step`, after `waited` seconds of waiting for it."""
+        """Record the end of the search at `step`, for which the steps had to wait `waited` seconds."""
         self._apart += waited
         if self._running and self._last_validation is not None and self.per_step > 0.0:
             self._search = step - self._last_validation + waited / self.per_step
@@ -230,14 +232,17 @@ class Pace:
 
     @property
     def per_step(self) -> float:
-        """Recent duration of a gradient step in seconds; 0 before one was timed."""
+        """Duration of the latest gradient steps in seconds per step; 0 before one was measured."""
         if len(self._marks) < 2:
             return 0.0
         (first, then), (last, now) = self._marks[0], self._marks[-1]
         return max(now - then, 0.0) / (last - first)
 
     def remaining(self, step: int, steps: int, next_validation: int) -> float:
-        """Predicted seconds from `step` to the end at `steps`, with the next round at `next_validation`."""
+        """Predicted seconds from `step` to the end of the run after `steps` steps.
+
+        `next_validation`: step of the next search round.
+        """
         if steps < step:
             return 0.0
         rounds = max(0, -(-(steps - next_validation) // self._every))
@@ -252,9 +257,9 @@ class Pace:
         return self.per_step * (steps - step + round_ * rounds + waits)
 
     def plan(self, step: int, steps: int, next_validation: int, left: float) -> int:
-        """Number of steps of a run with `left` seconds remaining; `steps` unchanged if the prediction fits.
+        """Number of steps of a run with `left` seconds remaining; `steps` is kept if the prediction fits.
 
-        At least the steps already done, and at least one.
+        The result is at least 1, and at least the number of steps that are already made.
         """
         cost = self.per_step
         if left > 0.0 and (cost <= 0.0 or (steps > step and not self._due(left))):
@@ -280,7 +285,7 @@ class Pace:
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """True once enough was timed since the last planning to replan."""
+        """True once enough steps were measured since the last planning to plan again."""
         if self._left is None:
             first = self._marks[0][1]
             return len(self._marks) > FIRST or self._marks[-1][1] - first >= WINDOW * self._seconds

@@ -1,7 +1,7 @@
-"""Checkpoints: tensors as safetensors, facts as JSON, and a pointer to the latest, updated last.
+"""Checkpoints: tensors as safetensors, scalars as JSON, and a pointer to the latest checkpoint.
 
-`ckpt/step-NNNNNN.safetensors` and its `.json` are complete before `ckpt/last.json` is replaced to name them,
-so a kill or a full disk at any moment leaves the last good checkpoint in place. No pickle is used.
+The pointer `ckpt/last.json` is replaced only once `ckpt/step-NNNNNN.safetensors` and its `.json` are
+complete, so a kill or a full disk at any moment leaves the last good checkpoint in place. No pickle is used.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
     """Load the latest checkpoint of a run.
 
     Args:
-        run: its folder.
+        run: folder of the run.
         spec_hash: SHA-256 of the specification.
         system_hash: SHA-256 of the system file.
 
@@ -105,7 +105,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
 
 @contextmanager
 def restoring(run: RunDir) -> Iterator[None]:
-    """Raise RunError (R101) where a checkpoint's content does not fit the objects restored from it."""
+    """Context in which an error of restoring objects from a checkpoint becomes RunError (R101)."""
     try:
         yield
     except _DAMAGE as error:
@@ -113,7 +113,7 @@ def restoring(run: RunDir) -> Iterator[None]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
-    """Facts and tensor bytes of the latest checkpoint, verified against each other."""
+    """Scalars and tensor bytes of the latest checkpoint, after a check that both belong together."""
     try:
         facts = json.loads((folder / POINTER).read_text())
         name = facts["file"]
@@ -147,6 +147,6 @@ def _shown(folder: Path) -> str:
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
-    """The tensors of one module, without its prefix."""
+    """Tensors whose names begin with `prefix`, the weights of one module, without the prefix."""
     start = prefix + "."
     return {name[len(start) :]: value for name, value in checkpoint.tensors.items() if name.startswith(start)}

@@ -34,13 +34,13 @@ MISSION_MOST = 128
 
 @dataclass(frozen=True, slots=True)
 class PlannerChoice:
-    """A planner to plan with in closed loop.
+    """A planner for closed-loop planning, with its options.
 
     Attributes:
-        name: of `stlc.registry.PLANNERS`.
-        options: of the planner, name -> text.
-        seconds: processor time of a plan.
-        evaluations: judged plans of a plan at most; None for no limit.
+        name: name in `stlc.registry.PLANNERS`.
+        options: options of the planner, name -> text.
+        seconds: processor time per plan.
+        evaluations: maximum number of plans judged in search of one; None for no limit.
     """
 
     name: str
@@ -90,34 +90,34 @@ class TrainConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedConfig:
-    """Resolved options of a run, saved with it.
+    """Resolved options of a run; fresh states are newly drawn, hard ones are those that failed.
 
     Attributes:
-        method: its name.
-        seed: of all random numbers.
-        hidden: widths of the network.
+        method: name of the method.
+        seed: seed of all random numbers.
+        hidden: widths of the network's hidden layers.
         plans: number of plans of the network.
-        batch: fresh states per step.
-        hard: solved hard states per step, once there are any.
+        batch: number of fresh states per step.
+        hard: number of hard states with a repaired plan per step, once there are any.
         lr: peak learning rate.
         warmup: share of the steps over which the learning rate rises.
-        hold: share of the steps at the peak learning rate; if positive, the rise takes a fixed number of
-            steps.
+        hold: share of the steps at the peak learning rate; if it is positive, the learning rate rises over a
+            fixed number of steps.
         clip: bound on the norm of the gradient.
         average: decay of the moving average of the weights.
-        pool: fresh states judged per search round.
-        every: steps between search rounds, doubled where a round repaired little.
+        pool: number of fresh states judged per search round.
+        every: steps between search rounds; doubled after a round that repaired few plans.
         most: maximum number of failing states repaired per round.
-        slope: backward slope of switches, per unit.
-        imitation: weight of the distance to a repaired plan.
-        share: weight of the mean over plans beside the winner's loss.
-        performance: factor of the performance terms.
+        slope: slope, per unit, that replaces the derivative of jumps and conditions.
+        imitation: weight of the distance to a repaired plan in the loss.
+        share: weight of the mean loss of all plans, in addition to the loss of the best one.
+        performance: factor of the performance terms in the loss.
         held_out: number of held-out states.
-        threads: of torch; rounding of sums depends on their number. 0: unchanged.
+        threads: number of threads of torch, on which the rounding of sums depends; 0: not changed.
         samples: size of a fixed training set; 0: fresh states in every step.
-        clock: of budgets and recorded times.
+        clock: clock of budgets and recorded times.
         ranks: number of processes that train together, each with its own batch.
-        drives: maximum closed-loop runs per guard after the training; 0: none.
+        drives: maximum number of closed-loop runs per guard after the training.
     """
 
     method: str
@@ -165,7 +165,11 @@ _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks", "environments
 
 
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
-    """Return the options unchanged. Raises ValueError where one has the wrong type or is too large."""
+    """Return the options unchanged if all are valid.
+
+    Raises:
+        ValueError: an option has the wrong type or is too large.
+    """
     words = {
         "method": METHODS.names,
         "clock": get_args(Clock),
@@ -197,7 +201,7 @@ def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
 
 
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
-    """Resolve the options of a run: the user's, then the system file's, then those of the method.
+    """Resolve the options of a run: those of the user, else of the system file, else of the method.
 
     Raises:
         UsageError: U101, there is no such method.
@@ -252,7 +256,7 @@ def base_config(
         kind: type of the options; fields that a method adds keep their defaults.
         batch: default number of fresh states per step.
         plans: default number of plans of the network.
-        searches: whether a search runs concurrently: torch leaves a core to it.
+        searches: whether a search runs concurrently; torch then leaves a core to it.
     """
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)
@@ -276,6 +280,6 @@ def base_config(
 
 
 def _threads(*, searching: bool) -> int:
-    """Threads of torch: the present setting, or the cores less one for a concurrent search."""
+    """Number of threads of torch: as set, or all cores but one if a search runs concurrently."""
     most = int(torch.get_num_threads())
     return max(1, min(most, cores() - 1)) if searching else most

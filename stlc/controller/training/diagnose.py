@@ -1,9 +1,9 @@
-"""Divergence diagnosis: mirrors that are no symmetry, non-finite steps, requirements without a plan.
+"""Diagnosis of trainings that fail: wrong mirrors, non-finite steps, requirements without a plan.
 
-The chain of a training step is network -> plans -> states -> robustness of each requirement and performance
-terms -> gradient; the first non-finite link is reported. A search that finds no plan proves nothing. Bounds
-do: interval arithmetic over all plans encloses the states reachable within the horizon, and so bounds the
-robustness of a requirement from above.
+A training step computes network -> plans -> states -> robustness of each requirement and performance terms ->
+gradient; the first of these that is not finite is reported. A search that finds no plan does not prove that
+there is none, but bounds do: interval arithmetic over all plans encloses the states that are reachable within
+the horizon, and so bounds the robustness of a requirement from above.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ class TrainingStep:
     def of(
         cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task
     ) -> TrainingStep:
-        """Step with all plans of the network for states (B, n)."""
+        """Training step with all plans that the network proposes for states (B, n)."""
         with torch.no_grad():
             plans = network(x0)
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
 
 
 def diagnose(step: TrainingStep) -> StlcError:
-    """Find the first non-finite link of a training step, and its place."""
+    """Error that reports which quantity of a training step first becomes non-finite, and where."""
     for check in (_plans, _motion, _robustness, _cost):
         found = check(step)
         if found is not None:
@@ -129,7 +129,7 @@ def _motion(step: TrainingStep) -> StlcError | None:
 
 
 def _robustness(step: TrainingStep) -> StlcError | None:
-    """Error for a requirement with non-finite value, or else non-finite gradient, on finite states.
+    """Error for a requirement whose value, or else whose gradient, is not finite although the states are.
 
     An infinite value spoils the gradients of all requirements, so values are checked first.
     """
@@ -155,7 +155,7 @@ def _robustness(step: TrainingStep) -> StlcError | None:
 
 
 def _cost(step: TrainingStep) -> StlcError | None:
-    """Error for a performance term with non-finite value or gradient."""
+    """Error for a performance term whose value or gradient is not finite; None if there is none."""
     declared = step.task.system.decl
     for term in declared.objective.terms:
         alone = replace(declared, objective=replace(declared.objective, terms=(term,)))
@@ -192,7 +192,7 @@ def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Value per plan (B,) and its gradient by the plan, (B, T, m)."""
+    """Values per plan, (B,), and their gradients by the plans, (B, T, m)."""
     u = step.u.detach().requires_grad_()
     value = value_of(u)
     if not value.requires_grad:
@@ -243,10 +243,10 @@ TRIES = 4000
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
-    """Diagnostic R404 of a task without a known plan, with the conflicting requirements.
+    """Diagnostic R404, for a task without a known plan, with the requirements that conflict.
 
-    Those proved to have no plan; otherwise a core, found by removing requirements as long as no plan is found
-    for the rest, until `enough` returns True.
+    These are the requirements that provably have no plan. If there are none, requirements are removed as long
+    as no plan is found for the remaining ones, until `enough` returns True, and the rest is reported.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -264,7 +264,7 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
 
 
 def refuted(task: Task) -> bool:
-    """True if bounds prove for some requirement that no plan from any of `STARTS` starts satisfies it."""
+    """True if bounds prove for some requirement that no plan from any of `STARTS` states satisfies it."""
     return any(_impossible(task, rule) for rule in task.rules)
 
 
@@ -278,14 +278,14 @@ def _starts(task: Task) -> torch.Tensor:
 
 
 def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
-    """Best plans for these requirements alone, by local search."""
+    """The best plans found by local search for the requirements `rules` alone."""
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
     return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """True if exploration finds a plan for these requirements alone."""
+    """True if exploration finds a plan that satisfies the requirements `rules`."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
@@ -333,7 +333,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Note on the effort of the search, which is not a proof."""
+    """Note on how long was searched, since a search without result proves nothing."""
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
@@ -349,12 +349,12 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _impossible(task: Task, rule: CompiledRequirement) -> bool:
-    """True if bounds prove that no plan from any of the starts satisfies a requirement."""
+    """True if bounds prove that no plan from any of the fixed initial states satisfies the requirement."""
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
 
 def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
-    """Bounds on every state after each number of steps, over all controls."""
+    """Bounds on every state, by name, after each number of steps from state `x` under any controls."""
     step, system = task.system.exact_step, task.system
     low, high = system.control_low.tolist(), system.control_high.tolist()
     controls = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
@@ -376,10 +376,10 @@ def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
 
 
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
-    """Upper bound on the robustness of a formula at time 0; inf where the bounds are undecided.
+    """Upper bound on the robustness of a formula at time 0; inf if the bounds decide nothing.
 
-    Formulas are in negation normal form and thus monotone in their predicates: the bound is the robustness
-    under the upper bounds of the predicates over time.
+    Formulas are in negation normal form, so their robustness does not decrease with that of their predicates:
+    the bound is the robustness for the upper bounds of the predicates over time.
     """
     columns = {"": np.zeros((len(reached), 1))}
 
@@ -398,7 +398,7 @@ def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float
 
 
 def _upper(atom: ir.Predicate, facts: Mapping[str, Bounds]) -> float:
-    """Upper bound on the robustness of a predicate under bounds on the states of its instant."""
+    """Upper bound on the robustness of a predicate at one instant, given bounds on the states there."""
     if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
         return math.inf
     reach = bounds(atom.num, facts)
@@ -416,9 +416,10 @@ ODD = 0.02
 
 
 def check_mirror(task: Task) -> None:
-    """Check the mirror symmetry on random states and their images.
+    """Check the mirror symmetry of a task on random states and their mirror images.
 
-    Raises SystemFileError (S304) where they differ: the mirror is no symmetry of system and specification.
+    Raises:
+        SystemFileError: S304, system or specification are not symmetric.
     """
     mirror = task.system.mirror
     if mirror is None:
@@ -441,7 +442,7 @@ def check_mirror(task: Task) -> None:
 
 
 def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:
-    """Report the column that differs most, where more of its rows differ than near-ties explain."""
+    """Raise S304 for the column that differs most, if more rows differ than near-ties explain."""
     found, wanted = found.reshape(-1, len(names)), wanted.reshape(-1, len(names))
     off = ~torch.isclose(found, wanted, rtol=NEAR, atol=NEAR, equal_nan=True)
     shares = off.double().mean(0)

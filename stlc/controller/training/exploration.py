@@ -62,7 +62,7 @@ RAISED = 250
 
 
 def pieces(formula: ir.Formula) -> list[ir.Formula]:
-    """Conjuncts of a formula: parts that can be satisfied or violated separately."""
+    """Conjuncts of a formula, which can be satisfied or violated one by one."""
     match formula:
         case ir.BoolOp("and", items):
             return [piece for item in items for piece in pieces(item)]
@@ -74,15 +74,16 @@ def pieces(formula: ir.Formula) -> list[ir.Formula]:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Prefixes of equal length, one per row.
+    """Prefixes of plans of equal length, one per row; a piece is a conjunct of the specification.
 
     Attributes:
-        states: their trajectories, (rows, steps + 1, n).
-        plans: (rows, steps, m).
-        met: pieces satisfied by every continuation, (rows, pieces).
-        kind: equal for prefixes with the same satisfied pieces and timers in the same cells, (rows, columns).
-        worth: sum of the lower bounds of the open pieces, (rows,).
-        visits: number of times each was extended, (rows,).
+        states: predicted trajectories, (rows, steps + 1, n).
+        plans: controls, (rows, steps, m).
+        met: whether every continuation satisfies a piece, (rows, pieces).
+        kind: numbers that are equal for prefixes with the same satisfied pieces and with timers in the same
+            cells, (rows, columns).
+        worth: sum of the lower bounds on the robustness of undecided pieces, (rows,).
+        visits: number of times that each prefix was extended, (rows,).
     """
 
     states: Numbers
@@ -107,11 +108,11 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class ExplorationResult:
-    """Result of the exploration from one start.
+    """Result of the exploration from one initial state.
 
     Attributes:
-        plan: satisfying plan, (T, m) float64; None where none was found.
-        sweeps: number of sweeps made.
+        plan: satisfying plan, (T, m) float64; None if none was found.
+        sweeps: number of times that all layers were extended.
     """
 
     plan: Tensor | None
@@ -119,11 +120,11 @@ class ExplorationResult:
 
 
 class Exploration:
-    """Exploration of the plans of one task, from one start at a time.
+    """Exploration of the plans of one task, from one initial state at a time.
 
     Attributes:
         task: specification and system.
-        pieces: formulas whose conjunction the specification is.
+        pieces: conjuncts of the specification.
     """
 
     def __init__(self, task: Task) -> None:
@@ -154,10 +155,10 @@ class Exploration:
         """Search for a satisfying plan from the state (n,).
 
         Args:
-            x: the start.
-            sweeps: maximum number of times that each layer is extended.
+            x: the initial state.
+            sweeps: maximum number of times that each layer (the prefixes of one length) is extended.
             generator: random numbers of the exploration.
-            enough: asked before each sweep after the first; True gives up.
+            enough: called before each sweep after the first; True ends the exploration.
         """
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         start = x.double().numpy(force=True)[None, None]
@@ -185,16 +186,16 @@ class Exploration:
         spare: float,
         enough: Callable[[], bool] = lambda: False,
     ) -> SearchResult:
-        """Find plans from some of the starts (k, n), with their remainders from states on the way.
+        """Find plans from some of the initial states, and from states that these plans pass.
 
-        Starts are tried in order while sweeps remain. Where the specification has memory, states along a plan
-        are further starts, which the remainder of the plan may solve.
+        The states are tried in order while sweeps remain. If the specification has memory, the states along a
+        plan are further initial states, which the remainder of the plan may solve.
 
         Args:
-            starts: (k, n).
-            sweeps: total for plans of `USUAL` steps; fewer for longer ones.
+            starts: initial states, (k, n).
+            sweeps: total number of sweeps for plans of `USUAL` steps; fewer for longer plans.
             generator: random numbers of the exploration.
-            spare: target robustness of the found plans.
+            spare: robustness that the plans are to reach.
             enough: called repeatedly; True ends the exploration.
         """
         sweeps = max(math.ceil(sweeps * min(1.0, (USUAL / self.task.horizon) ** 2)), 2)
@@ -215,14 +216,14 @@ class Exploration:
     # ------------------------------------------------------------------ found plans
 
     def _raised(self, x: Tensor, plan: Tensor, spare: float) -> Tensor:
-        """The plan (T, m), improved by local search towards robustness `spare`."""
+        """Improve the plan (T, m) by local search until its robustness is `spare`."""
         if self.task.native is None:
             return plan
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
     def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """The start with its plan, and the states on the way that the remainder of the plan solves."""
+        """The initial state with its plan, and states along the plan with remainders that solve them."""
         states, plans = [x], [plan]
         if self.task.compiled.timers:
             path = self.task.rollout(x[None], plan[None])[0]
@@ -253,7 +254,7 @@ class Exploration:
         return self._layer(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _layer(self, states: Numbers, plans: Numbers) -> Layer:
-        """Layer of the prefixes that may still satisfy the specification."""
+        """Layer of those given prefixes that may still satisfy the specification."""
         good = np.isfinite(states).all((1, 2))
         states, plans = states[good], plans[good]
         whole = states.shape[1] == self.task.horizon + 1
@@ -277,7 +278,7 @@ class Exploration:
         return np.stack([np.broadcast_to(each[0], len(states)) for each in found], 1)
 
     def _chosen(self, layer: Layer, random: np.random.Generator) -> NDArray[np.int64]:
-        """Draw prefixes to extend, (CHILDREN,), preferring satisfied pieces, high worth and few visits."""
+        """Draw prefixes to extend, (CHILDREN,), preferably with satisfied pieces, high worth, few visits."""
         kind = _numbered(layer.kind)
         rank = np.empty(len(layer))
         for each in range(kind.max() + 1):
@@ -290,7 +291,7 @@ class Exploration:
         return chosen
 
     def _drawn(self, plans: Numbers, more: int, random: np.random.Generator) -> Numbers:
-        """Draw continuations, (rows, more, m): levels, ends of ranges, changes of the last control, noise."""
+        """Draw controls after prefixes, (rows, more, m): levels, range ends, changed controls, noise."""
         rows, steps, controls = plans.shape
         span, shape = self._high - self._low, (rows, 1, controls)
         level = self._low + span * random.random(shape)
@@ -304,7 +305,7 @@ class Exploration:
         return drawn
 
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Best prefix per cell, thinned to at most `KEPT`, with equal shares for the kinds."""
+        """The best prefix per cell, reduced to at most `KEPT` prefixes, with equal shares for all kinds."""
         if not len(layer):
             return layer
         parts = [layer.kind]
@@ -323,6 +324,6 @@ class Exploration:
 
 
 def _numbered(kinds: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the distinct row that each row equals."""
+    """Index of the first row that each row equals: the same number for equal rows."""
     numbers: NDArray[np.int64] = np.unique(kinds, axis=0, return_inverse=True)[1].reshape(-1)
     return numbers

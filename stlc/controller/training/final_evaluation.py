@@ -35,13 +35,13 @@ class TrainingOutcome:
 
     Attributes:
         run: the run with its policy.
-        score: on held-out states; None where training was interrupted, and on ranks after the first.
-        seconds: of training, held-out verdict included.
+        score: result on held-out states; None if training was interrupted, and on ranks after the first.
+        seconds: duration of the training, evaluation on held-out states included.
         interrupted: whether `Watch.stop` ended it.
         ranks: number of processes that trained together.
-        why: diagnosis of the conflicting requirements, where no plan was found for any start.
+        why: diagnosis of the conflicting requirements if no plan was found from any initial state.
         steps: total number of steps.
-        simulated: closed-loop results; None where not simulated.
+        simulated: closed-loop results; None if there was no simulation.
     """
 
     run: Run
@@ -59,7 +59,7 @@ class FinalEvaluation:
     """Evaluation of a policy within the remaining time of its training.
 
     Attributes:
-        writer: of the run.
+        writer: writer of the run's folder.
         task: problem of the training.
         config: resolved options of the run.
         time: budget of the training.
@@ -76,7 +76,7 @@ class FinalEvaluation:
 
     @property
     def reserve(self) -> float:
-        """Seconds of the budget reserved for the whole evaluation."""
+        """Seconds of the budget reserved for the evaluation on held-out states and the simulations."""
         return verdict_reserve(self.time.seconds) + self._for_simulations
 
     @property
@@ -84,7 +84,7 @@ class FinalEvaluation:
         return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
 
     def of(self, policy: Policy, steps: int) -> TrainingOutcome:
-        """Evaluate a policy after `steps` steps, store the result in the run, and close its record."""
+        """Evaluate a policy after `steps` training steps, store the result, and close the run's record."""
         self.trained = self.time.now()
         result = score(
             self.task, policy, n=self.config.held_out, enough=self._out_of_time, report=self.report
@@ -115,16 +115,16 @@ class FinalEvaluation:
         return closed_loop(run, lambda: end - time.now(), self.config.drives)
 
     def _out_of_time(self) -> bool:
-        """True once the evaluation on held-out states has to end."""
+        """True once the time for the evaluation on held-out states is over."""
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once the closed-loop simulations have to end, too."""
+        """True once the time for the closed-loop simulations is over."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property
     def _verdict_seconds(self) -> float:
-        """Seconds left for the held-out evaluation; without budget a share of the duration of the steps."""
+        """Seconds left for the evaluation on held-out states; without budget a share of the training time."""
         spent = self.trained - self.time.started
         if not self.time.allowed:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)

@@ -1,4 +1,4 @@
-"""Run folder before the first step: exact inputs, options, versions, machine."""
+"""Folder of a run before the first step: copies of its inputs, its options, versions, machine."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def train_here(
 
 
 def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch) -> RunDir:
-    """Create the folder of a run without training, whose policy is a planner.
+    """Create the folder of a run whose policy is a planner, without training.
 
     Raises:
         MissingError: R201, the folder cannot be written.
