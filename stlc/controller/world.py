@@ -1,8 +1,8 @@
 """The world of a deployment: the true environment, with effects that the policy's model lacks.
 
-A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it,
-imported only when that system is deployed. Without one, independent agents follow the model and meet the
-`events` of the file.
+A system file names a world as `test: {world: "traffic_grid.py:TrafficGrid"}`: a class in a Python file beside
+it, imported only when the system is deployed. Without a world, independent agents follow the model and are
+subject to the `events` of the system file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 
 
 class World(Protocol):
-    """True environment of the agents, with effects that the model lacks; states float64, without timers."""
+    """True environment of the agents, with effects that the model lacks.
+
+    States are float64 and do not contain the timers that a specification adds.
+    """
 
     def reset(self) -> Tensor:
         """Initial states, (agents, n)."""
@@ -41,9 +44,9 @@ class World(Protocol):
         """Progress of the task since `reset`, name -> number."""
 
     def snapshot(self) -> Scene:
-        """Arrays for a picture of this instant; their shapes stay constant.
+        """Arrays from which a picture of this instant is drawn; their shapes are the same at every step.
 
-        Arrays with an entry per agent have the agents first: (agents, …).
+        Arrays with an entry per agent have the agents as first dimension: (agents, …).
         """
 
     def units(self) -> Mapping[str, str]:
@@ -51,18 +54,18 @@ class World(Protocol):
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Draw frame `index` of snapshots stacked to (frames, …); `decision` is (frames, agents)."""
+        """Draw frame `index` of snapshots that are stacked over time; `decision` is (frames, agents)."""
 
 
 @runtime_checkable
 class Choosing(Protocol):
     """World in which agents choose among options, such as the station to go to.
 
-    Agents choose whenever they replan, and take the option with the best plan.
+    Agents choose whenever they replan, and each takes the option for which its plan is best.
     """
 
     def options(self) -> Tensor:
-        """The present states under every option, (agents, k, n); option 0 is the present state."""
+        """States under every option, (agents, k, n); option 0 leaves the present state."""
 
     def choose(self, pick: Tensor) -> Tensor:
         """Apply every agent's option, (agents,) int64; return the states, (agents, n)."""
@@ -70,23 +73,23 @@ class Choosing(Protocol):
 
 @runtime_checkable
 class Redrawing(Protocol):
-    """World that can redraw the start of an agent before the first step."""
+    """World that can draw the initial state of an agent again before the first step."""
 
     def redraw(self, rows: Tensor) -> Tensor:
-        """Redraw the starts of some agents, (k,) int64; return all states, (agents, n).
+        """Draw the initial states of the agents `rows`, (k,) int64, again; return all states, (agents, n).
 
-        Other agents keep theirs, unless they depend on the redrawn ones.
+        Other agents keep their states, unless these depend on the redrawn ones.
         """
 
 
 @runtime_checkable
 class Charting(Protocol):
-    """World whose picture can show plans."""
+    """World whose picture can show planned trajectories."""
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Picture coordinates of planned states (agents, k, n): (agents, k, 2 or 3).
+        """Picture coordinates of planned states: (agents, k, n) -> (agents, k, 2 or 3).
 
-        Row by row for the agents, from their present state on; NaN where the states are NaN.
+        Each agent's states begin with its present one; NaN states give NaN.
         """
 
 
@@ -99,7 +102,7 @@ class WorldType(Protocol):
 
 
 class ModelWorld:
-    """Independent agents that follow the model exactly, with the events of the system file."""
+    """Independent agents that follow the model exactly and are subject to the events of the system file."""
 
     def __init__(self, system: System, agents: int, generator: torch.Generator) -> None:
         self._system, self._agents, self._generator = system, agents, generator
@@ -129,7 +132,7 @@ class ModelWorld:
         return self._happen(moved)
 
     def progress(self) -> Mapping[str, float]:
-        """Number of firings of each conditional event, over all agents."""
+        """How often each event that has a condition fired, over all agents."""
         return dict(self._counts)
 
     def units(self) -> Mapping[str, str]:

@@ -1,9 +1,10 @@
 """Training state of a plan network: gradient steps, exploration, validation, checkpoint contents.
 
-Search and distil: every few dozen steps fresh states are judged, failing ones are repaired by a search that
-starts from the policy's own plan, and repaired plans are imitated for as long as their state still fails.
-Each gradient step mixes fresh states with such hard ones. Of the network's plans the best one is trained
-(winner takes all), with a small weight on the mean so that none stays untrained.
+Search and distil: every few dozen steps the policy's plans from new states are judged, failing plans are
+repaired by a search that starts from them, and repaired plans are imitated for as long as the policy fails at
+their state. Each gradient step uses newly drawn (fresh) states and such failed (hard) ones. Of the network's
+plans the best one is trained (winner takes all), with a small weight on the mean so that none stays
+untrained.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ RISE = 30
 
 
 class Trainer(Learner):
-    """Training of a plan network. The same seed and steps give the same weights on the same machine."""
+    """Training of a plan network; on one machine, equal seeds and steps give equal weights."""
 
     def __init__(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
@@ -89,7 +90,7 @@ class Trainer(Learner):
         self.learnt = torch.empty(0, len(task.system.names), device=device)
 
     def advance(self) -> float:
-        """Make one gradient step and return its loss; NaN and no step if loss or gradient is not finite."""
+        """Make one gradient step; return its loss, or change nothing and return NaN if it is not finite."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate
         value = self._loss()
@@ -121,7 +122,7 @@ class Trainer(Learner):
 
     @property
     def policy(self) -> BestOfKPolicy:
-        """The resulting policy: averaged weights, on the CPU."""
+        """The policy learned until now: the moving average of the weights, on the CPU."""
         on_processor = self.device.type == "cpu"
         return BestOfKPolicy(self.task, self.average if on_processor else deepcopy(self.average).cpu())
 
@@ -136,16 +137,16 @@ class Trainer(Learner):
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Part of the training -> reason why torch is used, or "" where it runs as C."""
+        """Part of the training -> reason why it runs in torch; "" if it runs in C."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
     def wait(self, stop: Stop = never) -> bool:
-        """Wait for the end of the repair search; False where `stop` came first."""
+        """Wait for the end of the repair search; return False if `stop` ended the waiting."""
         return self.repairing is None or self.repairing.result(stop) is not None
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step on any rank, and whether the weights before it give finite plans."""
+        """Cause of a non-finite step on any rank, and whether the weights before it gave finite plans."""
         theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
         x0 = torch.cat((self.learnt, *theirs))
         step = TrainingStep.of(self.network, self.objective, x0, self.step, self.task)
@@ -154,10 +155,10 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Search for plans by exploration, if local search solved hardly any failing state last round.
+        """Search for plans by exploration, if local search solved hardly any failing state in the last round.
 
-        The effort increases whenever nothing is found. False where `stop` came first; then nothing has
-        changed.
+        The effort increases after every search without result. Returns False if `stop` ended the exploration;
+        then nothing has changed.
         """
         if not self.barren:
             return True
@@ -183,9 +184,10 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Judge fresh states; a method that searches also starts to repair failing ones.
+        """Judge the policy's plans from new states; a method that searches starts to repair failing plans.
 
-        The repair runs concurrently with the training steps; the next validation collects its results.
+        The repair runs concurrently with the training steps; its results are collected at the next
+        validation.
         """
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
@@ -206,7 +208,7 @@ class Trainer(Learner):
         return found.mean(self.ranks)
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
-        """Start a search that runs until the next round."""
+        """Start a search for better plans, which runs until the next validation."""
         tries, steps = self._effort[1], self.config.every
         return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
 
@@ -222,10 +224,11 @@ class Trainer(Learner):
             self.repairing.cancel()
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
-        """Store the plans found by the previous search round in replay buffer and supply.
+        """Put the plans that the last search found into the replay buffer and the source of training states.
 
         Returns:
-            Number of states searched, number solved, and the share of states then known to be feasible.
+            Number of states searched, number solved, and the resulting estimate of the share of feasible
+            states.
         """
         if self.repairing is None:
             return 0, 0, None
@@ -267,7 +270,7 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the best plan, which is trained, (B,), and whether any plan satisfies, (B,)."""
+        """Index of the best plan per state, (B,), and whether any plan of the state satisfies phi, (B,)."""
         batch, count = plans.shape[:2]
         if count == 1 and self.config.hard == 0:
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
@@ -277,13 +280,16 @@ class Trainer(Learner):
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
-        """Weighted distance of the nearest plan to the repaired one, over states that still fail."""
+        """Weighted mean square distance between repaired plans and the nearest proposed ones.
+
+        States that are already solved count as 0.
+        """
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
         return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
-        """A feasible gamma: a share of the robustness that search reaches on the median state."""
+        """Feasible margin gamma: a share of the robustness that search reaches on the median state."""
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
         x0 = self.supply.take(min(count, MARGIN_STATES))
@@ -299,7 +305,7 @@ class Trainer(Learner):
         return Searcher(self.task, self.generator, enough=enough, device=self.device)
 
     def _supply(self) -> Supply:
-        """Source of training states: along missions where the specification has memory, else independent."""
+        """Source of training states: along missions if the specification has memory, else random."""
         if not self.task.compiled.timers:
             return Draws(self.task, self.generator, self.device)
         policy = BestOfKPolicy(self.task, self.network)
@@ -314,9 +320,9 @@ class Trainer(Learner):
     # ------------------------------------------------------------- checkpoints
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption, bit for bit; on the first of several ranks, of all ranks.
+        """Tensors from which training resumes exactly, bit for bit; on the first rank, those of all ranks.
 
-        All ranks have to call this at the same time.
+        All ranks (processes that train together) must call this at the same time.
         """
         found: dict[str, Tensor] = self._own()
         for index, theirs in enumerate(self.ranks.gather(found), start=1):
@@ -328,7 +334,7 @@ class Trainer(Learner):
         return found
 
     def _own(self) -> dict[str, Tensor]:
-        """State of this rank alone."""
+        """Tensors of this rank alone."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
@@ -348,7 +354,7 @@ class Trainer(Learner):
         return found
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars stored with `tensors`."""
+        """Scalars that are stored together with `tensors`."""
         return super().facts() | {
             "solved": self.buffer.count,
             "accuracy": self.accuracy,
@@ -357,7 +363,7 @@ class Trainer(Learner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         tensors, facts = self._restored(tensors, facts)
         super().restore(tensors, facts)
         self.accuracy = float(facts["accuracy"])
@@ -389,7 +395,7 @@ class Trainer(Learner):
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """State for this rank: its own entries in place of the first rank's."""
+        """State for this rank, in which its own entries replace those of the first rank."""
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")
@@ -401,7 +407,7 @@ class Trainer(Learner):
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Entries under `prefix.`, without the prefix."""
+    """Entries whose names begin with `prefix.`, under names without it."""
     return {
         name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
     }
@@ -423,20 +429,24 @@ class NetworkMethod(Method):
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
-        """The loss at the margin of the training."""
+        """Loss of the method, with the margin of the training."""
 
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Trainer:
-        """Training state before the first step."""
+        """The training before its first step."""
         return Trainer(task, config, steps=steps, device=device, ranks=ranks)
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
-        """The network of a run, with weights drawn from torch's global generator."""
+        """A network with the options of a run and random weights, drawn from torch's global generator."""
         return PlanNetwork(task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str = "cpu") -> BestOfKPolicy:
-        """Load the policy of a run: averaged weights. Raises RunError: R101 or R102, see `Method.load`."""
+        """Load the policy of a run, with averaged weights.
+
+        Raises:
+            RunError: R101 or R102, see `Method.load`.
+        """
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         network = self.network(task, config)
         try:

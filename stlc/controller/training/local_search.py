@@ -1,9 +1,10 @@
 """Plan repair by batched local search on the exact robustness, starting from the policy's own plan.
 
-Gradients vanish outside a stop zone and do not lead across an obstacle; a search does. Each generation judges
-a batch of changed plans per state and retains the best. Changes are noise over a random stretch of time, a
-constant shift of a stretch, a stretch held at one random level, and plans that solved other states. The
-native kernel does it if there is one, otherwise torch.
+The robustness gradient of a requirement such as stopping in a zone vanishes outside of the zone, and
+gradients do not lead across an obstacle; a search has neither problem. Each generation judges a batch of
+changed plans per state and retains the best. Changes are noise over a random stretch of time, a constant
+shift of a stretch, a stretch held at one random level, and plans that solved other states. The native kernel
+runs the search if there is one, otherwise torch.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ class SearchResult:
 
     Attributes:
         states: initial states, (B, n).
-        plans: the best plan per state, (B, T, m).
-        rho: its exact robustness, (B,).
+        plans: the best plan found per state, (B, T, m).
+        rho: exact robustness of these plans, (B,).
     """
 
     states: Tensor
@@ -55,11 +56,11 @@ class SearchResult:
 
     @property
     def solved(self) -> Tensor:
-        """Mask of the states whose plan satisfies the specification by more than rounding, (B,)."""
+        """Mask of the states whose plan satisfies the specification by more than rounding errors, (B,)."""
         return self.rho >= FLOAT32_SLACK
 
     def to(self, device: torch.device) -> SearchResult:
-        """Copy on another device."""
+        """A copy of the result on another device."""
         return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
 
 
@@ -72,7 +73,7 @@ class Search:
     Attributes:
         states: initial states, (B, n).
         plans: initial plans, (B, T, m).
-        seed: of its random numbers.
+        seed: seed of the search's random numbers.
     """
 
     def __init__(self, states: Tensor, plans: Tensor, seed: int) -> None:
@@ -84,18 +85,18 @@ class Search:
 
     @classmethod
     def of(cls, found: SearchResult) -> Search:
-        """A finished search with the given result."""
+        """A search that is already finished, with the given result."""
         search = cls(found.states, found.plans, 0)
         search._found.set_result(found)
         return search
 
     def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
-        """Start on a thread of `pool`."""
+        """Start the search `climb` on a thread of `pool`."""
         self._found = pool.submit(climb, self._cancelled.is_set)
         return self
 
     def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
-        """Run in `steps` equal shares, one per `advance`."""
+        """Prepare the search `climb` to run in `steps` equal parts, one per call of `advance`."""
         self._climb, self._share = climb, -(-climb.left // max(1, steps))
         return self
 
@@ -104,7 +105,7 @@ class Search:
         return self._found.done()
 
     def advance(self) -> None:
-        """Do one share of the work, unless another thread does it."""
+        """Do one part of the work, unless another thread runs the search."""
         if self._climb is not None and not self.done():
             for _ in range(self._share):
                 if not self._climb.generation():
@@ -112,7 +113,7 @@ class Search:
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
-        """Wait for the result; None where `stop` ends the waiting first."""
+        """Wait for the result and return it; None if `stop` ends the waiting first."""
         while not self.done():
             if stop():
                 return None
@@ -139,7 +140,7 @@ class Searcher:
         enough: float,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Search plans of `task` up to the target robustness `enough`.
+        """Prepare searches for plans of `task` with a robustness of at least `enough`.
 
         The generator and the native search are on the CPU; states and plans are on `device`.
         """
@@ -153,14 +154,14 @@ class Searcher:
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
     ) -> SearchResult:
-        """Improve plans up to the target robustness, with a maximum number of evaluations.
+        """Improve plans until they have the target robustness or `tries` plans were judged.
 
         Args:
             x0: states, (B, n).
             plans: initial plans, (B, T, m).
-            bank: plans that solved other states, (k, T, m); may be empty.
-            tries: maximum evaluations per state.
-            stop: ends the search early, with the best plans so far.
+            bank: library of plans that solved other states, (k, T, m); may be empty.
+            tries: maximum number of plans judged per state.
+            stop: condition that ends the search early, with the best plans until then.
         """
         if self.task.native is not None:
             return self._climbing(x0, plans, bank, tries, cores(), self._seed())(stop).to(x0.device)
@@ -177,9 +178,9 @@ class Searcher:
         steps: int = 1,
         seed: int | None = None,
     ) -> Search:
-        """Start `repair` concurrently.
+        """Start `repair` as a search that runs concurrently with other work.
 
-        The native kernel leaves its result on the CPU; torch works in `steps` shares.
+        The native kernel leaves its result on the CPU; torch works in `steps` parts, see `Search.advance`.
         """
         seed = self._seed() if seed is None else seed
         search = Search(x0, plans, seed)
@@ -189,7 +190,7 @@ class Searcher:
 
     @torch.no_grad()
     def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> SearchResult:
-        """`repair` without plan library on the calling thread, with as many kernel threads as torch has."""
+        """Run `repair` without plan library on the calling thread, with as many threads as torch has."""
         bank = plans.new_zeros(0, *plans.shape[1:])
         if self.task.native is None:
             return self._climb(x0, plans, bank, tries, self._seed()).finish()
@@ -201,7 +202,7 @@ class Searcher:
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
-        """Prepare a native search with its own copies and random numbers."""
+        """Prepare a native search, with copies of its inputs and with random numbers of its own."""
         native = self.task.native
         assert native is not None
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
@@ -222,10 +223,10 @@ class Searcher:
 
 
 class _TorchClimb:
-    """The same local search in torch, one generation at a time.
+    """The same local search in torch, one generation (batch of changed plans per state) at a time.
 
     Attributes:
-        found: the best plans so far.
+        found: the best plans found.
         left: maximum number of remaining generations.
     """
 
@@ -245,7 +246,7 @@ class _TorchClimb:
 
     @torch.no_grad()
     def generation(self, stop: Stop = never) -> bool:
-        """Try `TRIES` changed plans for every unfinished state; False once nothing is left to do."""
+        """Try `TRIES` changed plans for every unfinished state; return False once nothing is left to do."""
         still = (self.found.rho < self.enough).nonzero()[:, 0]
         if self.left == 0 or not len(still):
             return False
@@ -257,13 +258,13 @@ class _TorchClimb:
         return self.left > 0
 
     def finish(self, stop: Stop = never) -> SearchResult:
-        """Run to the end and return the result."""
+        """Run the search to its end and return the result."""
         while not stop() and self.generation(stop):
             pass
         return self.found
 
     def _keep_better(self, still: Tensor, tried: Tensor) -> None:
-        """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
+        """Judge plans (k, tries, T, m) for the states with indices `still`, (k,), and update `found`."""
         found, tries = self.found, tried.shape[1]
         x0 = found.states[still].repeat_interleave(tries, 0)
         judged = self.task.judge(x0, tried.flatten(0, 1), states=False)
@@ -274,7 +275,7 @@ class _TorchClimb:
         found.rho[rows] = value[better]
 
     def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
-        """Changed plans, (B, tries, T, m), within the bounds."""
+        """Changed plans, (B, tries, T, m), within the control bounds."""
         quarter = tries // 4
         span = self.high - self.low
         start = plans[:, None]
@@ -288,7 +289,7 @@ class _TorchClimb:
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
-        """Plans that solved other states; piecewise constant ones while there are few."""
+        """Plans that solved other states, (B, count, T, m); while there are few, piecewise constant plans."""
         states, steps, controls = plans.shape
         if bank.shape[0] >= 64:
             return bank[self._randint(0, bank.shape[0], states, count)]
@@ -297,7 +298,7 @@ class _TorchClimb:
         return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
 
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:
-        """Mask of a random stretch of time per plan and control: (B, tries, T, m)."""
+        """Mask of a random interval of time for each plan and control: (B, tries, T, m)."""
         states, tries, steps, controls = shape
         first = self._randint(0, steps, states, tries, 1, controls)
         length = self._randint(1, steps + 1, states, tries, 1, controls)
@@ -315,5 +316,5 @@ class _TorchClimb:
 
 
 def idle_cores() -> int:
-    """Cores that torch leaves to a concurrent search, at least one."""
+    """Number of cores that torch leaves to a concurrent search, at least 1."""
     return max(1, cores() - int(torch.get_num_threads()))

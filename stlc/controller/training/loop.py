@@ -1,4 +1,4 @@
-"""Training loop: steps, validations, log rows, checkpoints, and the final evaluation."""
+"""Training loop: steps, validations, rows of `train.jsonl`, checkpoints, and the final evaluation."""
 
 from __future__ import annotations
 
@@ -69,12 +69,13 @@ class Watch:
     """Callbacks of a training.
 
     Attributes:
-        started: called once with the resolved options, including margin and number of steps.
+        started: called once with the resolved options, which include the margin and the number of steps.
         row: called with every row of `train.jsonl`.
         stop: called after every step; True saves and ends the training.
-        deferring: context of the steps, in which an interrupt waits until the step is finished and saved.
-            Outside of it an interrupt may be raised anywhere.
-        late: wall-time budget -> seconds by which the work around the training would exceed it.
+        deferring: context manager around the steps, in which an interrupt is deferred until the step is
+            finished and saved; outside of it an interrupt may be raised anywhere.
+        late: function of the wall-time budget that returns the seconds by which the work around the training
+            would exceed it.
         evaluating: called with the progress of the final evaluation, as a short text.
     """
 
@@ -99,17 +100,18 @@ def train(
     Args:
         task: problem to train for.
         config: the user's options.
-        folder: of the run.
+        folder: folder of the run.
         watch: callbacks.
-        ranks: processes that train together; all call this at the same time, the first one writes.
+        ranks: processes that train together; all call this function at the same time, and the first one
+            writes.
 
     Raises:
-        SystemFileError: S301, hardly any initial state is admissible; S304, the mirror of the policy is no
-            symmetry.
+        SystemFileError: S301, hardly any initial state is admissible; S302, states are not finite; S304, the
+            declared mirror is no symmetry of the system.
         MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, a rank is
             gone.
         RunError: R401, the loss or its gradient is not finite.
-        SystemFileError: S302, states are not finite.
+
     """
     now = clock_of(config.clock)
     started = now()
@@ -148,16 +150,17 @@ def resume(
     """Resume an interrupted run; the weights become those of an uninterrupted run, bit for bit.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         steps: new total number of steps.
         budget: additional seconds; if neither is given, the rest of the run's budget is used, or its step
             schedule is completed.
-        device: of torch.
+        device: torch device.
         watch: callbacks.
-        ranks: processes that train together: as many as before.
+        ranks: processes that train together; their number must be the same as before.
 
     Raises:
-        RunError: R101, R102, or R103 where nothing is left to do.
+        RunError: R101, the run is damaged or was never saved; R102, its checkpoint belongs to another
+            specification or system; R103, nothing is left to do.
         UsageError: R104, the run was trained with another number of ranks.
     """
     keep_freed_memory()
@@ -212,7 +215,7 @@ def resume(
 def _without_steps(
     method: Method, task: Task, config: ResolvedConfig, writer: RunWriter, time: TimeBudget, watch: Watch
 ) -> TrainingOutcome:
-    """Outcome of a planner, which is evaluated without training."""
+    """Outcome of a run whose policy is a planner, which is evaluated without training."""
     margin = task.system.decl.objective.gamma
     writer.note({"margin": margin, "steps": 0, "schedule": None})
     watch.started({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
@@ -222,7 +225,7 @@ def _without_steps(
 
 
 def _require_as_many(before: int, now: int) -> None:
-    """Raise UsageError (R104) where a run is resumed with another number of ranks."""
+    """Raise UsageError (R104) if the number of ranks differs from that before."""
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
         raise UsageError(
@@ -236,7 +239,11 @@ def _require_as_many(before: int, now: int) -> None:
 
 
 def find_device(name: str) -> torch.device:
-    """Return a torch device. Raises MissingError R302 where it does not exist."""
+    """Return a torch device.
+
+    Raises:
+        MissingError: R302, the device does not exist.
+    """
     try:
         best = "cuda" if torch.cuda.is_available() else "cpu"
         device = torch.device(best if name == "auto" else name)
@@ -252,12 +259,12 @@ def find_device(name: str) -> torch.device:
 
 
 class _Session:
-    """A training session: from the learner's present state to the end, or to an interruption."""
+    """Training session: from the learner's present state to the end of the training or an interruption."""
 
     def __init__(
         self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
     ) -> None:
-        """`schedule` is completed; with a budget it is replanned as the pace demands."""
+        """Prepare to complete `schedule`; with a budget, the number of steps is adapted to the pace."""
         self.writer = writer
         self.learner = learner
         self.watch = watch
@@ -296,7 +303,7 @@ class _Session:
             learner.close()
 
     def _trained(self) -> bool:
-        """Make all steps; False where the run is to stop earlier."""
+        """Make all steps; return False if the training has to stop before the last one."""
         learner, saved = self.learner, time.perf_counter()
         while (more := self._goes_on()) and not self._hopeless():
             if not math.isfinite(learner.advance()):
@@ -314,10 +321,10 @@ class _Session:
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
-        """True if another step follows, after a validation if one is due; None: the run is to stop.
+        """Validate if that is due, and return whether another step follows; None: the training has to stop.
 
-        The end and a validation wait for the concurrent search. If that takes less time than expected,
-        further steps may fit into the budget.
+        The end of training and a validation wait for the concurrent search. If that takes less time than
+        expected, further steps may fit into the budget.
         """
         learner = self.learner
         ends = self._planned() <= learner.step
@@ -333,7 +340,7 @@ class _Session:
         return True
 
     def _planned(self) -> int:
-        """Number of steps planned at this moment: by the budget, or by the schedule."""
+        """Total number of steps as planned at present, by the budget or by the schedule."""
         learner = self.learner
         if self.time.allowed:
             left = self.time.started + self.time.seconds - self.evaluation.reserve - self.now()
@@ -347,14 +354,14 @@ class _Session:
 
     @property
     def _known_steps(self) -> int | None:
-        """Total number of steps; None until those of a budget have been planned."""
+        """Total number of steps; None with a budget for which no steps have been planned yet."""
         return None if self.time.allowed and not self.pace.planned else self.schedule.steps
 
     def _note_schedule(self) -> None:
         self.writer.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
     def _validate(self, began: float) -> None:
-        """Validate and write the row; `began`: clock reading before the round."""
+        """Validate, and write the row of `train.jsonl`; `began`: clock reading before the validation."""
         learner = self.learner
         found = learner.validate()
         self.pace.validated(learner.step, self.now() - began)
@@ -365,7 +372,7 @@ class _Session:
             self.refuted = learner.ranks.any(refuted(learner.task))
 
     def _wait_for_search(self) -> bool:
-        """Wait for the concurrent search; False where the run is to stop earlier."""
+        """Wait for the concurrent search; return False if the training has to stop before its end."""
         began = self.now()
         came = self.learner.wait(self.watch.stop)
         if self.learner.searches:
@@ -373,7 +380,7 @@ class _Session:
         return not self.learner.ranks.any(not came)
 
     def _hopeless(self) -> bool:
-        """True if policy and search never satisfied the specification, after all effort or by proof."""
+        """True if policy and search never satisfied the specification, by proof or after all efforts."""
         learner = self.learner
         enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:
@@ -381,7 +388,7 @@ class _Session:
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
-        """Outcome of a session without evaluation."""
+        """Outcome of a session that ends without evaluation."""
         learner = self.learner
         run = Run(self.writer.folder, learner.task, learner.policy)
         return TrainingOutcome(
@@ -389,7 +396,7 @@ class _Session:
         )
 
     def _save(self) -> None:
-        """Write a checkpoint; of a running search it keeps the inputs."""
+        """Write a checkpoint; for a running search, its inputs are saved."""
         began = self.now()
         facts = {
             **self.learner.facts(),
@@ -421,7 +428,7 @@ class _Session:
         self.watch.row(row)
 
     def _broken(self) -> StlcError:
-        """Cause of a non-finite step. The weights before it are saved if finite."""
+        """Error with the cause of a non-finite step; the weights before it are saved if they are finite."""
         error, good = self.learner.diagnose()
         if good:
             self._save()

@@ -1,4 +1,4 @@
-"""Training loss: the paper's truncated robustness and performance terms (Eq. 8 to 10)."""
+"""Training loss: truncated robustness plus performance terms, as in the paper (Eq. 8 to 10)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ class Objective:
     """Parameters of the loss.
 
     Attributes:
-        margin: the paper's gamma, at which robustness is truncated.
-        smoothing: the paper's k; None: exact min and max with subgradients.
-        switch: differentiable form of jumps and indicators.
-        saturation: s of `s log(1 + hinge / s)`, so that infeasible states do not dominate; None: plain hinge.
+        margin: the paper's gamma; robustness above it does not reduce the loss.
+        smoothing: the paper's k of smooth min and max; None: exact min and max with subgradients.
+        switch: form of jumps and indicators that is differentiated.
+        saturation: s of `s log(1 + hinge / s)`, which keeps infeasible states from dominating; None: plain
+            hinge.
         stl_weight: the paper's lambda.
         performance_weight: factor of the performance terms.
     """
@@ -40,7 +41,7 @@ class Objective:
 
 
 def paper_objective(task: Task) -> Objective:
-    """The paper's objective: hinge at gamma on log-sum-exp robustness, tanh switching (Eq. 6 to 10)."""
+    """The paper's objective: hinge at gamma on log-sum-exp robustness, with tanh switching (Eq. 6 to 10)."""
     declared = task.system.decl.objective
     return Objective(
         margin=declared.gamma,
@@ -52,7 +53,7 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """Objective of the `guided` method: exact operators, a feasible margin, a saturating hinge."""
+    """Objective of the method `guided`: exact min and max, and a saturating hinge at a feasible margin."""
     return Objective(
         margin=margin,
         smoothing=None,
@@ -72,7 +73,8 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
         u: plans in physical units, (B, T, m), differentiable.
 
     Returns:
-        Loss per plan, (B,), differentiable; the performance terms count where the plan satisfies exactly.
+        Loss per plan, (B,), differentiable; the performance terms count only for plans that satisfy the
+        specification.
     """
     rho, columns = _rolled(task, objective, x0, u)
     exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
@@ -88,9 +90,9 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
 def native_rolled(
     task: Task, objective: Objective, x0: Tensor, u: Tensor
 ) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, by generated C.
+    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, computed in C.
 
-    None where the objective has another meaning, or where torch has to be used.
+    None if the native kernel cannot compute what the objective requires, or if torch has to be used.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
@@ -100,7 +102,7 @@ def native_rolled(
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where the meaning is the same."""
+    """Robustness (B,) and states (T+1, B) by name, differentiable; in C if that is equivalent."""
     native = native_rolled(task, objective, x0, u)
     if native is not None:
         return task.graph.overall(native[0]), native[1]

@@ -1,4 +1,4 @@
-"""A finished or unfinished training run: its folder, task and policy."""
+"""A training run, finished or not: its folder, task and policy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Run:
     """A training run.
 
     Attributes:
-        dir: its folder.
+        dir: folder of the run.
         task: problem of the training.
         policy: the trained policy; call it with states (B, n) for plans (B, T, m) in physical units.
     """
@@ -64,12 +64,13 @@ class Run:
     ) -> Run:
         """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
 
-        `overrides` change constants and set parameters, as `--set` does, and a `scenario` of the system file
-        is applied; the policy is unchanged.
+        `overrides` change constants and set parameters, as `--set` does; `scenario` is the one of the system
+        file to apply. The policy is unchanged.
 
         Raises:
             UsageError: the run does not exist.
-            RunError: R101, it is damaged or has no checkpoint yet; R102, its checkpoint is of another task.
+            RunError: R101, the run is damaged or has no checkpoint yet; R102, its checkpoint belongs to
+                another task.
             SpecError, SystemFileError: its specification or system is invalid.
         """
         folder = RunDir.open(where, root)
@@ -79,7 +80,11 @@ class Run:
 
     @property
     def network(self) -> PlanNetwork:
-        """The network of the policy. Raises RunError (R101) where the run's method trains none."""
+        """The network of the policy.
+
+        Raises:
+            RunError: R101, the run's method trains no network.
+        """
         if self.policy.network is None:
             message = f"the policy of `{self.dir.shown}` is no network"
             raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
@@ -92,10 +97,10 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class RunWriter:
-    """Writer of a run's folder during training. Of several ranks only the first writes.
+    """Writer of a run's folder during training; of several ranks (processes) only the first writes.
 
     Attributes:
-        folder: of the run.
+        folder: folder of the run.
         writes: whether this process writes.
     """
 
@@ -113,7 +118,7 @@ class RunWriter:
             self.folder.update(facts)
 
     def before(self, step: int) -> None:
-        """Drop the rows of the validation at step `step` and of later ones; these steps are run again."""
+        """Remove rows of validations at `step` and later from `train.jsonl`; these steps are run again."""
         if self.writes:
             self.folder.keep_rows(lambda row: row.get("step", 0) < step)
 
@@ -123,7 +128,11 @@ class RunWriter:
             self.folder.append_row(row)
 
     def checkpoint(self, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int) -> None:
-        """Write a checkpoint at a step. Raises MissingError (R201); the last good one stays."""
+        """Write a checkpoint at a step.
+
+        Raises:
+            MissingError: R201, it cannot be written; the last good checkpoint stays.
+        """
         if self.writes:
             hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
             save_checkpoint(self.folder, tensors, {**facts, **hashes}, step=step)
@@ -134,7 +143,7 @@ class RunWriter:
             save_states(self.folder.path / "eval" / "held_out.npz", task, score)
 
     def close(self, status: Status, result: object = None) -> None:
-        """Record how the training ended."""
+        """Record the status and the result with which the training ended."""
         if self.writes:
             self.folder.finish(status, result)
 
@@ -142,9 +151,9 @@ class RunWriter:
 def load_task(
     folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
 ) -> Task:
-    """Compile the specification and the system of a run's folder, with `overrides` applied.
+    """Compile the specification and the system in a run's folder, with `overrides` applied.
 
-    A parameter that the policy was trained with keeps its column, with the given value.
+    A parameter that the policy observes keeps its column (entry of the state), with the given value.
     """
     trained = folder.record().get("overrides") or {}
     spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
@@ -168,10 +177,10 @@ def system_hash(folder: RunDir) -> str:
 
 
 def trained_on(folder: RunDir) -> str:
-    """Hash of the system that a policy was trained on, if it may be deployed on the one in the folder.
+    """Hash of the system file that a policy was trained on, or else of the one in the run's folder.
 
-    The fields that determine what a policy learns must be unchanged; worlds, scenarios and backup may be
-    edited.
+    The former is returned if the system file was edited but the policy may still be deployed on it: the
+    fields that determine what a policy learns are unchanged; worlds, scenarios and backup may differ.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")
@@ -188,7 +197,7 @@ def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -
 
 
 def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
-    """Save the imports of a specification: the texts in a folder of their own, and an index."""
+    """Save the texts of a specification's imports in the subfolder `below`, with an index."""
     for key, text in library.items():
         write_atomic(folder.path / below / file_of(key), text)
     if library:
@@ -196,7 +205,11 @@ def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -
 
 
 def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
-    """Read the texts saved by `save_library`, by key. Raises RunError (R101) where one is damaged."""
+    """Read the texts saved by `save_library`, by name of the import.
+
+    Raises:
+        RunError: R101, a text is damaged.
+    """
     if not (folder.path / below / INDEX).is_file():
         return {}
     index = folder.read_json(f"{below}/{INDEX}")
@@ -207,12 +220,16 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
 
 
 def save_config(folder: RunDir, config: ResolvedConfig) -> None:
-    """Write the resolved options of a run; JSON is YAML too."""
+    """Write the resolved options of a run, as JSON, which is also YAML."""
     write_atomic(folder.path / CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
 def load_config(folder: RunDir) -> ResolvedConfig:
-    """Read the resolved options of a run. Raises RunError R101 where they are damaged."""
+    """Read the resolved options of a run.
+
+    Raises:
+        RunError: R101, they are damaged.
+    """
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
         method = values["method"]

@@ -1,10 +1,11 @@
 """Sources of training states: independent draws, a fixed set, states along missions, solved hard states.
 
-Where a specification has memory (clock, statuses, timers), a state is useful for training only if a mission
-reaches it: the memory must fit the position. Therefore a pool of missions is simulated with the plans of the
-present policy, and the states on the way are returned. A mission ends when it is over or lost, and often
-where no plan satisfies the specification; a new one starts in its place. Early in training missions end
-early; later they get further, and plans that search found for failing states continue some of them.
+If a specification has memory (the time of the mission, satisfied goals, timers), only states that a mission
+reaches are useful for training, because the memory must fit the position. Therefore a pool of missions is
+simulated with the plans of the present policy, and the states on the way are returned. A new mission starts
+in place of one that is over, that can no longer satisfy the specification, or, often, at a state from which
+no satisfying plan is found. Early in training missions end soon; later they get further, and plans that
+search found for failing states continue some of them.
 """
 
 from __future__ import annotations
@@ -59,20 +60,20 @@ class Supply(ABC):
         return taken
 
     def follow(self, states: Tensor, plans: Tensor) -> None:  # noqa: B027
-        """Use plans that solve states on which the policy fails: (k, n), (k, T, m); ignored by default."""
+        """Use plans that solve states where the policy fails: (k, n), (k, T, m); by default ignored."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """State of the source, by name."""
+        """State of the source, as tensors by name."""
         return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state of `tensors`."""
+        """Restore the state from what `tensors` returned."""
         for name in self.state:
             setattr(self, name, tensors[name].to(self.device))
 
 
 class Draws(Supply):
-    """Independent initial states."""
+    """Source of independent initial states."""
 
     def _more(self, n: int) -> Tensor:
         return self.task.sample(max(n, BLOCK), generator=self.generator, device=self.device)
@@ -82,7 +83,7 @@ class FixedSet:
     """A fixed training set: states of another source, reshuffled after each pass.
 
     Attributes:
-        states: all of them, (size, n).
+        states: all states of the set, (size, n).
         queue: indices that remain in this pass, (k,).
     """
 
@@ -101,11 +102,11 @@ class FixedSet:
         return self.states[taken]
 
     def tensors(self) -> dict[str, Tensor]:
-        """The set, and the rest of the present pass."""
+        """The states of the set, and the indices that remain in the present pass."""
         return {"states": self.states, "queue": self.queue}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state of `tensors`."""
+        """Restore the state from what `tensors` returned."""
         self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))
 
 
@@ -124,7 +125,7 @@ GIVE_UP = 0.3
 
 
 class Missions(Supply):
-    """States along missions simulated with a planner.
+    """Source of states along missions that are simulated with a policy.
 
     Attributes:
         block: visited states not yet returned, (k, n).
@@ -141,7 +142,7 @@ class Missions(Supply):
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Continue some missions from states reached by plans that solve states on which the policy fails."""
+        """Continue some missions from states that are reached by plans found for failing states."""
         if len(states) and len(self.pool):
             judged = self.task.judge(states, plans)
             reached = self._at(judged, self._legs(len(states)))
@@ -153,7 +154,7 @@ class Missions(Supply):
 
     @torch.no_grad()
     def _more(self, _n: int) -> Tensor:
-        """Simulate every mission for one leg, and return states on the way in random order, (k, n)."""
+        """Simulate every mission for a number of steps and return visited states in random order, (k, n)."""
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
         judged = self._plan(self.pool)
@@ -169,19 +170,19 @@ class Missions(Supply):
         return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
-        """Restart missions that are over or lost, and some whose plan failed."""
+        """Restart missions that are over or can no longer succeed, and some of those whose plan failed."""
         given_up = ~good & (self._rand(len(good)) < GIVE_UP)
         ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
-        """Random number of steps for which plans are followed, up to half of the horizon, (n,) int64."""
+        """Random numbers of steps for which plans are followed, at most half of the horizon, (n,) int64."""
         most = max(self.task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
-        """Predicted states after `steps`, one number per row: (n, dim)."""
+        """Predicted states after the number of steps that `steps` gives for each row: (n, dim)."""
         return torch.stack(
             [judged.columns[name].gather(0, steps[None])[0] for name in self.task.system.names], 1
         )
@@ -197,7 +198,10 @@ class Missions(Supply):
 
 
 def mission_steps(task: Task) -> int:
-    """Steps of a mission: up to a horizon past the last named one; without end, some periods."""
+    """Number of steps of a mission: a horizon past the last time in the specification.
+
+    For a mission without end, it is a number of periods.
+    """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
         return task.horizon * 4
@@ -208,9 +212,9 @@ def mission_steps(task: Task) -> int:
 
 @torch.no_grad()
 def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
-    """`n` states along missions simulated with the policy, (n, dim) float64.
+    """States along missions simulated with the policy, (n, dim) float64.
 
-    The simulation stops once `enough` returns True.
+    The simulation ends once `enough` returns True.
     """
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)
@@ -236,12 +240,12 @@ CAPACITY = 20_000
 
 @dataclass(slots=True)
 class ReplayBuffer:
-    """Ring buffer of solved hard states.
+    """Ring buffer of hard states (at which the policy failed) with the plans found for them.
 
     Attributes:
         states: (capacity, n).
         plans: (capacity, T, m).
-        count: solved states ever added; the newest `min(count, capacity)` are kept.
+        count: number of states ever added; the newest `min(count, capacity)` are kept.
     """
 
     states: Tensor
