@@ -28,7 +28,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files aw
 @pytest.fixture
 def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(native, "_made", {})
+    monkeypatch.setattr(native, "_temporary", {})
     monkeypatch.setattr(toolchain, "_known", {})
     return tmp_path / "cache/stlc"
 

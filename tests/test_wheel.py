@@ -249,6 +249,8 @@ TRAIN = THREE[0]
 COMMANDS = {
     "log": ([*TRAIN, "--log", "tensorboard"],),
     "onnx": (TRAIN, ["export", "latest", "--to", "onnx"]),
+    "plan": (["plan", "specs/traffic.stl", "--method", "milp", "--budget", "5s"],),
+    "mpc": (["plan", "specs/ship_safe.stl", "--method", "mpc", "--budget", "5s"],),
 }
 
 

@@ -36,7 +36,7 @@ def hanging(monkeypatch, tmp_path):
         (toolchain, "IDLE", 0.2),
         (toolchain, "_known", {}),
         (toolchain, "_versions", {}),
-        (native, "_made", {}),
+        (native, "_temporary", {}),
         (trace_csv, "LARGE", 1),
     ):
         monkeypatch.setattr(module, name, value)

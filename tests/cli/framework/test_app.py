@@ -35,7 +35,7 @@ from stlc.diagnostics import (
 from stlc.version import __version__
 
 COMMANDS = (
-    *("train", "simulate", "check", "explain", "plot", "report", "runs"),
+    *("train", "simulate", "plan", "check", "explain", "plot", "report", "runs"),
     *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
     "export",
 )

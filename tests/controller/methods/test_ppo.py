@@ -88,9 +88,9 @@ def test_the_policy_plays_what_the_environments_play(car_task: Task) -> None:
             actions.append(network(seen))
             seen = made.step(actions[-1]).observation
     policy, wanted = ActorPolicy(car_task, network), torch.stack(actions, 1).double()
-    torch.testing.assert_close(policy.plan(first), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(policy.plan(first).double(), wanted, rtol=1e-5, atol=1e-5)
     policy._native = lambda _system: None  # type: ignore[method-assign, assignment]
-    torch.testing.assert_close(policy.plan(first), wanted, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(policy.plan(first).double(), wanted, rtol=1e-4, atol=1e-4)
     assert observe(car_task, first, made.steps)[:, -1].tolist() == [1.0] * 8
 
 
