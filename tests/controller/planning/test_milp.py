@@ -111,6 +111,13 @@ def test_the_greatest_robustness_is_found(cart: System) -> None:
     assert plan(task_of(cart, "eventually[0 s, 3 s] p > 3.5"), x0, "milp").infeasible.tolist() == [True]
 
 
+def test_a_margin_of_exactly_zero_is_a_plan(cart: System) -> None:
+    """Full acceleration alone reaches p = 3 within 3 s; solvers stay beside a boundary, plans may not."""
+    found = plan(task_of(cart, "eventually[0 s, 3 s] p >= 3"), torch.zeros(1, 3), "milp")
+    assert found.satisfied.tolist() == [True]
+    assert not bool(found.infeasible.any())
+
+
 def test_an_expression_that_is_not_linear_is_named(cart: System) -> None:
     with pytest.raises(UsageError, match=r"cannot encode p \* v"):
         plan(task_of(cart, "always[0 s, 5 s] p * v < 1"), torch.zeros(1, 3), "milp")

@@ -1,9 +1,9 @@
 """Encoding of dynamics and formulas of the IR from one initial state, as a mixed-integer linear model.
 
-Columns that no control reaches are numbers and fold away. `Encoding.TIGHT` keeps every condition by a small
-margin, so that its solutions are plans; `Encoding.RELAXED` contains every satisfying plan, so that its
-infeasibility is a proof. Both are exact up to `MARGIN` but for norms, whose circles are polygons with
-`SIDES` sides: inscribed in the one, circumscribed in the other.
+Columns that no control reaches are numbers and fold away. A tight encoding keeps the conditions of the
+dynamics by `MARGIN`, so that its solutions are plans; a relaxed one contains every satisfying plan, so that
+its infeasibility is a proof. Both are exact up to `MARGIN` but for norms, whose circles are polygons with
+`SIDES` sides: inscribed in the tight encoding, circumscribed in the relaxed one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from stlc.compile.ir.text import show_number
 from stlc.compile.ir.traverse import leaves, nodes, numbers
 
 MARGIN = 1e-5
-"""Margin of conditions in the tight encoding, and their tolerance in the relaxed one."""
+"""Margin of the dynamics' conditions in a tight encoding; tolerance of all conditions in a relaxed one."""
 SIDES = 16
 """Sides of the polygon that stands for a circle."""
 
@@ -141,6 +141,7 @@ class Encoding:
         self.controls: list[list[Affine]] = []
         self._tight = tight
         self._slack = constant(MARGIN if tight else -MARGIN)
+        self._required = constant(0.0 if tight else -MARGIN)  # a margin of exactly 0 satisfies
         self._numbers: dict[tuple[int, int], Value] = {}
         self._trees: dict[tuple[int, int, int], Tree] = {}
         self._free: set[int] = set()
@@ -243,7 +244,7 @@ class Encoding:
             case ir.Truth(value):
                 return value
             case ir.Predicate():
-                return self._predicate(node, k, margin.margin.plus(self._slack))
+                return self._predicate(node, k, margin.margin.plus(self._required))
             case ir.BoolOp(op, items):
                 return junction(op, [self._tree(item, k, margin) for item in items])
             case ir.AtStart(body):
@@ -286,7 +287,7 @@ class Encoding:
     def _predicate(self, node: ir.Predicate, k: int, margin: Affine) -> Tree:
         value = self._number(node.num, k).times(float(node.sign))
         if value.known is not None and (node.guard or not margin.terms):
-            least = 0.0 if node.guard else margin.const - self._slack.const
+            least = 0.0 if node.guard else margin.const - self._required.const
             slack = 0.0 if self._tight or node.guard else MARGIN
             return value.known > least if node.strict and node.guard else value.known >= least - slack
         return self._condition(value, ZERO if node.guard else margin, node.num)
