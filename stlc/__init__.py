@@ -108,7 +108,7 @@ class _CallablePackage(ModuleType):
     """
 
     def __call__(self, spec: ast.Spec, system: System) -> Task:
-        """Join a specification and a system: the states with the timers, and the robustness graph.
+        """Compile the specification for the system, whose states are extended by the specification's timers.
 
         Raises:
             SpecError: the specification is invalid, or does not fit the system.

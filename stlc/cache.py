@@ -175,7 +175,11 @@ def why_not() -> str:
 
 
 def opened() -> Cache:
-    """The user's cache folder. Raises Unusable."""
+    """Open the user's cache folder.
+
+    Raises:
+        Unusable: the folder cannot be used.
+    """
     return private(place())
 
 
@@ -184,7 +188,7 @@ _descriptors: dict[Path, int] = {}
 
 
 def private(path: Path) -> Cache:
-    """A folder that only the user can write to, created if missing.
+    """Open a folder to which only the user can write, as a cache; it is created if missing.
 
     Raises:
         Unusable: it cannot be created, or another user could have changed its content.
@@ -205,7 +209,7 @@ def private(path: Path) -> Cache:
 
 
 def _checked_folder(path: Path) -> Path:
-    """The path of a folder through an open descriptor, after a check of its owner and mode."""
+    """Check owner and mode of a folder; return its path through an open file descriptor."""
     open_one = _descriptors.get(path)
     fresh = open_one is None or not os.path.samestat(os.fstat(open_one), path.lstat())
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else open_one
@@ -279,7 +283,7 @@ def prune(store: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST
 
 
 def _entries(store: Cache) -> Iterator[tuple[str, os.stat_result]]:
-    """The files of the cache that are stlc's own."""
+    """The files in the cache folder that stlc has written, with their status."""
     with suppress(OSError), os.scandir(store.folder) as entries:
         for entry in entries:
             if entry.name.startswith((*KINDS, _UNFINISHED)):

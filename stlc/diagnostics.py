@@ -54,7 +54,7 @@ class Diagnostic:
 
     @property
     def severity(self) -> Severity:
-        """Error or warning, by the letter of the code."""
+        """Severity, "error" or "warning", by the first letter of the code."""
         return "warning" if self.code.startswith("W") else "error"
 
     def with_note(self, text: str) -> Diagnostic:
@@ -101,7 +101,7 @@ class StlcError(Exception):
         self.diagnostics = diagnostics
 
     def __reduce__(self) -> tuple[type[StlcError], tuple[Diagnostic, ...]]:
-        """Pickled form: an error keeps its findings between processes."""
+        """Arguments for pickling, by which an error keeps its findings when it is sent to another process."""
         return type(self), self.diagnostics
 
 
@@ -114,7 +114,7 @@ class SystemFileError(StlcError):
 
 
 class TraceError(StlcError):
-    """A recorded trace cannot be used."""
+    """A trace cannot be used."""
 
 
 class RunError(StlcError):

@@ -35,7 +35,7 @@ def visible(text: str) -> str:
 
 
 def unseen(text: str) -> str:
-    """The first character of a text that `visible` would replace; "" if there is none."""
+    """The first character of a text that `visible` would replace; "" if there is no such character."""
     found = _INVISIBLE.search(text)
     return "" if found is None else found[0]
 
@@ -71,7 +71,7 @@ def shell(words: Iterable[str]) -> str:
 
 
 def operand(path: str) -> str:
-    """A path as an argument: a leading dash is not taken for an option."""
+    """A path as a command-line argument; one that begins with a dash is not taken for an option."""
     return f"./{path}" if path.startswith("-") else path
 
 
@@ -83,7 +83,7 @@ def _word(text: str) -> str:
 
 
 def _ansi(char: str) -> str:
-    """A character within `$'…'`; an invisible one is written as its bytes."""
+    """A character as written within `$'…'` in a shell; an invisible one is written as its bytes."""
     if not _INVISIBLE.match(char):
         return char
     return "".join(
@@ -100,7 +100,7 @@ def _raw(char: str) -> bool:
 
 
 def c_string(text: str) -> str:
-    """A literal of C99 and C++11 that holds the text in UTF-8, quotes included.
+    """A string literal of C99 and C++11 that holds the text in UTF-8, with its quotes.
 
     Characters other than printable ASCII are written as three octal digits; question marks do not form
     trigraphs. The literal is not a format string: print it by `%s`.

@@ -191,7 +191,7 @@ def find_spec(name: Path | str) -> Path:
 
 
 def _straight(path: Path) -> Path:
-    """`specs/../examples/car.yaml` as `examples/car.yaml`, unless a link makes that another file."""
+    """Shorten `specs/../examples/car.yaml` to `examples/car.yaml`, unless a link makes that another file."""
     short = Path(os.path.normpath(path))
     return short if short.is_file() and short.samefile(path) else path
 
@@ -217,7 +217,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def is_stored(path: Path) -> bool:
-    """True if a path is a file of a ROS 2 bag, packed or not."""
+    """True if a path is a storage file of a ROS 2 bag, compressed or not."""
     return path.name.lower().removesuffix(".zstd").endswith((".db3", ".mcap")) and path.is_file()
 
 

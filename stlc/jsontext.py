@@ -45,7 +45,7 @@ def plain(value: object) -> Json:
 
 
 def _foreign(value: object) -> Json:
-    """Convert dataclasses, and arrays with `tolist` (NumPy, torch)."""
+    """Convert an object to JSON data if it is a dataclass, or an array with `tolist` (NumPy, torch)."""
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
     to_list = getattr(value, "tolist", None)

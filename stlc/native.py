@@ -67,14 +67,14 @@ Doubles = "NDArray[np.float64]"
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Parameters of a local search; all arrays contiguous float64.
+    """Parameters of a local search in native code; all arrays are contiguous float64.
 
     Attributes:
         bounds: lowest and highest value of each control, and 1 for a periodic angle, (3, m).
         factors: scale of each requirement's robustness in the total, (R,).
-        bank: plans of other states, (k, T, m).
-        generations: number of generations, of `LANES` changed plans each.
-        enough: target robustness at which the search of a row ends.
+        bank: library of plans that solved other states, (k, T, m).
+        generations: number of generations, in each of which `LANES` changed plans are tried.
+        enough: target robustness at which the search of a row (one initial state) ends.
         seed: seed of the random changes.
         stop: condition that ends the search before all rows are done.
     """
@@ -89,7 +89,10 @@ class SearchOptions:
 
 
 class Kernel:
-    """The compiled functions `judge` and `climb`; see `stlc.compile.backends.c.emit`."""
+    """Library with the compiled functions `judge` (robustness of plans) and `climb` (local search).
+
+    Their C code comes from `stlc.compile.backends.c.emit`.
+    """
 
     def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
         self._judge, self._climb = library.judge, library.climb
@@ -142,8 +145,8 @@ class Kernel:
             threads: number of threads; the result does not depend on it.
 
         Returns:
-            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN. If the search was
-            stopped, the last rows are unchanged, and their robustness is NaN.
+            Plans (B, T, m) and their robustness (B,); -inf if the dynamics give NaN. If the search was
+            stopped early, the plans of the last rows are unchanged, and their robustness is NaN.
 
         Raises:
             MemoryError: there is not enough memory.
@@ -177,7 +180,10 @@ class ObjectiveSlopes:
 
 
 class Adjoint:
-    """The compiled function `pull`; see `stlc.compile.backends.c.adjoint`."""
+    """Library with the compiled function `pull`, the gradient of an objective by the plans.
+
+    Its C code comes from `stlc.compile.backends.c.adjoint`.
+    """
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._pull = library.pull
@@ -191,16 +197,16 @@ class Adjoint:
         *,
         threads: int = 1,
     ) -> NDArray[np.float64]:
-        """The gradient by plans of an objective of robustness and states.
+        """Gradient, by the plans, of an objective that depends on robustness and states.
 
         Args:
-            x0: (B, n).
-            u: (B, T, m).
-            outcome: derivatives of the objective.
+            x0: initial states, (B, n).
+            u: plans, (B, T, m).
+            outcome: derivatives of the objective by robustness and states.
             threads: number of threads.
 
         Returns:
-            (B, T, m).
+            The gradient, (B, T, m).
 
         Raises:
             MemoryError: there is not enough memory.
@@ -220,12 +226,14 @@ class Adjoint:
 
 
 class Advance:
-    """The compiled functions `advance` and `look`; see `stlc.compile.backends.c.advance`.
+    """Library with the compiled functions `advance` (one step) and `look` (observations).
+
+    Their C code comes from `stlc.compile.backends.c.advance`.
 
     Args:
-        library: with the two functions.
+        library: library that contains the two functions.
         seen: number of values that the policy reads, k.
-        rewarded: whether a reward is compiled in.
+        rewarded: whether the library computes a reward.
     """
 
     def __init__(self, library: ctypes.CDLL, *, seen: int, rewarded: bool) -> None:
@@ -247,7 +255,7 @@ class Advance:
     def advance(
         self, x: NDArray[np.float64], u: NDArray[np.float64], share: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64] | None]:
-        """One exact step.
+        """Advance states by one step of the exact dynamics.
 
         Args:
             x: states, (B, n), contiguous.
@@ -276,8 +284,11 @@ def _share(
 ) -> None:
     """Call `rows(first, last)` on short parts of a batch, on several threads.
 
-    Python runs between two parts: an interruption or `stop` ends the work there, with the other rows
-    unprocessed. Raises MemoryError if a part returns a value other than 0.
+    Python code runs between two parts: there, an interruption or `stop` ends the work, and the remaining rows
+    are not processed.
+
+    Raises:
+        MemoryError: a part returned a value other than 0.
     """
     queue = _Parts(batch, grain, stop)
     if threads < 2:
@@ -296,7 +307,7 @@ def _share(
 
 
 class _Parts:
-    """The rows of a batch, handed out in parts that take about `PART` seconds each, whole grains."""
+    """Division of a batch into parts of about `PART` seconds each, whose sizes are multiples of `grain`."""
 
     def __init__(self, batch: int, grain: int, stop: Stop) -> None:
         self.failed = False
@@ -325,7 +336,7 @@ class _Parts:
 
 
 def load(text: str) -> ctypes.CDLL | None:
-    """The library of a C text, built if it is not in the cache; None if that fails."""
+    """Library compiled from a C text, or loaded from the cache; None if that fails."""
     using = compiler()
     if using is None:
         return None
@@ -350,7 +361,11 @@ def why_none(text: str) -> str:
 
 
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
-    """The library, cached or built. Raises CompilerError."""
+    """Library of a C text for the compiler `using`, from the cache or newly built.
+
+    Raises:
+        CompilerError: the compiler cannot be used.
+    """
     key = _key(text, using)
     store = cache.persistent()
     places = [place for place in (store, _temporary.get("here")) if place is not None]
@@ -385,13 +400,17 @@ _temporary: dict[str, Cache | None] = {}
 
 
 def _key(text: str, using: str) -> str:
-    """Hash of all inputs of a build. Raises CompilerError."""
+    """Hash of all inputs of a build, the name of the library in the cache.
+
+    Raises:
+        CompilerError: the compiler cannot be used.
+    """
     parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, _processor())
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
 
 
 def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
-    """A cached library, if its content is unchanged."""
+    """Library with the name `key` in the cache; None if it is missing or its content has changed."""
     for name in place.names(f"kernel-{key}-"):
         data = place.read(name)
         if data is None:
@@ -412,7 +431,11 @@ def _load(place: Cache, name: str) -> ctypes.CDLL | None:
 
 
 def _built(text: str, using: str, key: str) -> bytes | None:
-    """Build a library; return its bytes, None if the disk is full. Raises CompilerError."""
+    """Build a library and return its bytes; None if the disk is full.
+
+    Raises:
+        CompilerError: the compiler cannot be used.
+    """
     try:
         with tempfile.TemporaryDirectory(prefix="stlc-") as folder, leaving(lambda _code: rmtree(folder)):
             source, target = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
@@ -424,7 +447,7 @@ def _built(text: str, using: str, key: str) -> bytes | None:
 
 
 def _compile(using: str, source: Path, target: Path, key: str) -> None:
-    """Build with optimisation, or with less if the compiler exceeds its time or memory limit."""
+    """Compile a C text with optimisation, or with less if the compiler exceeds its time or memory limit."""
     try:
         try:
             why = _attempted(using, source, target, "-O3" if source.stat().st_size < LONG else "-O2")
@@ -439,9 +462,13 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Build with vectorised sine and other functions if the C library has them, else without.
+    """Compile with vectorised sine and similar functions if the C library has them, else without.
 
-    Returns the reason of a failure, or "". Raises CompilerError if the compiler exceeded its limits.
+    Returns:
+        The reason of a failure, or "".
+
+    Raises:
+        CompilerError: the compiler exceeded its limits.
     """
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
     for attempt in (*fast, []):

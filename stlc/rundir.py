@@ -85,7 +85,7 @@ class RunDir:
 
     @classmethod
     def newest(cls, root: Path = RUNS) -> RunDir:
-        """The run that `latest` points to; without that link the most recently changed run.
+        """The run to which `latest` points; without that link, the most recently changed run.
 
         Raises:
             UsageError: R101, there is no run below `root`.
@@ -101,10 +101,10 @@ class RunDir:
 
     @classmethod
     def open(cls, where: Path | str, root: Path = RUNS) -> RunDir:
-        """The run called `where`.
+        """Open the run called `where`.
 
-        Names are a folder or a file in it, `latest`, the name or file of a specification (its newest run),
-        and the number of a run, its words, or both, with or without `SPEC/` before it.
+        Possible names: a folder, or a file in it; `latest`; the name or file of a specification (its newest
+        run); the number of a run, its words, or both, with or without `SPEC/` before it.
 
         Raises:
             UsageError: R101, there is no such run, or several fit.
@@ -297,7 +297,7 @@ def _spec_path(run: RunDir) -> Path | None:
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:
-    """Names of a run: its folder, its number twice, its words."""
+    """Names by which a run can be called: folder, number with and without zeros, words."""
     number, _, words = run.name.partition("-")
     return run.name, number, str(int(number)), words
 
@@ -322,7 +322,7 @@ def _checked(words: str) -> str:
 
 
 def _reserve(home: Path, words: str) -> Path:
-    """Create the folder with the next free number, unique among concurrent processes.
+    """Create a run folder with the next free number, which no concurrent process can get.
 
     Folders of one number may have different words, so creating the folder does not reserve the number. The
     process that creates the marker file of a number owns it, and then checks again that the number is unused.

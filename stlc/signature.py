@@ -16,14 +16,15 @@ class Column:
     """A scalar column.
 
     Attributes:
-        name: as written in specifications and system files.
+        name: name in specifications and system files.
         unit: physical unit of the stored numbers.
         kind: type of the signal; a bool is stored as 0 or 1, an enum as a value of `labels`.
         role: role of the signal; `timer` columns are appended by the compiler.
-        low: nominal lower end of the range in this unit; None if unknown.
-        high: nominal upper end.
+        low: nominal lower end of the range, in `unit`; None if unknown.
+        high: nominal upper end of the range, in `unit`; None if unknown.
         labels: (label, value) pairs of an enum.
-        fact: whether the range is enforced (clamp, bool, enum), not only nominal.
+        fact: whether the range is enforced (by a clamp, or as the values of a bool or enum), not only
+            nominal.
     """
 
     name: str

@@ -41,7 +41,7 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 
 
 def undoing(undo: Callable[[int], object]) -> int:
-    """Register `undo` for a forced exit until the process ends; return its key."""
+    """Register `undo`, which a forced exit calls, until the process ends; return its key."""
     key = next(_numbers)
     _undone[key] = undo
     return key

@@ -52,12 +52,7 @@ class TooMuchError(CompilerError):
 
 
 class HangsError(Exception):
-    """A program exceeded its limits and was killed.
-
-    Attributes:
-        why: reason, printed after the name of the program.
-        worked: whether the program used the processor, and so exceeded the time or memory limit.
-    """
+    """Error: the compiler needs more time or memory for a text than the limit."""
 
     def __init__(self, why: str, *, worked: bool = False) -> None:
         super().__init__(why)
@@ -127,7 +122,11 @@ def _identity(using: str) -> str:
 
 
 def works(using: str) -> str:
-    """Reason for which a compiler cannot build a library, "" if it can; clears remembered failures."""
+    """Test whether a compiler can build a library, and clear remembered failures if it can.
+
+    Returns:
+        The reason why it cannot; "" if it can.
+    """
     forget()
     try:
         version(using)
@@ -156,7 +155,7 @@ _known: dict[str, str] = {}
 
 
 def trouble(key: str) -> str:
-    """Reason of a recent failure, in this process or another; "" where there was none."""
+    """Reason of a recent compiler failure, in this process or another; "" if there was none."""
     if key in _known:
         return _known[key]
     store = cache.persistent()
@@ -172,7 +171,7 @@ def _recorded(store: Cache, name: str) -> str:
 
 
 def remember(key: str, why: str, *, seconds: float | None = None) -> None:
-    """Remember a failure for `seconds` (default: `REMEMBERED`)."""
+    """Remember a failure of the compiler, which is then not tried, for `seconds` (`REMEMBERED`)."""
     _known[key] = why
     store = cache.persistent()
     if store is not None:
@@ -181,14 +180,14 @@ def remember(key: str, why: str, *, seconds: float | None = None) -> None:
 
 
 def remembered() -> list[str]:
-    """Remembered reasons for which commands do not use the compiler."""
+    """Reasons of remembered failures, because of which commands do not use the compiler at present."""
     store = cache.persistent()
     found = [] if store is None else [_recorded(store, name) for name in store.names(_TROUBLE)]
     return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
 
 
 def forget() -> None:
-    """Forget all failures."""
+    """Forget which compilers failed, so that they are tried again."""
     _known.clear()
     _versions.clear()
     store = cache.persistent()
@@ -250,7 +249,7 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Defer stop signals: a half-started process could not be killed."""
+    """Context in which stop signals are deferred, since a process that is being started cannot be killed."""
     if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
         yield
         return

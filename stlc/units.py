@@ -63,7 +63,7 @@ class Unit:
         return Unit(self.dims, self.ratio, _si_text(self.dims) if self.ratio == 1 else f"Δ{self.text}")
 
     def of_si(self, value: float) -> float:
-        """A number in SI units, converted to this unit."""
+        """Convert a number from SI units to this unit."""
         return (value - float(self.offset)) / self.scale
 
     def __mul__(self, other: Unit) -> Unit:
@@ -212,7 +212,7 @@ def same_dims(a: Unit, b: Unit) -> bool:
 
 
 def _factors(text: str) -> list[tuple[str, int]]:
-    """(symbol, power) pairs of a unit; each `/` divides by the next factor only."""
+    """Pairs (symbol, power) of the factors of a unit; each `/` divides by the next factor only."""
     factors: list[tuple[str, int]] = []
     position, sign = 0, 1
     while True:
@@ -230,7 +230,7 @@ def _factors(text: str) -> list[tuple[str, int]]:
 
 
 def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
-    """Advice for a product with `degC`."""
+    """Advice for a product that contains `degC`: the same product with `K`."""
     powers: dict[str, int] = {}
     for symbol, power in factors:
         known = SYMBOLS.get(symbol)
@@ -257,7 +257,7 @@ def _si_text(dims: Dims) -> str:
 
 
 def _text(powers: Mapping[str, int]) -> str:
-    """`kg*m/s^2`, `1/s`, `1`."""
+    """Text of a unit, such as `kg*m/s^2`, `1/s`, `1`."""
 
     def written(symbol: str, power: int) -> str:
         return symbol if power == 1 else f"{symbol}^{power}"

@@ -64,7 +64,7 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
 
 
 def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
-    """The nodes of the tree with their depths, the deciding child first, without recursion."""
+    """The nodes of the tree with their depths, first the child that decides the value; without recursion."""
     stack = [(0, tree)]
     while stack:
         depth, node = stack.pop()
@@ -103,7 +103,7 @@ def _readings(node: CauseNode, cause: Cause, result: Checked) -> list[str]:
 
 
 def _record(cause: Cause, result: Checked) -> ViolationCause:
-    """The record of a cause; the tree is a list of nodes with depths."""
+    """Record of the cause of a violation; the tree of causes is a list of nodes with depths."""
     subject = result.verdict.subject
     nodes: list[CauseNodeRecord] = [
         {

@@ -118,8 +118,8 @@ def requirement_record(
         rule: the requirement.
         cause: cause of its violation, if any.
         margins: statistics of the robustness.
-        trace: trace of the least robustness.
-        start: its start in seconds.
+        trace: index of the trace with the least robustness.
+        start: instant of the least robustness, in seconds.
         found: verdict and counts.
     """
     robustness = {
@@ -137,7 +137,7 @@ def _least(values: NDArray[np.float64]) -> float | None:
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean; values are divided first, as their sum may overflow."""
+    """The mean; values are divided by their number before they are added, because their sum may overflow."""
     with np.errstate(invalid="ignore"):  # +inf and -inf have no mean
         return float((values / values.size).sum()) if values.size else None
 

@@ -37,7 +37,8 @@ class Question:
         system: name of a system file.
         names: name of a signal in the specification -> its name in the trace.
         require: names of the judged requirements; all if empty.
-        at: start of judging: a sample, a time, or `all`; None: as the requirements say.
+        at: instant at which judging starts: a sample, a time, or `all`; None: the instants that the
+            requirements imply.
         end: treatment of traces that are too short.
         tolerance: a requirement is satisfied if its robustness is at least minus this.
         resample: time step of the grid for resampling, in seconds.
@@ -69,7 +70,7 @@ class Work:
         name: name of the file as given.
         question: options of reading and judging.
         runs: folder of all runs.
-        out: output file of the robustness signals.
+        out: file to which the robustness signals are written.
         chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
         color: whether texts may be coloured.
         mode: colour mode of the program.
@@ -85,7 +86,7 @@ class Work:
 
 
 def found(name: str, runs: Path) -> Path:
-    """The file of a trace: as given, or in the newest run."""
+    """The file of a trace: the path `name`, or else the trace in the newest run."""
     from stlc.files import find_trace
 
     path = find_trace(name, runs)
@@ -125,7 +126,7 @@ def judge(name: str, question: Question, runs: Path) -> Checked:
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
-    """Remark on a trace that was found in a run folder."""
+    """Remark that names the trace judged, if it was found in the newest run's folder."""
     return () if path == Path(name) else (f"taking {path}, of the newest run",)
 
 
@@ -142,7 +143,7 @@ def _options(question: Question) -> tuple[str, ...]:
 
 
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:
-    """Reading options of files: names and grid; with a monitor also the types of signals."""
+    """Options for reading trace files: names and grid; if there is a monitor, also the types of signals."""
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
 
@@ -151,7 +152,7 @@ def reading_options(monitor: Monitor | None, question: Question) -> Reading:
 
 
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
-    """The specification for the trace `name`: the given one, else the one it carries; and a remark."""
+    """Specification for the trace `name`: the file `spec`, else the one in the trace; and a remark."""
     if spec is not None:
         return read_source(find_spec(spec)), ""
     if not carried.text:
@@ -169,10 +170,10 @@ def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Sourc
 
 
 def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
-    """The monitor of a specification, cached for traces with the same one.
+    """The monitor of a specification, cached for traces with the same specification.
 
-    `carried` holds the imported files and set constants stored in a trace; it is ignored if the specification
-    was given as a file.
+    `carried` holds the imported files and the changed constants that are stored in a trace; it is ignored if
+    the specification was given as a file.
     """
     library: Mapping[str, str] = {}
     changed = question.overrides
@@ -199,7 +200,7 @@ def _monitor(
 
 
 def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
-    """The sample that `--at` names in a trace; "all" and None are returned unchanged.
+    """The sample of a trace that the option `--at` names; "all" and None are returned unchanged.
 
     Args:
         text: value of the option: a sample, a time, or "all".
@@ -209,7 +210,7 @@ def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int |
         samples: number of samples; None if unknown.
 
     Raises:
-        UsageError: U101, it is not an instant, or the trace has no sample there.
+        UsageError: U101, the text is not an instant, or the trace has no sample there.
     """
     if text is None or text == "all":
         return "all" if text else None

@@ -20,9 +20,9 @@ SMALL = 1_000_000
 
 
 def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
-    """The outcomes in order, computed by `jobs` processes.
+    """The outcomes of all files in order, computed by `jobs` processes.
 
-    A single file that cannot be judged raises; among several it gives an outcome with errors.
+    If a single file cannot be judged, its error is raised; one of several files gives an outcome with errors.
     """
     if len(works) == 1:
         yield outcome_of(works[0])

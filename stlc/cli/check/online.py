@@ -230,7 +230,7 @@ def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online)
 
 
 def _tell(decision: Decision, online: Online) -> None:
-    """Print a violation always, satisfaction only of a requirement that is judged once."""
+    """Print a decided verdict: a violation always, satisfaction only of a requirement that is judged once."""
     repeated = online.repeats(decision.requirement)
     if decision.status == "satisfied" and repeated:
         return

@@ -90,9 +90,10 @@ class Outcome:
 
 
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
-    """0 satisfied, 1 violated, 4 inconclusive; with `fail_under` the share of satisfied starts decides.
+    """Exit code: 0 satisfied, 1 violated, 4 inconclusive; `fail_under` bounds the satisfied share.
 
-    A file that cannot be judged takes precedence over every verdict. Traces out of scope do not count.
+    A file that cannot be judged takes precedence over every verdict. Traces to which the specification does
+    not apply (out of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:

@@ -40,7 +40,7 @@ def doctor(
 
 
 def _finding(name: str, state: Literal["ok", "missing", "off"], detail: str) -> InstallationFinding:
-    """A checked item; "off" is a missing one that only some commands need."""
+    """A checked item; its state "off" means that it is missing, but only some commands need it."""
     return {"name": name, "state": state, "detail": detail}
 
 
@@ -131,7 +131,7 @@ def _cache() -> InstallationFinding:
 
 
 def _compiler() -> InstallationFinding:
-    """Evaluator of plans, C kernels or torch, and remembered failures of the compiler."""
+    """Finding on how plans are evaluated (C kernels or torch), and on remembered failures of the compiler."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()

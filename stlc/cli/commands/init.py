@@ -153,7 +153,7 @@ def _example_files(name: str) -> dict[str, str]:
 
 
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
-    """The given specifications with an installed system, and the name of its file."""
+    """Pairs of a specification that refers to an installed system, and the name of that system's file."""
     for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
         if named and (SYSTEMS / named[2]).is_file():
@@ -216,7 +216,7 @@ def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
     Args:
         name: name of the specification.
         system: system whose states become the signals.
-        reference: path of that system in the specification.
+        reference: path by which the specification refers to that system.
     """
     if system is None:
         signals, predicate = "signal x [m] in [-5, 5]", "x < 4 m"

@@ -127,7 +127,7 @@ def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
-    """A recording reduced to the wanted trace; unchanged without one."""
+    """The trace reduced to the one with number `wanted`; unchanged if None."""
     if wanted is None:
         return trace
     _require_trace(trace.traces, wanted)

@@ -21,7 +21,7 @@ Sort = Literal["time", "acc", "name"]
 
 
 def _default(context: typer.Context) -> None:
-    """Without a command: list."""
+    """List the runs if no subcommand is given."""
     if context.invoked_subcommand is None:
         list_().show()
 
@@ -122,7 +122,7 @@ def rm(
 
 
 def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """A nested record as `key.sub` -> text."""
+    """Flatten a nested record to texts by dotted names, `key.sub` -> text."""
     flat: dict[str, str] = {}
     for key, value in record.items():
         if isinstance(value, Mapping):
@@ -156,7 +156,7 @@ def _accuracy(record: Mapping[str, Any]) -> float | None:
 
 
 def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ...]:
-    """Row of the table."""
+    """Cells of a run's row in the table."""
     accuracy, result = _accuracy(record), record.get("result")
     seconds = result.get("seconds") if isinstance(result, Mapping) else None
     return (

@@ -190,7 +190,7 @@ def _planned(
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
-    """W604 if an unbounded mission is simulated for longer than the policy was validated."""
+    """Warning W604 if a mission without end is simulated for longer than the policy was validated."""
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
     seconds = steps * run.task.system.dt
@@ -205,7 +205,7 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Options of a deployment."""
+    """Options of a simulation."""
 
     run: Run
     guard: Mode
@@ -218,7 +218,11 @@ class _Order:
 
 
 def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
-    """Deploy without and with the guard under a scenario; robustness margins are written if `writes`."""
+    """Simulate the policy without and with its guard under the scenario `name` (None: no scenario).
+
+    `writes`: whether robustness margins are written to the file of `--robustness`. Returns the record of
+    both.
+    """
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.training.run import Run
@@ -244,7 +248,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
-    """Printer of readable output: to the standard output, unless margins are written there."""
+    """Function that prints text: to the standard output, unless robustness margins are written there."""
     from stlc.cli.simulate.watch import STANDARD_OUTPUT
 
     if margins != STANDARD_OUTPUT:
@@ -276,7 +280,7 @@ def _satisfied(document: Simulation, guard: Mode) -> float:
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
-    """Deploy nominally and under scenarios; the trace is that of the nominal deployment."""
+    """Simulate without and with each scenario; the trace stored is that without scenario."""
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():
         each = _deployed(order, name, writes=False)
@@ -306,7 +310,7 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Run one watched deployment; results up to a failure or Ctrl-C are saved."""
+    """Simulate under one guard with live output; after a failure or Ctrl-C, results are saved, too."""
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
 

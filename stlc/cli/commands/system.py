@@ -126,7 +126,7 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Compare forward kinematics with another library's; raises an error on a mismatch."""
+    """Compare the forward kinematics with those of another library, and raise an error if they differ."""
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:
         return []
@@ -163,7 +163,7 @@ def _facts(decl: SystemDecl) -> documents.SystemFacts:
 
 
 def _all_systems() -> Iterator[documents.ListedSystem]:
-    """Every system file in the search path; the text of a valid one is its first sentence."""
+    """Every system file in the search path, with the first sentence of its description if it is valid."""
     from stlc.diagnostics import StlcError
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS

@@ -196,7 +196,11 @@ def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object
 
 
 def _logger(name: str | None) -> Opener | None:
-    """Opener of the logger of `--log`. Raises MissingError (R301) if it is not installed."""
+    """Function that opens the logger of `--log`; None without that option.
+
+    Raises:
+        MissingError: R301, the logger is not installed.
+    """
     if name is None:
         return None
     if name != "tensorboard":
@@ -306,9 +310,9 @@ LOST = "R403"
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Print only from the first rank that `torchrun` started; other ranks report only errors of their own.
+    """Context in which only the first process that `torchrun` started prints; others report only own errors.
 
-    Every rank finds errors of a specification; a missing package may concern one machine only.
+    Every process finds the errors of a specification; a missing package may concern one machine only.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

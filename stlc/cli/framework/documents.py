@@ -32,7 +32,7 @@ Positive = Annotated[float, 0]
 
 
 def record(kind: type[R], source: object, **given: object) -> R:
-    """A record of the attributes of an object with the names of the keys; `given` has the other keys."""
+    """A record whose keys are the attributes of `source` with the same names; `given` has the other keys."""
     names = [name for name in kind.__annotations__ if name not in given]
     made: Any = {name: getattr(source, name) for name in names} | given
     found: R = made
@@ -749,7 +749,7 @@ def _object(kind: Any) -> dict[str, Any]:
 
 
 def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Alternatives; a type or null, and several plain types, are one schema."""
+    """Schema of alternatives; a type or null, or several plain types, are joined into one schema."""
     plain = [part["type"] for part in parts if part.keys() == {"type"}]
     rest = [part for part in parts if part.keys() != {"type"}]
     if not rest:

@@ -76,7 +76,7 @@ def _schema(argv: Sequence[str]) -> str:
 
 
 def _known(error: BaseException) -> StlcError | None:
-    """`error` as an StlcError, or None if it is a bug."""
+    """`error` as an StlcError; None if it is an internal error."""
     match error:
         case StlcError():
             return error

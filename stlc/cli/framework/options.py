@@ -89,12 +89,16 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
-    """`["T_red=3 s"]` as `{"T_red": "3 s"}`. Raises UsageError (U101) as `parse_pairs`."""
+    """Parse pairs such as `T_red=3 s` into a mapping such as `{"T_red": "3 s"}`.
+
+    Raises:
+        UsageError: U101, see `parse_pairs`.
+    """
     return parse_pairs(pairs, "--set", "NAME=VALUE", "T_red=3s")
 
 
 def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: str) -> dict[str, str]:
-    """The values of a repeated option, by the name before `=`.
+    """Parse the values of a repeated option: name before `=` -> text after it.
 
     Raises:
         UsageError: U101, a value is not of the form, or a name is given twice.
@@ -139,7 +143,7 @@ def _below(name: str) -> Iterator[str]:
 
 
 def _shown(path: Path, folder: Path) -> bool:
-    """True if no part of the path below the folder is hidden."""
+    """True if no folder or file name in the path below `folder` begins with a dot."""
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 

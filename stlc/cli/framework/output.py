@@ -195,8 +195,8 @@ def _cell(text: str, width: int) -> str:
 class Pulse:
     """Heartbeat of a silent command: its current activity and the elapsed time.
 
-    On a terminal a line redrawn after `IN_TERMINAL` seconds without output and removed before the next
-    output; elsewhere a line every `IN_LOG` seconds.
+    On a terminal, it is a line that appears after `IN_TERMINAL` seconds without output and is removed before
+    the next output; elsewhere, a new line is written every `IN_LOG` seconds.
     """
 
     IN_TERMINAL, IN_LOG = 1.5, 28.0
@@ -227,7 +227,7 @@ class Pulse:
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Set the activity within the block; "" for waiting, without a heartbeat."""
+        """Context that sets the activity shown by the heartbeat; "" for waiting, without a heartbeat."""
         self._doing.append((what, time.monotonic()))
         self.note()
         try:
@@ -241,7 +241,7 @@ class Pulse:
             self._doing[-1] = what, self._doing[-1][1]
 
     def note(self) -> None:
-        """Register output: the line on the terminal is removed."""
+        """Register that output follows, and remove the heartbeat's line from the terminal."""
         with self._lock:
             self._last = time.monotonic()
             if self._shown:
@@ -270,7 +270,7 @@ PULSE = Pulse()
 
 
 class _Noted:
-    """A stream that registers its output at the heartbeat."""
+    """Stream that tells the heartbeat about its output."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -139,8 +139,8 @@ class Program:
     Attributes:
         name: as it is typed.
         help: help text of the program.
-        package: of its commands.
-        order: of commands in the help; others follow by name.
+        package: package that holds the commands.
+        order: order of commands in the help; others follow by name.
         moved: former commands -> their replacements.
     """
 

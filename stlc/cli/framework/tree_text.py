@@ -1,4 +1,4 @@
-"""Syntax trees as text, as values for JSON, and as a graph for Graphviz."""
+"""Syntax trees as indented text, as values for JSON, and as a graph for Graphviz."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _value(value: object) -> Any:
 
 
 def as_dot(specs: Sequence[ast.Spec]) -> str:
-    """A directed graph, a node for each node."""
+    """Text of a directed graph for Graphviz, in which every node of the trees is a node."""
     lines = ["digraph stlc {", '  node [shape=box, fontname="monospace"];']
     count = 0
     stack: list[tuple[int | None, ast.Node]] = [(None, spec) for spec in reversed(specs)]

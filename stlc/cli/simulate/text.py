@@ -28,9 +28,10 @@ COMPARED = ("obeyed every rule", "plan accuracy")
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
-    """The metrics as text: drives first; with `windows` also plans and starts.
+    """The metrics as lines of text: drives (closed-loop runs) first; with `windows` also plans and starts.
 
-    Without a specification of drives the latter are always shown, as drives are then judged like plans.
+    If no specification for drives is declared, plans and starts are always shown, because drives are then
+    judged like plans.
     """
     from stlc.cli.framework.output import table
 
@@ -65,14 +66,14 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """A line on the selection of starts, if they were selected."""
+    """A line that says how initial states were selected, if they were."""
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:
-    """The verdict on the drives, and the agents for which no better drive is known."""
+    """Verdict on the drives (closed-loop runs), and the agents for which no better drive is known."""
     from stlc.view.words import obeyed_sentence, viable_sentence
 
     yield f"  {obeyed_sentence(document)}"
@@ -94,7 +95,7 @@ def _rules(document: Record) -> Iterator[tuple[str, ...]]:
 
 
 def _broken(drives: Record) -> Iterator[str]:
-    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few, viable ones first."""
+    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` for the first runs, viable ones first."""
     from stlc.view.words import cause_words
 
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
@@ -116,7 +117,7 @@ def _foreseen(foreseen: Record | None) -> Iterator[str]:
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
-    """Errors of the model under the scenario, a line for each kind."""
+    """Errors that the scenario gives the model, a line for each kind."""
     for name, what in ERRORS.items():
         if name in errors:
             numbers = errors.get("numbers", []) if name == "parameters" else []
@@ -143,7 +144,7 @@ def compared(document: Record) -> Iterator[str]:
 
 
 def _both(guard: Record) -> list[str]:
-    """The cells of a guard: drives that obeyed among those not lost, and plan accuracy."""
+    """The cells of a guard: share of drives that obeyed among those not lost, and accuracy of plans."""
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
     return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
@@ -206,7 +207,7 @@ def _number(metric: Record, unit: str, digits: int) -> str:
 
 
 def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
-    """`not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`."""
+    """Text on unsafe agents: `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`."""
     if not unsafe:
         return f"all {agents} agents were driven safely"
     lost = [each for each in unsafe if each["savable"]]
@@ -219,7 +220,7 @@ def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
 
 
 def _listed(agents: Sequence[Record]) -> str:
-    """`seed 2: 7, 11; seed 5: 0`, the first few."""
+    """Text that lists the first few agents by seed: `seed 2: 7, 11; seed 5: 0`."""
     shown = agents[:MOST_LISTED]
     seeds = dict.fromkeys(each["seed"] for each in shown)
     parts = (
@@ -230,7 +231,7 @@ def _listed(agents: Sequence[Record]) -> str:
 
 
 def _acted(decisions: Mapping[str, float]) -> str:
-    """`3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
+    """Text on the interventions: `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
     total = 1.0 - decisions["policy"]
     if total <= 0.0:
         return "0 % of decisions"

@@ -82,7 +82,7 @@ def require_writable(where: str | None) -> None:
 
 @contextmanager
 def _lines(where: str) -> Iterator[TextIO]:
-    """A line-buffered file."""
+    """A file opened for writing, which is flushed after every line."""
     if where == STANDARD_OUTPUT:
         yield sys.stdout
         return

@@ -25,11 +25,11 @@ ENDED = 70
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One of several runs.
+    """One of several training runs.
 
     Attributes:
-        spec: the specification's file.
-        seed: None for that of the system file.
+        spec: file of the specification.
+        seed: seed of the run; None for that of the system file.
     """
 
     spec: Path
@@ -38,15 +38,15 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Many:
-    """Runs that differ only in specification and seed.
+    """Training runs that differ only in specification and seed.
 
     Attributes:
-        specs: the specifications' files.
-        system: as given, or None; only of one specification.
-        config: common configuration.
-        launch: folder and name.
-        seeds: for each specification; None for that of its system file.
-        jobs: processes at a time.
+        specs: files of the specifications.
+        system: system file of `--system`, or None; allowed for a single specification only.
+        config: training options that all runs share.
+        launch: folder and name of the runs.
+        seeds: seeds for each specification; None for that of its system file.
+        jobs: number of processes at a time.
         cluster: address of a Ray cluster to train on.
         log: value of `--log`.
         pictures: whether reports are drawn.
@@ -143,7 +143,7 @@ def _record(part: Part, ended: JobResult) -> TrainedJob:
 
 
 def _line(ended: JobResult) -> str:
-    """The message at the end of a run."""
+    """The message that is printed when a run has ended."""
     accuracy = ended.result.get("accuracy")
     if accuracy is None:
         return f"{ended.job.name} broke off with exit code {ended.code}\n{ended.why}".rstrip()

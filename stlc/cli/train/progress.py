@@ -52,9 +52,9 @@ def percent(value: float) -> str:
 class Progress:
     """Shows a training run: in place on a terminal, one line every 25 s elsewhere.
 
-    Rows are those of `train.jsonl`; a row may carry only some of its keys (a bare `step` moves the counter),
-    missing keys keep their last value. In use: `start`, `update`…, `finish`; `stop` alone restores the
-    terminal after an interruption.
+    Rows are those of `train.jsonl`; a row may have only some of the keys, such as `step` alone, and the other
+    values stay as they are. Call `start`, then `update` for every row, then `finish`; after an interruption,
+    `stop` restores the terminal.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Progress:
             self._print(self._title)
 
     def chosen(self, engine: Mapping[str, Any]) -> None:
-        """Show the configuration that the engine resolved."""
+        """Show the options that the training resolved."""
         self._print(f"  engine          {engine_text(engine)}")
         if "by_torch" in engine:
             self._print(f"  computed by     {native_text(engine['by_torch'])}")
@@ -224,7 +224,7 @@ def _packed(cells: list[str], width: int) -> list[str]:
 
 
 def engine_text(engine: Mapping[str, Any]) -> str:
-    """The resolved configuration on a line: method, network, batch, learning rate and margin."""
+    """The resolved options on one line: method, network, batch, learning rate and margin."""
     network = "x".join(map(str, engine["hidden"]))
     if "environments" in engine:  # one control a step, learned from rewards
         parts = (
@@ -251,7 +251,7 @@ def engine_text(engine: Mapping[str, Any]) -> str:
 
 
 def native_text(by_torch: Mapping[str, str]) -> str:
-    """The parts of training that run as generated C, and why others do not."""
+    """Which parts of the training run as generated C, and why others run in torch."""
     native = [part for part, reason in by_torch.items() if not reason]
     reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
     lines = [f"{', '.join(native)}: C"] if native else []

@@ -69,7 +69,7 @@ class Session:
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
-        """Expected delay in seconds at the end on a slow machine, estimated from the time of imports."""
+        """Predicted delay in seconds at the end of training, estimated from the time of imports."""
         return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
 
     @contextmanager
@@ -118,7 +118,7 @@ class Session:
         self._forced.close()
 
     def _ended(self, _code: int = INTERRUPTED) -> None:
-        """Record a killed run as interrupted; its last checkpoint remains."""
+        """Set the status of a run that is killed to "interrupted"; its last checkpoint remains."""
         with suppress(StlcError):
             self.folder.finish("interrupted")
         self._say_interrupted()
@@ -171,7 +171,11 @@ class Session:
 
 
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
-    """The commands of the final screen; the newest run needs no name, others below `runs` no path."""
+    """The commands that the final screen suggests.
+
+    They name the run by the shortest name that finds it: the newest run needs none, others below `runs` no
+    path.
+    """
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
     start = "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
