@@ -248,7 +248,7 @@ def file_part(name: str, *, empty: str) -> str:
     """A name as one path component: letters, digits, `_`, `-`, `.`; at most `LONGEST` bytes.
 
     Args:
-        name: of anything.
+        name: any name.
         empty: replacement for a name without any allowed character.
     """
     part = re.sub(r"[^\w.-]+", "-", visible(name).replace("\ufffd", "-")).strip("-.") or empty

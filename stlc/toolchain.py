@@ -70,7 +70,7 @@ class ProgramResult:
 
 
 def compiler() -> str | None:
-    """The system's C compiler: `$CC`, `cc`, `gcc` or `clang`; None where there is none."""
+    """Path of the system's C compiler: `$CC`, `cc`, `gcc` or `clang`; None if there is none."""
     names = (os.environ.get("CC"), "cc", "gcc", "clang")
     return next((found for name in names if name and (found := shutil.which(name))), None)
 

@@ -25,13 +25,13 @@ _MAX_POWER = 99
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A physical unit. Equality ignores how it is written.
+    """A physical unit. Units are equal if they mean the same, however they are written.
 
     Attributes:
         dims: exponents of m, kg, s, A and K.
         ratio: size of the unit in SI units, exactly (pi to double precision).
-        text: unit as written; "" for an undeclared unit, in contrast to `1`.
-        offset: zero point of the scale in SI units, exactly; 0 except for scales such as `degC`.
+        text: text of the unit in the file; "" for an undeclared unit, in contrast to `1`.
+        offset: value of the unit's zero in SI units, exactly: 273.15 for `degC`, 0 for units without offset.
     """
 
     dims: Dims = _NONE

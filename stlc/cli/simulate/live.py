@@ -164,7 +164,7 @@ class LiveView:
         return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
-        """A bar left or right of the middle, scaled by the largest margin so far."""
+        """A bar to the left (negative) or right of the middle, scaled by the largest margin until now."""
         full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
         finite = abs(value) if np.isfinite(value) else 0.0
         scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)

@@ -1,7 +1,8 @@
 """Search and distil: plans of failing states are repaired by local search and imitated.
 
-Every few dozen steps fresh states are judged; failing ones are repaired by a search that starts from the
-policy's own plan, and repaired plans are imitated for as long as their state still fails (decision 7).
+Every few dozen steps the policy's plans from newly drawn states are judged; failing plans are repaired by a
+search that starts from them, and repaired plans are imitated for as long as the policy fails at their state
+(decision 7).
 """
 
 from __future__ import annotations

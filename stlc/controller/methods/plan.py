@@ -1,4 +1,4 @@
-"""Planning in closed loop: no training; a planner plans anew whenever the policy is asked."""
+"""Planning in closed loop, without training: a planner searches for a plan whenever the policy is called."""
 
 from __future__ import annotations
 

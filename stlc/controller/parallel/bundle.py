@@ -34,17 +34,17 @@ _OTHER_VERSION = 5
 
 @dataclass(frozen=True, slots=True)
 class JobBundle:
-    """A job with its input files, for a worker.
+    """Training job with its input files, to be sent to a worker.
 
     Attributes:
-        arguments: of `stlc train`.
-        folder: the caller's working directory.
-        runs: the folder of its runs.
-        inputs: input files and folders; absolute paths.
-        files: an archive of them.
-        probe: a file visible only to machines that share the caller's file system.
+        arguments: arguments of `stlc train`.
+        folder: working directory of the caller.
+        runs: folder of the caller's runs.
+        inputs: absolute paths of the input files and folders.
+        files: archive of the inputs.
+        probe: file that only machines with the caller's file system can see.
         cores: number of cores for the job.
-        version: of the caller's stlc.
+        version: version of the caller's stlc.
     """
 
     arguments: tuple[str, ...]
@@ -82,15 +82,15 @@ class JobBundle:
 
 @dataclass(frozen=True, slots=True)
 class BundleResult:
-    """Result of a job returned by a worker.
+    """Result of a job, as a worker returns it.
 
     Attributes:
         code: exit code of the training.
-        out: its standard output.
-        said: the end of its standard error.
-        cores: number of cores it had.
-        run: path of its run on the caller's machine; None where nothing has to be transferred.
-        files: an archive of that run.
+        out: standard output of the training.
+        said: end of its standard error.
+        cores: number of cores that the job had.
+        run: path of the run on the caller's machine; None if nothing has to be transferred.
+        files: archive of the run.
     """
 
     code: int
@@ -246,12 +246,12 @@ def unpack(data: bytes, folder: Path) -> None:
 def input_files(
     path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
 ) -> tuple[Path, ...]:
-    """Input files of a training, as far as they can be read; errors are reported by the training itself.
+    """Input files of a training that can be read; errors in them are reported by the training itself.
 
     Args:
-        path: of the specification.
-        system: replaces the one named by the specification.
-        overrides: of `--set`.
+        path: path of the specification.
+        system: system file that replaces the one named by the specification.
+        overrides: values of `--set`.
     """
     path = find_spec(path)
     found: dict[Path, None] = {path: None}

@@ -145,7 +145,7 @@ def joined(device: str) -> Iterator[Ranks]:
     """Connect the ranks of this training while the context is open.
 
     Args:
-        device: of torch; on `cuda` every rank of a machine takes a GPU of its own.
+        device: torch device; on `cuda` every rank of a machine takes a GPU of its own.
 
     Raises:
         MissingError: R403, the other ranks cannot be reached.

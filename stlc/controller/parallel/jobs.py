@@ -28,9 +28,9 @@ class Job:
 
     Attributes:
         name: identifies the job.
-        arguments: of `stlc train`, without `--json`.
-        inputs: input files and folders, for machines without shared file system.
-        runs: the folder of its runs, for the same machines.
+        arguments: arguments of `stlc train`, without `--json`.
+        inputs: input files and folders, which are sent to machines that do not share the file system.
+        runs: folder in which the run is stored, also if it comes from such a machine.
     """
 
     name: str
@@ -168,9 +168,9 @@ def start(
     """Start a training process.
 
     Args:
-        arguments: of `stlc train`.
-        share: cores to pin it to; all if None.
-        folder: working directory; the present one if None.
+        arguments: arguments of `stlc train`.
+        share: cores to which the process is pinned; all if None.
+        folder: working directory; the current one if None.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", "stlc", "train", *arguments, "--json"],

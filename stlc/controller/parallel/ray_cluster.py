@@ -27,7 +27,8 @@ class RayExecutor:
     """Executor of jobs as Ray tasks, as many at a time as the cluster has CPUs for.
 
     Attributes:
-        address: of the cluster; `auto` for the one that this machine belongs to, `local` for this machine.
+        address: address of the cluster; `auto`: the cluster to which this machine belongs; `local`: this
+            machine alone.
         cores: CPUs per job.
         gpus: GPUs per job.
     """

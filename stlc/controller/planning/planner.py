@@ -251,11 +251,11 @@ def plan(
         task: specification and system.
         x0: initial states, (B, n) or (n,), in the order of `task.system.names`.
         method: name of a planner.
-        budget: limits per start; by default `SECONDS` of processor time.
-        seed: of the planner's random numbers.
-        start: initial guess, (B, T, m).
+        budget: limits of the search; by default `SECONDS` of processor time per initial state.
+        seed: seed of the planner's random numbers.
+        start: initial guesses of plans, (B, T, m).
         progress: called with the search after each round.
-        options: of the planner.
+        options: options of the planner.
 
     Returns:
         The best plans, judged exactly in float64.

@@ -28,14 +28,12 @@ if TYPE_CHECKING:
 class Policy(ABC):
     """Interface of planners and trained policies: candidate plans, and the selection among them.
 
-    Of the plans that satisfy the specification the one with the least performance cost is selected, otherwise
-    the one with the largest exact robustness.
+    Of the candidates that satisfy the specification, the one with the least performance cost is selected; if
+    there is none, the one with the largest exact robustness.
 
     Attributes:
-        task: the problem whose verdicts select the plan; `for_task` changes it.
-        network: the network that proposes the plans; None where there is none, then exports are refused.
-        judged_at_once: states of a batch of the final evaluation, which can be stopped between batches; fewer
-            where a plan is costly.
+        task: task whose verdicts select the plan; `for_task` returns the policy for another task.
+        network: network that proposes the plans; None if there is none: such a policy cannot be exported.
     """
 
     network: PlanNetwork | None = None
@@ -49,7 +47,7 @@ class Policy(ABC):
         """All candidate plans in physical units: (B, n) -> (B, plans, T, m)."""
 
     def for_task(self, task: Task) -> Self:
-        """The same policy for another task of the same system, for example one with robustness margins."""
+        """This policy for another task of the same system, for example one with robustness margins."""
         other = copy(self)
         other.task = task
         return other

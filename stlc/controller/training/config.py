@@ -54,16 +54,16 @@ class TrainConfig:
     """Options of the user; None leaves the choice to the system file, then to the method.
 
     Attributes:
-        method: a name of `stlc.registry.METHODS`.
-        budget: seconds, final evaluation included; converted to steps repeatedly.
-        clock: of the budget.
+        method: name of a training method, see `stlc.registry.METHODS`.
+        budget: training time in seconds, final evaluation included; the number of steps is adapted to it.
+        clock: clock of the budget.
         steps: optimiser steps, or the schedule of a run with a budget; takes precedence over `budget`.
-        seed: of all random numbers in training.
+        seed: seed of all random numbers in training.
         device: torch device.
-        threads: of torch; None leaves one core to the concurrent search.
+        threads: number of threads of torch; None leaves one core to the concurrent search.
         plans: number of plans of the network.
         lr: peak learning rate.
-        batch: fresh states per step.
+        batch: number of newly drawn states per step.
         held_out: number of held-out states.
         drives: maximum closed-loop runs per guard after the training; 0: none.
         planner: the planner of the method `plan`.

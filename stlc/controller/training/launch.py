@@ -104,10 +104,11 @@ def train_here(
 
     Args:
         task: problem to train for; see `stlc.compile`.
-        budget: seconds; None takes the system file's, else 60 without `steps`.
-        steps: optimiser steps; take precedence over `budget`.
-        seed: of all random numbers; None takes the system file's.
-        method: `guided` (search and distil) or `gradient` (the paper's); None takes the system file's.
+        budget: training time in seconds; None: that of the system file, or 60 if it has none and `steps` is
+            None.
+        steps: number of optimiser steps; takes precedence over `budget`.
+        seed: seed of all random numbers; None: that of the system file.
+        method: `guided` (search and distil) or `gradient` (the paper's); None: that of the system file.
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
     return train(task, config, open_folder(task, config)).run

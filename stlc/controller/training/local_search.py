@@ -2,9 +2,9 @@
 
 The robustness gradient of a requirement such as stopping in a zone vanishes outside of the zone, and
 gradients do not lead across an obstacle; a search has neither problem. Each generation judges a batch of
-changed plans per state and retains the best. Changes are noise over a random stretch of time, a constant
-shift of a stretch, a stretch held at one random level, and plans that solved other states. The native kernel
-runs the search if there is one, otherwise torch.
+changed plans per state and retains the best. Changes are noise over a random interval of time, a constant
+shift over an interval, a random constant over an interval, and plans that solved other states. The native
+kernel runs the search if there is one, otherwise torch.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Searcher:
 
 
 class _TorchClimb:
-    """The same local search in torch, one generation (batch of changed plans per state) at a time.
+    """Local search like that of the native kernel, in torch, one generation (changed plans) at a time.
 
     Attributes:
         found: the best plans found.

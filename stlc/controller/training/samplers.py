@@ -38,7 +38,7 @@ class Supply(ABC):
 
     Attributes:
         block: states drawn and not yet returned, (k, n).
-        device: of the states.
+        device: torch device of the states.
     """
 
     state: ClassVar[tuple[str, ...]] = ("block",)
