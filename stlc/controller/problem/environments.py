@@ -184,7 +184,7 @@ class Environments:
         self._actions = self._blank()
 
     def _blank(self) -> Tensor:
-        """Empty array for the actions of an episode, (N, T, m)."""
+        """Array of zeros for the actions of an episode, (N, T, m)."""
         return torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
 
     def _starts(self) -> Tensor:

@@ -85,7 +85,7 @@ class SampledShooting(GuardStage):
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents whose plan does not satisfy phi.
 
-        After a search for phi_safe alone, only the agents with a safe plan remain.
+        With `limits.rescue`, only agents with a safe plan; another stage has searched for phi_safe alone.
         """
         none = len(self.prefixes.heads) == 0
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
