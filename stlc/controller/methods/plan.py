@@ -33,7 +33,7 @@ class PlanConfig(ResolvedConfig):
     evaluations: int = 0
 
 
-class Plan(Method):
+class PlanMethod(Method):
     """Receding-horizon planning without a trained policy: `stlc simulate SPEC --method search`."""
 
     options = PlanConfig
@@ -68,4 +68,4 @@ class Plan(Method):
         return PlannerPolicy(task, planner, budget, seed=config.seed)
 
 
-METHOD = Plan()
+METHOD = PlanMethod()

@@ -39,11 +39,11 @@ SIDES = 16
 class Greatest:
     """The greatest of some values; the least is minus the greatest of minus them."""
 
-    items: tuple[Value, ...]
+    items: tuple[Expression, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class Conditional:
     """One value where a condition holds, else another.
 
     Attributes:
@@ -52,8 +52,8 @@ class Choice:
         fails: its negation as a tree.
     """
 
-    yes: Value
-    no: Value
+    yes: Expression
+    no: Expression
     holds: Tree
     fails: Tree
 
@@ -72,11 +72,11 @@ class Square:
     variable: int
 
 
-Atom: TypeAlias = "Greatest | Choice | Norm | Square"
+Atom: TypeAlias = "Greatest | Conditional | Norm | Square"
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
+class Expression:
     """An affine form plus atoms with coefficients, which become variables only where they must.
 
     Attributes:
@@ -87,16 +87,16 @@ class Value:
     form: Affine
     atoms: tuple[tuple[float, Atom], ...] = ()
 
-    def plus(self, other: Value, factor: float = 1.0) -> Value:
+    def plus(self, other: Expression, factor: float = 1.0) -> Expression:
         """This value plus `factor` times another."""
         added = tuple((factor * each, atom) for each, atom in other.atoms)
-        return Value(self.form.plus(other.form, factor), self.atoms + added)
+        return Expression(self.form.plus(other.form, factor), self.atoms + added)
 
-    def times(self, factor: float) -> Value:
+    def times(self, factor: float) -> Expression:
         """This value times a constant."""
         if not factor:
-            return Value(ZERO)
-        return Value(self.form.times(factor), tuple((factor * each, atom) for each, atom in self.atoms))
+            return Expression(ZERO)
+        return Expression(self.form.times(factor), tuple((factor * each, atom) for each, atom in self.atoms))
 
     @property
     def known(self) -> float | None:
@@ -104,13 +104,13 @@ class Value:
         return None if self.atoms or self.form.terms else self.form.const
 
 
-def number(value: float) -> Value:
+def number(value: float) -> Expression:
     """A constant."""
-    return Value(constant(value))
+    return Expression(constant(value))
 
 
 @dataclass(frozen=True, slots=True)
-class Requirement:
+class Demand:
     """A formula to hold at the first sample.
 
     Attributes:
@@ -122,7 +122,7 @@ class Requirement:
     margin: Affine
 
 
-Row: TypeAlias = dict[str, Value]
+Row: TypeAlias = dict[str, Expression]
 """Columns at one sample: name -> value."""
 
 
@@ -142,7 +142,7 @@ class Encoding:
         self._tight = tight
         self._slack = constant(MARGIN if tight else -MARGIN)
         self._required = constant(0.0 if tight else -MARGIN)  # a margin of exactly 0 satisfies
-        self._numbers: dict[tuple[int, int], Value] = {}
+        self._numbers: dict[tuple[int, int], Expression] = {}
         self._trees: dict[tuple[int, int, int], Tree] = {}
         self._free: set[int] = set()
 
@@ -155,7 +155,7 @@ class Encoding:
         lets: Sequence[tuple[str, ir.Num]],
         step: Mapping[str, ir.Num],
         horizon: int,
-        requirements: Sequence[Requirement] = (),
+        requirements: Sequence[Demand] = (),
     ) -> list[Tree]:
         """Encode the dynamics over a horizon, and requirements at the first sample.
 
@@ -189,18 +189,18 @@ class Encoding:
                 for index in form.terms
                 if name in once and low <= 0.0 <= high
             }
-            env = row | {name: Value(form) for name, form in zip(bounds, inputs, strict=True)}
+            env = row | {name: Expression(form) for name, form in zip(bounds, inputs, strict=True)}
             self.rows.append(env)
             for name, num in lets:
-                env[name] = Value(self._linear(self._number(num, k), num))
-            moved = {name: Value(self._linear(self._number(num, k), num)) for name, num in step.items()}
+                env[name] = Expression(self._linear(self._number(num, k), num))
+            moved = {name: Expression(self._linear(self._number(num, k), num)) for name, num in step.items()}
             row = {name: moved.get(name, value) for name, value in row.items()}
         row[ir.ELAPSED] = number(float(horizon))
         self._invariants(requirements, row, horizon)
         self.rows.append(row)
         return [self._tree(each.formula, 0, each) for each in requirements]
 
-    def _invariants(self, requirements: Sequence[Requirement], row: Row, k: int) -> None:
+    def _invariants(self, requirements: Sequence[Demand], row: Row, k: int) -> None:
         """Bound the states of sample `k` by what requirements demand of it, whatever the plan."""
         self.rows.append(row)
         for each in requirements:
@@ -212,7 +212,7 @@ class Encoding:
                         self.model.tighten(part.form, part.margin.const)
         self.rows.pop()
 
-    def _demanded(self, formula: ir.Formula, k: int, what: Requirement) -> Iterator[ir.Formula]:
+    def _demanded(self, formula: ir.Formula, k: int, what: Demand) -> Iterator[ir.Formula]:
         """State formulas that hold at sample `k` wherever `formula` holds at the first."""
         match formula:
             case ir.Predicate() if k == 0:
@@ -232,14 +232,14 @@ class Encoding:
 
     # ------------------------------------------------------------------- formulas
 
-    def _tree(self, formula: ir.Formula, k: int, what: Requirement) -> Tree:
+    def _tree(self, formula: ir.Formula, k: int, what: Demand) -> Tree:
         """The condition that a part of a requirement holds at sample `k`."""
         key = id(what), id(formula), k
         if key not in self._trees:
             self._trees[key] = self._formula(formula, k, what)
         return self._trees[key]
 
-    def _formula(self, node: ir.Formula, k: int, margin: Requirement) -> Tree:
+    def _formula(self, node: ir.Formula, k: int, margin: Demand) -> Tree:
         match node:
             case ir.Truth(value):
                 return value
@@ -268,7 +268,7 @@ class Encoding:
         raise UnencodableError(f"`{type(node).__name__.lower()}`")
 
     def _until(
-        self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Requirement
+        self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Demand
     ) -> Tree:
         """`until`, or its dual `release`: min and max exchanged."""
         inner, outer = ("and", "or") if strong else ("or", "and")
@@ -307,15 +307,15 @@ class Encoding:
                 return junction(turned, [self._decided(item, k, holds=holds) for item in items])
         raise UnencodableError("a condition over time")
 
-    def _condition(self, value: Value, margin: Affine, num: ir.Num) -> Tree:
+    def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
         """`value >= margin` as a tree of affine conditions: extrema and choices are split."""
         for index, (factor, atom) in enumerate(value.atoms):
-            rest = Value(value.form, value.atoms[:index] + value.atoms[index + 1 :])
+            rest = Expression(value.form, value.atoms[:index] + value.atoms[index + 1 :])
             match atom:
                 case Greatest(items):
                     parts = [self._condition(rest.plus(item, factor), margin, num) for item in items]
                     return junction("or" if factor > 0.0 else "and", parts)
-                case Choice(yes, no, holds, fails):
+                case Conditional(yes, no, holds, fails):
                     first = self._condition(rest.plus(yes, factor), margin, num)
                     second = self._condition(rest.plus(no, factor), margin, num)
                     return junction("and", (junction("or", (fails, first)), junction("or", (holds, second))))
@@ -323,7 +323,7 @@ class Encoding:
                     return self._circle(value.form, factor, lengths, margin)
         return self._polynomial(value, margin, num)
 
-    def _polynomial(self, value: Value, margin: Affine, num: ir.Num) -> Tree:
+    def _polynomial(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
         """`value >= margin` for a value without extrema and choices, quadratic at most."""
         squares: dict[int, float] = {}
         for factor, atom in value.atoms:
@@ -396,14 +396,14 @@ class Encoding:
 
     # -------------------------------------------------------------------- numbers
 
-    def _number(self, num: ir.Num, k: int) -> Value:
+    def _number(self, num: ir.Num, k: int) -> Expression:
         """The value of a number at sample `k`."""
         key = id(num), k
         if key not in self._numbers:
             self._numbers[key] = self._value(num, k)
         return self._numbers[key]
 
-    def _value(self, num: ir.Num, k: int) -> Value:
+    def _value(self, num: ir.Num, k: int) -> Expression:
         match num:
             case ir.Const(value):
                 return number(value)
@@ -422,15 +422,17 @@ class Encoding:
                 return self._choice(cond, k, lambda: number(1.0), lambda: number(0.0))
         raise UnencodableError(show_number(num))
 
-    def _choice(self, cond: ir.Formula, k: int, yes: Callable[[], Value], no: Callable[[], Value]) -> Value:
+    def _choice(
+        self, cond: ir.Formula, k: int, yes: Callable[[], Expression], no: Callable[[], Expression]
+    ) -> Expression:
         holds, fails = (self._decided(cond, k, holds=each) for each in (True, False))
         if fails is False or holds is True:
             return yes()
         if holds is False or fails is True:
             return no()
-        return Value(ZERO, ((1.0, Choice(yes(), no(), holds, fails)),))
+        return Expression(ZERO, ((1.0, Conditional(yes(), no(), holds, fails)),))
 
-    def _op(self, num: ir.Num, name: str, args: list[Value]) -> Value:
+    def _op(self, num: ir.Num, name: str, args: list[Expression]) -> Expression:
         known = [arg.known for arg in args]
         fold = FUNCTIONS[name].fold
         if fold is not None and None not in known:
@@ -438,7 +440,7 @@ class Encoding:
         if name in _FORMS:
             return _FORMS[name](self, args)
         if name == "norm":
-            return Value(ZERO, ((1.0, Norm(tuple(self._linear(arg, num) for arg in args))),))
+            return Expression(ZERO, ((1.0, Norm(tuple(self._linear(arg, num) for arg in args))),))
         if name == "mul" or name == "square" or (name == "pow" and known[1] == 2.0):
             return self._product(num, args[0], args[1] if name == "mul" else args[0])
         divisor = known[-1]
@@ -448,14 +450,14 @@ class Encoding:
             return self._remainder(self._linear(args[0], num), divisor)
         raise UnencodableError(show_number(num))
 
-    def _clipped(self, args: Sequence[Value]) -> Value:
+    def _clipped(self, args: Sequence[Expression]) -> Expression:
         held = self._held(args)
         if held is not None:
             return held
         above = self._greatest(args[:2])
         return self._greatest([above.times(-1.0), args[2].times(-1.0)]).times(-1.0)
 
-    def _greatest(self, items: Sequence[Value]) -> Value:
+    def _greatest(self, items: Sequence[Expression]) -> Expression:
         """The greatest value, without those that the bounds exclude."""
         ends = [(-math.inf, math.inf) if v.atoms else self.model.bounds(v.form) for v in items]
         least = max(low for low, _ in ends)
@@ -464,9 +466,9 @@ class Encoding:
             left.append(next(i for i, (low, _) in enumerate(ends) if low >= least))
         if len(left) == 1:
             return items[left[0]]
-        return Value(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
+        return Expression(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
 
-    def _held(self, args: Sequence[Value]) -> Value | None:
+    def _held(self, args: Sequence[Expression]) -> Expression | None:
         """`clip(v + c u, low, high)` without saturation; None if that excludes a value of it.
 
         A control that is read nowhere else can reach each bound exactly instead of beyond it, wherever v lies
@@ -484,9 +486,9 @@ class Encoding:
         ends = self.model.bounds(form)
         found = self.model.variable(max(low, ends[0]), min(high, ends[1]))
         self.model.require(form.plus(found, -1.0), 0.0, 0.0)
-        return Value(found)
+        return Expression(found)
 
-    def _product(self, num: ir.Num, left: Value, right: Value) -> Value:
+    def _product(self, num: ir.Num, left: Expression, right: Expression) -> Expression:
         for one, other in ((left, right), (right, left)):
             if one.known is not None:
                 return other.times(one.known)
@@ -499,27 +501,27 @@ class Encoding:
             ((variable, a),), ((_, b),) = first.terms.items(), second.terms.items()
             cross = a * second.const + b * first.const
             form = Affine({variable: cross} if cross else {}, first.const * second.const)
-            return Value(form, ((a * b, Square(variable)),))
+            return Expression(form, ((a * b, Square(variable)),))
         raise UnencodableError(show_number(num))
 
-    def _remainder(self, form: Affine, divisor: float) -> Value:
+    def _remainder(self, form: Affine, divisor: float) -> Expression:
         """`form` modulo a constant, through a whole number."""
         low, high = self.model.bounds(form.times(1.0 / divisor))
         if math.floor(low) == math.floor(high):
-            return Value(form.plus(constant(-divisor * math.floor(low))))
+            return Expression(form.plus(constant(-divisor * math.floor(low))))
         whole = self.model.variable(math.floor(low), math.floor(high), integer=True)
         rest = form.plus(whole, -divisor)
         self.model.require(rest, min(0.0, divisor), max(0.0, divisor))
-        return Value(rest)
+        return Expression(rest)
 
-    def _linear(self, value: Value, num: ir.Num) -> Affine:
+    def _linear(self, value: Expression, num: ir.Num) -> Affine:
         """The value as one variable: extrema and choices get binary variables."""
         form = value.form
         for factor, atom in value.atoms:
             match atom:
                 case Greatest(items):
                     form = form.plus(self._extremum([self._linear(item, num) for item in items]), factor)
-                case Choice(yes, no, holds, fails):
+                case Conditional(yes, no, holds, fails):
                     ends = self._linear(yes, num), self._linear(no, num)
                     form = form.plus(self._switched(*ends, holds, fails), factor)
                 case _:
@@ -552,7 +554,7 @@ class Encoding:
         return no.plus(model.product(binary, gap))
 
 
-_FORMS: dict[str, Callable[[Encoding, list[Value]], Value]] = {
+_FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {
     "add": lambda _, args: args[0].plus(args[1]),
     "sub": lambda _, args: args[0].plus(args[1], -1.0),
     "neg": lambda _, args: args[0].times(-1.0),
@@ -587,12 +589,14 @@ def _conjuncts(tree: Tree) -> Iterator[Tree]:
         yield tree
 
 
-def _scaled(one: Value, other: Value) -> Value | None:
+def _scaled(one: Expression, other: Expression) -> Expression | None:
     """The product of a choice between two constants and another value; None if `one` is no such choice."""
     match one.atoms:
-        case ((factor, Choice(yes, no, holds, fails)),) if not one.form.terms:
+        case ((factor, Conditional(yes, no, holds, fails)),) if not one.form.terms:
             if yes.known is None or no.known is None:
                 return None
-            chosen = Choice(other.times(factor * yes.known), other.times(factor * no.known), holds, fails)
-            return other.times(one.form.const).plus(Value(ZERO, ((1.0, chosen),)))
+            chosen = Conditional(
+                other.times(factor * yes.known), other.times(factor * no.known), holds, fails
+            )
+            return other.times(one.form.const).plus(Expression(ZERO, ((1.0, chosen),)))
     return None

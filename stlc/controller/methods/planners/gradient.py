@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Gradient:
+class GradientPlanner:
     """Adam on latent plans, which are mapped to the control ranges like the outputs of a policy network.
 
     Attributes:
@@ -73,4 +73,4 @@ class Gradient:
                     adam.step()
 
 
-PLANNER = Gradient
+PLANNER = GradientPlanner

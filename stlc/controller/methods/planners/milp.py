@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from stlc.compile.backends.milp.encode import Encoding, Requirement
+from stlc.compile.backends.milp.encode import Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
 from stlc.diagnostics import Diagnostic, MissingError, UsageError
 
@@ -130,7 +130,7 @@ def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[
         rho = encoding.model.variable(0.0, MOST_RHO) if maximise else constant(target)
         factors = [rule.weight / rule.scale for rule in task.rules]
         wanted = [
-            Requirement(rule.formula, rho.times(1.0 / factor))
+            Demand(rule.formula, rho.times(1.0 / factor))
             for rule, factor in zip(task.rules, factors, strict=True)
         ]
         trees = encoding.roll(x0, bounds, step.lets, step.next, task.system.horizon, wanted)

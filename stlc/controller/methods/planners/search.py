@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class SearchPlanner:
     """Local search: in every generation the best of a batch of changed plans is kept.
 
     A change is noise over an interval of time, a shift of an interval, an interval held at one level, or a
@@ -61,4 +61,4 @@ class Search:
             number, tries = number + 1, min(2 * tries, self.longest)
 
 
-PLANNER = Search
+PLANNER = SearchPlanner
