@@ -156,11 +156,11 @@ class Learner(ABC):
     @property
     @abstractmethod
     def policy(self) -> Policy:
-        """The policy learned until now, on the CPU."""
+        """Policy after the steps made until now, on the CPU."""
 
     @property
     def rate(self) -> float:
-        """Learning rate of the next step."""
+        """Learning rate of the next gradient step."""
         return self.config.lr
 
     def validate(self) -> Validation:
@@ -190,7 +190,11 @@ class Learner(ABC):
         self.generator.set_state(tensors["generator"].cpu())
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step on any rank, and whether the weights before it gave finite plans."""
+        """Find the cause of a step whose loss or gradient was not finite on any of the ranks (processes).
+
+        Returns:
+            The error that describes the cause, and whether the weights before the step gave finite plans.
+        """
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
         return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
 

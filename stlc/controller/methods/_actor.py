@@ -1,4 +1,8 @@
-"""Policies of learners of one action a step: the plan is the actor's closed loop on the model."""
+"""Policies of actors (networks that choose one action per step).
+
+The plan of such a policy is the sequence of controls that the actor chooses in closed loop on the model of
+the system.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ActorConfig(ResolvedConfig):
-    """Options of a learner of one action a step.
+    """Options of a method that learns an actor, which chooses one action per step.
 
     Attributes:
-        reward: of an episode (`stlc.controller.problem.environments.Reward`).
-        environments: number of episodes side by side.
+        reward: name of the reward of an episode (`stlc.controller.problem.environments.Reward`).
+        environments: number of episodes that are simulated in parallel.
     """
 
     reward: str = "robustness"
@@ -35,11 +39,11 @@ class ActorConfig(ResolvedConfig):
 
 
 class ActorPolicy(Policy):
-    """Policy of an actor that sees the elapsed share of the plan beside the state.
+    """Policy of an actor that observes the state and the fraction of the plan that has elapsed.
 
     Args:
         task: specification and system.
-        actor: observations (B, k) float32 -> controls (B, m) in physical units; see `observe`.
+        actor: network from observations (B, k) float32 to controls (B, m) in physical units; see `observe`.
     """
 
     def __init__(self, task: Task, actor: Callable[[Tensor], Tensor]) -> None:
@@ -64,35 +68,35 @@ class ActorPolicy(Policy):
         return torch.stack(actions, 1)[:, None]
 
     def _native(self, system: System) -> NativeStep | None:
-        """The compiled step of a system; None where torch has to be used."""
+        """Compiled step of a system; None if the step cannot be compiled and torch has to be used."""
         if self._compiled is None or self._compiled[0] is not system:
             self._compiled = system, NativeStep.of(system, rewarded=False)
         return self._compiled[1]
 
 
 class ActorLearner(Learner):
-    """Training of an actor, by rewards."""
+    """Training of an actor (a network that chooses one action per step) by rewards."""
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reason why verdicts use torch, or "" where they run as C; no gradient of robustness is needed."""
+        """Reason why plans are judged in torch; "" if they are judged in C. Gradients are not needed."""
         reasons = super().torch_reasons()
         return {"verdicts": reasons["verdicts"]}
 
 
 def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Entries under `prefix.`, without the prefix."""
+    """Tensors whose names begin with `prefix.`, under their names without the prefix."""
     start = prefix + "."
     return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """State of an optimiser by name."""
+    """State of an optimiser as tensors, whose names begin with `prefix.`."""
     states = optimizer.state_dict()["state"].items()
     return {f"{prefix}.{index}.{name}": value for index, state in states for name, value in state.items()}
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restore the state of `optimizer_tensors`, without the prefix."""
+    """Restore an optimiser from `optimizer_tensors`, whose names here lack the prefix."""
     layout = optimizer.state_dict()
     for key, value in tensors.items():
         index, name = key.split(".")

@@ -74,14 +74,15 @@ class BatchedMlp(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How an ensemble is trained.
+    """Options of the training of an ensemble.
 
     Attributes:
         lr: learning rate of Adam.
-        decay: weight of the squared weights.
-        batch: samples of a gradient step of each network.
-        epochs: passes over the data, at most.
-        patience: passes without improvement of any network that end the training; 0: makes all passes.
+        decay: factor of the penalty on the sum of squared weights.
+        batch: number of samples per gradient step and network.
+        epochs: maximum number of passes over the data.
+        patience: number of passes after which training ends if no network has improved; 0: all passes are
+            made.
         held: share of the samples held out for validation; 0: none.
     """
 
@@ -94,19 +95,20 @@ class Fit:
 
 
 class Ensemble(nn.Module):
-    """Gaussian networks from inputs to changes of columns, all of which learn from different samples.
+    """Ensemble of networks that predict the change of a state in one step, each as a Gaussian.
 
-    Inputs are normalised, and so are the targets, since the columns of a state have different units. Columns
-    that never change in the data stay as they are, exactly.
+    The networks learn from different samples. Inputs and targets are normalised, since the components of a
+    state
+    have different units. Components that never change in the data are predicted not to change.
 
     Attributes:
         body: the networks, (E, B, inputs) -> (E, B, 2 outputs): means and logarithms of variances.
-        lowest: lower bounds on the logarithms of variances, (outputs,), learnt.
-        highest: upper bounds, (outputs,), learnt.
+        lowest: learnt lower bounds on the logarithms of variances, (outputs,).
+        highest: learnt upper bounds on the logarithms of variances, (outputs,).
         centre: mean of the inputs, (inputs,).
-        spread: their standard deviation, (inputs,).
+        spread: standard deviation of the inputs, (inputs,).
         drift: mean of the targets, (outputs,).
-        scale: their standard deviation, (outputs,); 0 of constant columns.
+        scale: standard deviation of the targets, (outputs,); 0 for a component that never changes.
         elites: indices of the networks with the least validation error, (elites,).
     """
 
@@ -142,7 +144,10 @@ class Ensemble(nn.Module):
         return len(self.body.weights[0])
 
     def normalise(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set the units of inputs (N, inputs) and targets (N, outputs); columns of targets come first."""
+        """Set mean and scale for normalisation from inputs (N, inputs) and targets (N, outputs).
+
+        The first components of the inputs are the states that the targets change.
+        """
         spread = inputs.std(0)
         scale = targets.std(0)
         self.centre.copy_(inputs.mean(0))
@@ -152,12 +157,12 @@ class Ensemble(nn.Module):
         self.scale.copy_(torch.where(still, torch.zeros_like(scale), scale))
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and logarithms of variances in units of `scale`: (E, B, inputs) -> 2 (E, B, outputs)."""
+        """Means and log-variances, in units of `scale`: (E, B, inputs) -> two tensors (E, B, outputs)."""
         mean, log = self.body((inputs - self.centre) / self.spread).chunk(2, -1)
         return mean, _bounded(log, self.lowest, self.highest)
 
     def loss(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        """Negative logarithm of the likelihood (Chua et al. 2018, Section 4), summed over the networks: ().
+        """Negative log-likelihood (Chua et al. 2018, Section 4), summed over the networks: ().
 
         Args:
             inputs: (E, B, inputs).
@@ -180,14 +185,14 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def variance(self, inputs: Tensor) -> Tensor:
-        """Variance of the mixture of the elites in the units of the data: (B, inputs) -> (B, outputs)."""
+        """Variance of the mixture of the elites, in physical units: (B, inputs) -> (B, outputs)."""
         mean, log = self(inputs.expand(self.networks, -1, -1))
         mean, log = mean[self.elites], log[self.elites]
         found: Tensor = (log.exp().mean(0) + mean.var(0, unbiased=False)) * self.scale.square()
         return found
 
     def predictor(self) -> Predictor:
-        """The elites as they are now, for sampling without gradient."""
+        """Predictor with the present weights of the elites, which draws samples without gradient."""
         return Predictor(self)
 
     def _scaled(self, targets: Tensor) -> Tensor:
@@ -197,13 +202,13 @@ class Ensemble(nn.Module):
 
 
 def _bounded(log: Tensor, lowest: Tensor, highest: Tensor) -> Tensor:
-    """Logarithms of variances within bounds, smoothly (Chua et al. 2018, Appendix A.1)."""
+    """Limit logarithms of variances smoothly to their bounds (Chua et al. 2018, Appendix A.1)."""
     log = highest - functional.softplus(highest - log)
     return lowest + functional.softplus(log - lowest)
 
 
 class Predictor:
-    """Samples of the changes that the elites of an ensemble predict.
+    """Random predictions by the elites (the networks with the least validation error) of an ensemble.
 
     Attributes:
         elites: number of networks.
@@ -226,11 +231,11 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """A sample of each change by the network of its row of the first axis.
+        """Draw a sample of the change for every input; inputs `[i]` are evaluated by elite number i.
 
         Args:
-            inputs: (k, B, inputs); the first k elites are asked, k <= `elites`.
-            generator: of the noise.
+            inputs: (k, B, inputs), where k is at most `elites`.
+            generator: random numbers of the noise.
 
         Returns:
             Changes in the units of the data, (k, B, outputs).
@@ -247,7 +252,7 @@ class Predictor:
 
 
 def optimizer_of(ensemble: Ensemble, fit: Fit) -> torch.optim.Optimizer:
-    """Adam over all networks at once; the bounds on variances do not decay."""
+    """Adam for all networks together; weight decay does not apply to the bounds on variances."""
     groups = [
         {"params": list(ensemble.body.parameters()), "weight_decay": fit.decay},
         {"params": [ensemble.lowest, ensemble.highest], "weight_decay": 0.0},
@@ -266,20 +271,21 @@ def train_ensemble(
 ) -> float:
     """Train all networks, each on its own bootstrap sample, and select the elites.
 
-    With validation data every network keeps its weights of least validation error; the training ends once no
+    If there are validation data, every network keeps the weights with the least validation error, and
+    training ends once no
     network has improved by 1 % within `fit.patience` passes.
 
     Args:
-        ensemble: to be trained further.
-        optimizer: of `optimizer_of`.
+        ensemble: the networks; training continues from their present weights.
+        optimizer: optimiser made by `optimizer_of`.
         inputs: (N, inputs).
         targets: (N, outputs).
-        fit: how.
-        generator: of all random numbers.
+        fit: options of the training.
+        generator: source of all random numbers.
 
     Returns:
-        Mean over the elites of the mean squared error on the validation data (without those, on the training
-        data), in units of the spread of the targets; NaN where the loss is not finite.
+        Mean over the elites of the mean squared error on the validation data (on the training data if there
+        are none), in units of the spread of the targets; NaN where the loss is not finite.
     """
     ensemble.normalise(inputs, targets)
     order = torch.randperm(len(inputs), generator=generator)
@@ -308,14 +314,14 @@ def train_ensemble(
 
 
 class _Best:
-    """Weights of least validation error of each network, and the passes since any of them improved."""
+    """For each network the weights with the least validation error, and the passes since any improved."""
 
     def __init__(self, ensemble: Ensemble, errors: Tensor | None) -> None:
         self._ensemble, self._errors, self._idle = ensemble, errors, 0
         self._kept = [] if errors is None else [each.detach().clone() for each in ensemble.body.parameters()]
 
     def update(self, errors: Tensor) -> int:
-        """Keep the weights of networks that have improved; return the passes without improvement so far."""
+        """Store the weights of the networks that improved; return the passes since the last improvement."""
         assert self._errors is not None
         better = errors < (1.0 - GAIN) * self._errors
         self._idle = 0 if bool(better.any()) else self._idle + 1
@@ -326,6 +332,6 @@ class _Best:
 
     @torch.no_grad()
     def restore(self) -> None:
-        """Put the kept weights back."""
+        """Give every network its stored weights, those with the least validation error."""
         for kept, now in zip(self._kept, self._ensemble.body.parameters(), strict=False):
             now.copy_(kept)

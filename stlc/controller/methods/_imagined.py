@@ -1,7 +1,8 @@
-"""Episodes of a task, real ones kept and imagined ones predicted by an ensemble, and their rewards.
+"""Observed and imagined episodes of a task, and their rewards.
 
-The ensemble learns the system. What the specification adds to it is known: parameters and timers follow from
-the states, and the reward is that of the task.
+Observed episodes are simulated with the model of the system and stored; an ensemble learns from them, and
+predicts imagined episodes. The ensemble predicts only the states of the system itself. The states that the
+specification adds (parameters and timers) are computed from these, and the reward is that of the task.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ PIECE = 5
 
 @dataclass(frozen=True, slots=True)
 class ModelConfig(ActorConfig):
-    """Options of a learner with a learnt model.
+    """Options of a method that learns a model of the system.
 
     Attributes:
-        networks: of the ensemble.
-        elites: networks that predict, those with the least validation error.
-        width: of their hidden layers.
+        networks: number of networks of the ensemble.
+        elites: number of networks that predict: those with the least validation error.
+        width: number of units per hidden layer.
         layers: number of hidden layers.
         model_lr: learning rate of the networks.
-        model_decay: weight of their squared weights.
-        model_batch: samples of a gradient step of each network.
-        model_epochs: passes over the data after new episodes, at most.
+        model_decay: factor of the penalty on the sum of squared weights.
+        model_batch: number of samples per gradient step and network.
+        model_epochs: maximum number of passes over the data after new episodes.
         model_patience: passes without improvement that end the training of the networks; 0: none.
         model_held: share of the samples held out for their validation.
         growth: share by which the data have to grow before the networks are trained again; 0: every time.
-        first: random episodes before the first training of the networks.
-        capacity: kept episodes; older ones are replaced.
+        first: number of episodes with random controls before the first training of the networks.
+        capacity: number of episodes that are stored; new ones replace the oldest.
     """
 
     environments: int = 16
@@ -68,7 +69,7 @@ class ModelConfig(ActorConfig):
 
     @property
     def fit(self) -> Fit:
-        """How the networks are trained."""
+        """Options of the training of the ensemble."""
         return Fit(
             self.model_lr,
             self.model_decay,
@@ -87,7 +88,7 @@ def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor
 
     Args:
         task: specification and system.
-        kind: of reward.
+        kind: name of the reward.
         states: (B, T+1, n).
         actions: controls within their ranges, (B, T, m).
     """
@@ -99,7 +100,7 @@ def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor
 
 
 def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
-    """Reward at the end of episodes (B, T+1, n), of the kinds `robustness` and `accuracy`: (B,)."""
+    """Reward at the end of episodes with states (B, T+1, n): (B,); not for the reward `task`."""
     rho = task.robustness(states)
     if kind == "accuracy":
         return SATISFIED * satisfied(rho).to(rho)
@@ -107,20 +108,20 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
-    """The declared reward of steps: (…, n), (…, n), (…, m) -> (…)."""
+    """Reward that the system declares, for steps `before` (…, n), `after` (…, n), `actions` (…, m): (…)."""
     system, shape = task.system, actions.shape[:-1]
     flat = [part.reshape(-1, part.shape[-1]) for part in (before, after, actions)]
     return system.reward(flat[1], system.commanded(flat[0], flat[2])).to(actions).view(shape)
 
 
 class Episodes:
-    """The latest episodes on the system.
+    """Memory of the latest observed episodes.
 
     Attributes:
-        states: (capacity, T+1, n); the first `count` hold.
+        states: (capacity, T+1, n); only the first `count` entries are filled.
         actions: (capacity, T, m).
         rewards: (capacity, T).
-        count: number of kept episodes.
+        count: number of stored episodes.
         total: number of episodes ever added.
     """
 
@@ -132,26 +133,31 @@ class Episodes:
         self.count = self.total = 0
 
     def add(self, states: Tensor, actions: Tensor, earned: Tensor) -> None:
-        """Keep episodes (N, T+1, n), (N, T, m), (N, T) in place of the oldest."""
+        """Store episodes: states (N, T+1, n), actions (N, T, m), rewards (N, T). The oldest are replaced."""
         at = (self.total + torch.arange(len(states))) % len(self.states)
         self.states[at], self.actions[at], self.rewards[at] = states, actions, earned
         self.total += len(states)
         self.count = min(self.total, len(self.states))
 
     def transitions(self, own: int) -> tuple[Tensor, Tensor]:
-        """Inputs and targets of the ensemble: (N, own + m), (N, own); `own` columns belong to the system."""
+        """Training data of the ensemble, where `own` is the number of states of the system itself.
+
+        Returns:
+            Inputs (states and controls), (N, own + m), and targets (changes of the states in a step), (N,
+            own).
+        """
         states, actions = self.states[: self.count, :, :own], self.actions[: self.count]
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
         return torch.cat((before, actions.flatten(0, 1)), 1), after - before
 
     def tensors(self) -> dict[str, Tensor]:
-        """The kept episodes."""
+        """Stored episodes as tensors by name."""
         names = ("states", "actions", "rewards")
         found = {f"episodes.{name}": getattr(self, name)[: self.count].clone() for name in names}
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore `tensors`, without their prefix."""
+        """Restore the episodes from what `tensors` returned, whose names here lack their prefix."""
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
             getattr(self, name)[: self.count] = tensors[name]
@@ -159,7 +165,11 @@ class Episodes:
 
 @torch.no_grad()
 def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[Tensor, Tensor]:
-    """Episodes from given states under controls `act(states, step)`, (N, n) -> (N, T+1, n), (N, T, m)."""
+    """Simulate episodes from states `x0`, (N, n), under the controls `act(states, step)`.
+
+    Returns:
+        States (N, T+1, n) and controls (N, T, m).
+    """
     system = task.system
     states, actions = [x0], []
     for step in range(system.horizon):
@@ -181,7 +191,10 @@ def random_controls(task: Task, count: int, generator: torch.Generator) -> Tenso
 
 
 class LearntModel:
-    """One step of the system, sampled from an ensemble; parameters and timers as the specification says."""
+    """Learnt model of one step of the system, which draws the next states from an ensemble.
+
+    Parameters and timers, the states that the specification adds, are computed exactly.
+    """
 
     def __init__(self, task: Task, predictor: Predictor) -> None:
         self.task, self.predictor = task, predictor
@@ -189,12 +202,12 @@ class LearntModel:
 
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, generator: torch.Generator) -> Tensor:
-        """States one step later, each row of the first axis by an elite of its own.
+        """Draw the states one step later; the states `x[i]` are advanced by elite number i.
 
         Args:
-            x: (k, B, n), k at most the number of elites.
+            x: states, (k, B, n), where k is at most the number of elites.
             u: controls within their ranges, (k, B, m).
-            generator: of the predictions.
+            generator: random numbers of the predictions.
         """
         own = x[..., : self._own]
         moved = own + self.predictor(torch.cat((own, u), -1), generator)
@@ -205,16 +218,18 @@ class LearntModel:
 
 
 class ModelLearner(Learner):
-    """Training with an ensemble: episodes on the system, the networks trained on them, then the subclass.
+    """Training with a learnt model: an ensemble that learns the system from observed episodes.
 
-    One step of the training is one episode in every environment, followed by the work on the learnt model.
-    The state between two steps is that of the networks, the kept episodes and the random numbers.
+    One step of the training observes one episode in every environment, trains the ensemble if due, and then
+    does
+    what the subclass adds. A checkpoint holds the networks, the stored episodes and the state of the random
+    numbers.
 
     Attributes:
-        episodes: all kept episodes.
+        episodes: the stored episodes.
         ensemble: the learnt model.
-        fitted: number of episodes at its latest training.
-        error: its validation error then, see `train_ensemble`.
+        fitted: number of episodes at the latest training of the ensemble.
+        error: validation error after that training, see `train_ensemble`.
     """
 
     config: ModelConfig
@@ -222,7 +237,7 @@ class ModelLearner(Learner):
     def __init__(
         self, task: Task, config: ModelConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
     ) -> None:
-        """Raises UsageError (U101) for several ranks, a GPU, or an undeclared reward."""
+        """Raise UsageError (U101) for several ranks (processes), a GPU, or an undeclared reward."""
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         if ranks.size > 1:
             raise usage(f"method `{config.method}` trains in one process", "start it without torchrun")
@@ -238,19 +253,21 @@ class ModelLearner(Learner):
 
     @property
     def environment_steps(self) -> int:
-        """Steps on the system so far."""
+        """Number of steps that have been simulated with the model of the system."""
         return self.episodes.total * self.task.system.horizon
 
     @property
     def model(self) -> LearntModel:
-        """The system as learnt so far."""
+        """Learnt model of the system with the present weights of the ensemble."""
         return LearntModel(self.task, self.ensemble.predictor())
 
     def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
-        """Play one episode in every environment and train the ensemble if due; False where that diverged.
+        """Play one episode in every environment and train the ensemble if due.
+
+        Returns False if the training of the ensemble diverged.
 
         Args:
-            act: states (N, n), step -> controls (N, m); None for random ones.
+            act: function from states (N, n) and the step to controls (N, m); None for random controls.
         """
         config = self.config
         count = config.environments if self.episodes.total else max(config.first, config.environments)
@@ -272,19 +289,19 @@ class ModelLearner(Learner):
         return not math.isnan(self.error)
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption, bit for bit: no episode is under way between two steps."""
+        """Tensors from which training resumes exactly; no episode is in progress between two steps."""
         found = super().tensors() | self.episodes.tensors()
         found |= {f"ensemble.{name}": value for name, value in self.ensemble.state_dict().items()}
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars stored with `tensors`."""
+        """Scalars that are stored together with `tensors`."""
         error = {"model_error": self.error} if not math.isnan(self.error) else {}
         own = {"fitted": self.fitted, "environment_steps": self.environment_steps}
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))
@@ -293,7 +310,7 @@ class ModelLearner(Learner):
 
 
 def ensemble_of(task: Task, config: ModelConfig) -> Ensemble:
-    """An ensemble whose initial weights depend on the seed alone."""
+    """Make an ensemble whose initial weights depend only on the seed of the options."""
     outputs = len(task.system.decl.signature.names)
     return Ensemble(
         outputs + len(task.system.control_names),

@@ -1,4 +1,4 @@
-"""What a run of soft actor-critic has: its options and its actor, without the package that trains it."""
+"""Options and actor of soft actor-critic; they need no stable-baselines3, which only training uses."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SacConfig(ActorConfig):
-    """Options of SAC; the paper has 8 environments, 1 update, and 5 to 20 million transitions.
+    """Options of SAC. The paper uses 8 environments, 1 update, and 5 to 20 million transitions.
 
     Attributes:
-        updates: gradient steps after each step of all environments.
-        capacity: of the replay buffer, in transitions.
-        warmup_transitions: transitions with random controls before the first update.
+        updates: number of gradient steps after each step of all environments.
+        capacity: capacity of the replay buffer, in transitions.
+        warmup_transitions: number of transitions with random controls before the first update.
         discount: gamma of the return.
-        smoothing: share of the new critics in the target critics, per update.
+        smoothing: share by which the target critics move towards the critics in an update (tau).
     """
 
     updates: int = 4
@@ -37,11 +37,13 @@ class SacConfig(ActorConfig):
 
 
 class SacActor(nn.Module):
-    """The mean of the library's actor, with the names of its weights; needs no package.
+    """Network with the mean of the actor of stable-baselines3, with the same names of its weights.
+
+    It does not need that package.
 
     Attributes:
         centre: mean of the observations of initial states, (k,).
-        spread: their standard deviation, (k,).
+        spread: standard deviation of the observations of initial states, (k,).
     """
 
     centre: Tensor
@@ -64,11 +66,11 @@ class SacActor(nn.Module):
         self.register_buffer("extent", 0.5 * (system.control_high - system.control_low).float())
 
     def normalised(self, observation: Tensor) -> Tensor:
-        """Observations on a common scale, (B, k)."""
+        """Observations less their mean, divided by their standard deviation, (B, k)."""
         return (observation - self.centre) / self.spread
 
     def controls(self, scaled: Tensor) -> Tensor:
-        """Controls in physical units of those in [-1, 1]: (B, m) -> (B, m)."""
+        """Scale controls from [-1, 1] to physical units: (B, m) -> (B, m)."""
         return self.middle + self.extent * scaled
 
     def forward(self, observation: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Soft actor-critic of stable-baselines3 over batched episodes, trained step by step.
 
-The library's own `save` pickles; here networks, optimisers, entropy coefficient, replay buffer and random
-numbers are tensors of the run's checkpoint.
+The library's own `save` writes pickles; here networks, optimisers, entropy coefficient, replay buffer and
+random numbers are stored as tensors in the run's checkpoint.
 """
 
 from __future__ import annotations
@@ -48,11 +48,13 @@ STORED = ("observations", "next_observations", "actions", "rewards", "dones")
 
 
 class EpisodesEnv(VecEnv):  # type: ignore[misc]
-    """Batched episodes as the library's vectorised environment: scaled observations, controls in [-1, 1].
+    """Batched episodes as a vectorised environment of stable-baselines3.
+
+    Observations are normalised; controls are scaled to [-1, 1].
 
     Args:
         environments: the episodes.
-        actor: scales of observations and controls.
+        actor: actor whose scales of observations and controls are used.
     """
 
     render_mode = None
@@ -64,20 +66,24 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         super().__init__(environments.count, seen, Box(-1.0, 1.0, (controls,), np.float32))
 
     def reset(self) -> np.ndarray[Any, Any]:
-        """Begin all episodes anew; return observations, (N, k)."""
+        """Begin all episodes at new initial states; return the observations, (N, k)."""
         self.environments.reset()
         return self.observed()
 
     def observed(self) -> np.ndarray[Any, Any]:
-        """Observations of episodes that begin, (N, k)."""
+        """Normalised observations of the present states at the beginning of episodes, (N, k)."""
         return self._seen(self.environments.observe(self.environments.states, 0))
 
     def step_async(self, actions: np.ndarray[Any, Any]) -> None:
-        """Keep the controls for `step_wait`, (N, m)."""
+        """Store the controls (N, m) that `step_wait` applies."""
         self._actions = torch.from_numpy(np.asarray(actions, np.float32))
 
     def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
-        """Advance all episodes by a step: observations (N, k), rewards (N,), ends (N,), and records."""
+        """Advance all episodes by one step under the stored controls.
+
+        Returns:
+            Observations (N, k), rewards (N,), whether episodes ended (N,), and one dictionary per episode.
+        """
         result = self.environments.step(self._actor.controls(self._actions))
         done = result.done.numpy()
         records: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -91,10 +97,10 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         return scaled
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: the environment holds no resources."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of every environment: all are this one."""
+        """Value of an attribute, repeated for every environment, since one object simulates all of them."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
@@ -106,16 +112,16 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:  # noqa: ARG002
-        """No environment is wrapped."""
+        """False for each environment, since none is wrapped."""
         return [False for _ in self._get_indices(indices)]
 
 
 class RandomState:
-    """Random numbers that the library draws from the global generators of torch and NumPy, kept apart.
+    """State of the random numbers that the library draws from the global generators of torch and NumPy.
 
     Attributes:
         torch: state of torch's generator.
-        numpy: state of NumPy's.
+        numpy: state of NumPy's generator.
     """
 
     def __init__(self, seed: int) -> None:
@@ -124,7 +130,7 @@ class RandomState:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Use these random numbers in the context, and leave those of the process as they were."""
+        """Context in which the global generators have this state; afterwards their own state is restored."""
         others = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002 - the library's
         torch.set_rng_state(self.torch)
         np.random.set_state(self.numpy)  # noqa: NPY002
@@ -137,19 +143,19 @@ class RandomState:
             random.setstate(others[2])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Both states by name."""
+        """States of both generators as tensors by name."""
         _, keys, position, *_ = self.numpy
         return {"torch": self.torch, "numpy": torch.tensor([*keys.tolist(), position])}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the states of `tensors`."""
+        """Restore the states from what `tensors` returned."""
         *keys, position = tensors["numpy"].tolist()
         self.torch = tensors["torch"]
         self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
 
 
 class SacLearner(ActorLearner):
-    """Training of SAC. The same seed and steps give the same weights on one machine."""
+    """Training by SAC. On one machine the same seed and number of steps give the same weights."""
 
     config: SacConfig
 
@@ -192,14 +198,18 @@ class SacLearner(ActorLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """The most probable control of every state."""
+        """Policy with the most probable controls of the actor."""
         theirs = {name: value.detach().cpu() for name, value in self.model.actor.state_dict().items()}
         own = {name: theirs[name] for name in self.actor.state_dict() if name in theirs}
         self.actor.load_state_dict(own, strict=False)
         return ActorPolicy(self.task, self.actor)
 
     def advance(self) -> float:
-        """Play one episode in every environment, with updates after each of its steps; the critics' loss."""
+        """Play one episode in every environment, with gradient steps after each step of the episodes.
+
+        Returns:
+            The mean loss of the critics; NaN if it is not finite.
+        """
         model, losses = self.model, []
         with self._random.used():
             for _ in range(self.environments.steps):
@@ -222,7 +232,7 @@ class SacLearner(ActorLearner):
         return loss
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step; the weights before it are gone, so that the last checkpoint stays."""
+        """Cause of a non-finite step; False, since the finite weights before that step are not kept."""
         return super().diagnose()[0], False
 
     # ------------------------------------------------------------- checkpoints
@@ -237,7 +247,10 @@ class SacLearner(ActorLearner):
         return {**found, "entropy": model.ent_coef_optimizer}
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption: networks, optimisers, entropy coefficient, replay buffer, random."""
+        """Tensors from which training resumes exactly.
+
+        They are those of networks, optimisers, entropy coefficient, replay buffer and random numbers.
+        """
         found = super().tensors()
         found |= {f"policy.{name}": value for name, value in self.policy.actor.state_dict().items()}  # type: ignore[attr-defined]
         for prefix, module in self._modules().items():
@@ -252,7 +265,7 @@ class SacLearner(ActorLearner):
         return found | {f"random.{name}": value for name, value in self._random.tensors().items()}
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars stored with `tensors`."""
+        """Scalars that are stored together with `tensors`."""
         model = self.model
         return super().facts() | {
             "transitions": model.num_timesteps,
@@ -261,7 +274,7 @@ class SacLearner(ActorLearner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         model, buffer = self.model, self.model.replay_buffer
         self.actor.load_state_dict(below(tensors, "policy"))

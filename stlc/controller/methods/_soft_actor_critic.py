@@ -1,7 +1,7 @@
-"""Soft actor-critic: learning of one action a step with entropy (Haarnoja et al., arXiv 1812.05905).
+"""Soft actor-critic (Haarnoja et al., arXiv 1812.05905), for methods that learn a model.
 
-Learners with a model need its gradient steps alone, on transitions of their own making, with random numbers
-and a state that a checkpoint holds.
+These methods need only its gradient steps, on transitions that they make themselves. All random numbers come
+from a given generator, and a checkpoint holds the whole state.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ LOG_LOW, LOG_HIGH = -5.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Transitions.
+    """Transitions: what happened in B steps of episodes.
 
     Attributes:
-        seen: observations, (B, k).
-        actions: in shares of the control ranges, -1 to 1, (B, m).
-        rewards: (B,).
+        seen: observations before the step, (B, k).
+        actions: actions, scaled from the control ranges to [-1, 1], (B, m).
+        rewards: rewards of the step, (B,).
         after: observations after the step, (B, k).
-        ended: 1 where the episode ended with the step, else 0, (B,).
+        ended: 1 if the episode ended with the step, else 0, (B,).
     """
 
     seen: Tensor
@@ -43,25 +43,26 @@ class Batch:
     ended: Tensor
 
     def of(self, rows: Tensor) -> Batch:
-        """The transitions at `rows`, (b,)."""
+        """The transitions with the indices `rows`, (b,)."""
         parts = (self.seen, self.actions, self.rewards, self.after, self.ended)
         return Batch(*(part[rows] for part in parts))
 
     def joined(self, other: Batch) -> Batch:
-        """These transitions and then those of `other`."""
+        """These transitions, followed by those of `other`."""
         names = ("seen", "actions", "rewards", "after", "ended")
         return Batch(*(torch.cat((getattr(self, name), getattr(other, name))) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
 class SacOptions:
-    """How actor and critics learn.
+    """Options of the training of actor and critics.
 
     Attributes:
-        lr: learning rate of Adam for all of them.
+        lr: learning rate of Adam for actor, critics and temperature.
         discount: gamma of the return.
-        average: share by which the target critics follow the critics in a step (tau).
-        temperature: weight of the entropy; 0: learnt, so that the entropy is -1 per control.
+        average: share by which the target critics move towards the critics in a gradient step (tau).
+        temperature: weight of the entropy; 0: the weight is learnt such that the entropy becomes -1 per
+            control.
     """
 
     lr: float
@@ -76,7 +77,7 @@ class SoftActorCritic(nn.Module):
     Attributes:
         actor: normalised observations -> means and logarithms of deviations, (1, B, k) -> (1, B, 2m).
         critics: normalised observations and actions -> values, (2, B, k + m) -> (2, B, 1).
-        targets: slowly following copy of the critics.
+        targets: target critics, a copy that follows the critics slowly.
         temperature: logarithm of the weight of the entropy, ().
         centre: mean of the observations, (k,).
         spread: their standard deviation, (k,).
@@ -111,7 +112,7 @@ class SoftActorCritic(nn.Module):
         }
 
     def normalise(self, seen: Tensor, returns: Tensor) -> None:
-        """Set the units of observations, (N, k), and of rewards, by the returns of episodes, (E,)."""
+        """Set mean and scale of the observations `seen`, (N, k), and the unit of rewards from returns (E,)."""
         spread = seen.std(0)
         self.centre.copy_(seen.mean(0))
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
@@ -127,9 +128,10 @@ class SoftActorCritic(nn.Module):
         return self._sampled(self._normalised(seen), generator)[0]
 
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """One gradient step of critics, actor and temperature; return the loss of the critics, ().
+        """Make one gradient step of critics, actor and temperature; return the loss of the critics, ().
 
-        Equations 5, 7 and 18 of the source, with the smaller of two target values.
+        Equations 5, 7 and 18 of Haarnoja et al., with the smaller one of the values of the two target
+        critics.
         """
         seen, after = self._normalised(batch.seen), self._normalised(batch.after)
         weight = self.temperature.detach().exp()
@@ -160,12 +162,12 @@ class SoftActorCritic(nn.Module):
         return ((seen - self.centre) / self.spread).clamp(-10.0, 10.0)
 
     def _parameters_of(self, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and logarithm of the standard deviation before squashing, (B, m) each."""
+        """Mean and log standard deviation of the actions before the tanh, (B, m) each."""
         mean, log = self.actor(seen[None])[0].chunk(2, -1)
         return mean, LOG_LOW + 0.5 * (LOG_HIGH - LOG_LOW) * (torch.tanh(log) + 1.0)
 
     def _sampled(self, seen: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Actions (B, m) and logarithms of their probability densities (B,) (Appendix C of the source)."""
+        """Random actions, (B, m), and the logarithms of their probability densities, (B,); Appendix C."""
         mean, log = self._parameters_of(seen)
         noise = torch.randn(mean.shape, generator=generator)
         raw = mean + noise * log.exp()
@@ -174,19 +176,19 @@ class SoftActorCritic(nn.Module):
         return torch.tanh(raw), (normal - squashed).sum(-1)
 
     def _values(self, critics: BatchedMlp, seen: Tensor, actions: Tensor) -> Tensor:
-        """Values by both critics: (B, k), (B, m) -> (2, B)."""
+        """Values of observations (B, k) and actions (B, m) by both critics: (2, B)."""
         values: Tensor = critics(torch.cat((seen, actions), -1).expand(2, -1, -1))[..., 0]
         return values
 
     def tensors(self) -> dict[str, Tensor]:
-        """All weights and the states of the optimisers, below `sac.`."""
+        """All weights and the states of the optimisers, under names that begin with `sac.`."""
         found = {f"sac.weights.{name}": value for name, value in self.state_dict().items()}
         for name, optimizer in self.optimizers.items():
             found |= optimizer_tensors(optimizer, f"sac.{name}")
         return found
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore `tensors`."""
+        """Restore weights and optimisers from what `tensors` returned."""
         self.load_state_dict(below(tensors, "sac.weights"))
         for name, optimizer in self.optimizers.items():
             restore_optimizer(optimizer, below(tensors, f"sac.{name}"))

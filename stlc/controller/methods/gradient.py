@@ -20,7 +20,10 @@ class Gradient(NetworkMethod):
     """Gradient descent on log-sum-exp robustness with tanh switching; one plan per state, no search."""
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Options of the paper: new states in every step, or a fixed training set, `train: {samples: …}`."""
+        """Resolve the options: as in the paper, every step uses new states, unless `samples` is given.
+
+        `train: {samples: …}` in the system file asks for a fixed training set of that size.
+        """
         found = base_config(task, config, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 

@@ -28,7 +28,12 @@ class Guided(NetworkMethod):
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Options; by default four plans, and in each step as many previously failing states as new ones."""
+        """Resolve the options.
+
+        By default the policy proposes four plans, and a step uses as many states at which it failed before as
+        new
+        states.
+        """
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 

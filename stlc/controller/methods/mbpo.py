@@ -2,8 +2,8 @@
 
 An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
 and soft actor-critic learns from their transitions, mixed with a few observed ones. The reward of imagined
-steps is that of the task: the robustness of an imagined episode that reaches the end is that of its observed
-beginning and its imagined rest.
+steps is that of the task. If an imagined episode reaches its end, its robustness is computed on the observed
+steps before its beginning and the imagined steps after it.
 
 The settings of Meng and Fan (2023) for their comparison: the options `environments=1 growth=0 imagined=400
 longest=15 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
@@ -43,16 +43,16 @@ class MbpoConfig(ModelConfig):
     """Options of MBPO.
 
     Attributes:
-        imagined: imagined episodes that begin for every observed step.
-        shortest: their first length, in steps.
-        longest: their last length.
-        growing_from: training step from which they grow.
-        growing_to: training step at which they have their last length; they grow linearly.
-        observed: share of observed transitions in a batch.
-        updates: gradient steps of actor and critics for every observed step.
-        critic_width: of the hidden layers of actor and critics.
+        imagined: number of imagined episodes that begin for every observed step.
+        shortest: length of imagined episodes at first, in steps.
+        longest: length of imagined episodes in the end, in steps.
+        growing_from: training step from which the length grows linearly.
+        growing_to: training step at which the length reaches `longest`.
+        observed: share of observed transitions in a batch; the others are imagined.
+        updates: number of gradient steps of actor and critics for every observed step.
+        critic_width: number of units per hidden layer of actor and critics.
         discount: gamma of the return.
-        follow: share by which the target critics follow in a gradient step.
+        follow: share by which the target critics move towards the critics in a gradient step.
         temperature: weight of the entropy; 0: learnt.
     """
 
@@ -73,8 +73,8 @@ class Acting(nn.Module):
     """Controls in physical units by the actor of a soft actor-critic.
 
     Args:
-        task: whose control ranges the actions are shares of.
-        learner: with the actor.
+        task: the task, whose control ranges scale the actions from [-1, 1].
+        learner: soft actor-critic, whose actor is used.
     """
 
     def __init__(self, task: Task, learner: SoftActorCritic) -> None:
@@ -88,11 +88,11 @@ class Acting(nn.Module):
         return self.physical(self._learner(seen))
 
     def physical(self, actions: Tensor) -> Tensor:
-        """Controls of actions in shares of their ranges: (…, m) -> (…, m)."""
+        """Scale actions from [-1, 1] to controls in physical units: (…, m) -> (…, m)."""
         return self._middle + self._half * actions
 
     def shares(self, controls: Tensor) -> Tensor:
-        """Actions of controls in physical units: (…, m) -> (…, m)."""
+        """Scale controls in physical units to actions in [-1, 1]: (…, m) -> (…, m)."""
         return (controls - self._middle) / self._half.clamp(min=1e-12)
 
 
@@ -110,19 +110,19 @@ class MbpoLearner(ModelLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """The most probable controls."""
+        """Policy with the most probable controls of the actor."""
         return ActorPolicy(self.task, self.acting)
 
     @property
     def length(self) -> int:
-        """Steps of imagined episodes at present."""
+        """Present length of imagined episodes, in steps."""
         config = self.config
         share = (self.step - config.growing_from) / max(1, config.growing_to - config.growing_from)
         share = min(max(share, 0.0), 1.0)
         return max(1, round(config.shortest + share * (config.longest - config.shortest)))
 
     def advance(self) -> float:
-        """Play one episode in every environment, and learn from them: ensemble, then actor and critics."""
+        """Play one episode in every environment; then train the ensemble, the actor and the critics."""
         before = self.environment_steps
 
         def act(states: Tensor, step: int) -> Tensor:
@@ -146,12 +146,12 @@ class MbpoLearner(ModelLearner):
         return loss
 
     def _seen(self, states: Tensor, steps: Tensor) -> Tensor:
-        """Observations with the elapsed share of the episode, (B, n), (B,) -> (B, k)."""
+        """Observations of states (B, n) at steps (B,), with the elapsed share of the episode: (B, k)."""
         seen = self.task.system.observe(states)
         return torch.cat((seen, (steps / self.task.horizon)[:, None].to(seen)), 1)
 
     def _normalise(self) -> None:
-        """Units of observations and rewards by the first episodes."""
+        """Set the units of observations and rewards from the episodes observed first."""
         kept = self.episodes
         states = kept.states[: kept.count]
         steps = torch.arange(states.shape[1]).repeat(len(states))
@@ -160,19 +160,19 @@ class MbpoLearner(ModelLearner):
         )
 
     def _drawn(self, count: int) -> tuple[Tensor, Tensor]:
-        """Random observed steps: episodes and steps, (count,) each."""
+        """Draw random observed steps: indices of episodes and indices of steps, (count,) each."""
         episodes = torch.randint(self.episodes.count, (count,), generator=self.generator)
         return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
 
     def _mixed(self, imagined: Batch) -> Batch:
-        """A batch of imagined and observed transitions."""
+        """Batch of random transitions, imagined and observed ones in the share that the options say."""
         size = self.config.batch
         real = min(size, round(self.config.observed * size))
         rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
         return imagined.of(rows).joined(self._observed_batch(real)) if real else imagined.of(rows)
 
     def _observed_batch(self, count: int) -> Batch:
-        """Random observed transitions."""
+        """Draw `count` random observed transitions."""
         episodes, steps = self._drawn(count)
         kept, after = self.episodes, steps + 1
         return Batch(
@@ -185,7 +185,7 @@ class MbpoLearner(ModelLearner):
 
     @torch.no_grad()
     def _imagined(self, count: int) -> Batch:
-        """Transitions of at least `count` imagined episodes from random observed states, to their ends."""
+        """Imagine at least `count` episodes from random observed states and return their transitions."""
         model, horizon, length = self.model, self.task.horizon, self.length
         members = model.predictor.elites
         count = -(-count // members) * members
@@ -216,7 +216,11 @@ class MbpoLearner(ModelLearner):
         return whole
 
     def _earned(self, paths: Tensor, x: Tensor, moved: Tensor, controls: Tensor, ends: Tensor) -> Tensor:
-        """Rewards of imagined steps (B, n), (B, n), (B, m), where episodes `paths` end at the mask: (B,)."""
+        """Rewards of one imagined step from states `x` to `moved` under `controls`: (B,).
+
+        `ends` marks the episodes that end with the step; `paths` holds the states of these from their
+        beginning.
+        """
         if self.reward == "task":
             return step_rewards(self.task, x, moved, controls)
         earned = x.new_zeros(len(x))
@@ -226,11 +230,11 @@ class MbpoLearner(ModelLearner):
         return earned
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption; imagined episodes last no longer than a step."""
+        """Tensors from which training resumes exactly; imagined transitions are not kept between steps."""
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 
@@ -241,7 +245,7 @@ class Mbpo(Method):
     options = MbpoConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> MbpoConfig:
-        """Options of MBPO; `--batch` and `--lr` are those of actor and critics."""
+        """Resolve the options; `--batch` and `--lr` are those of actor and critics."""
         found = base_config(task, config, kind=MbpoConfig)
         assert isinstance(found, MbpoConfig)
         lr = config.lr or task.system.decl.train.lr or RATE
@@ -257,7 +261,7 @@ class Mbpo(Method):
         return MbpoLearner(task, config, steps=steps, device=device, ranks=ranks)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:  # noqa: ARG002
-        """The actor of a run."""
+        """Load the actor of a run as a policy."""
         assert isinstance(config, MbpoConfig)
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         found = actor_critic_of(task, config)
@@ -267,7 +271,7 @@ class Mbpo(Method):
 
 
 def actor_critic_of(task: Task, config: MbpoConfig) -> SoftActorCritic:
-    """Actor and critics whose initial weights depend on the seed alone."""
+    """Make actor and critics whose initial weights depend only on the seed of the options."""
     return SoftActorCritic(
         task.system.observed_count + 1,
         len(task.system.control_names),

@@ -1,9 +1,9 @@
 """PETS: probabilistic ensembles with trajectory sampling (Chua et al., NeurIPS 2018).
 
-An ensemble learns the system from episodes. The policy plans with it whenever it is asked: the cross-entropy
-method over control sequences, each judged by the mean reward of particles that different networks carry
-forward. By default a plan is planned at once, by the reward of the imagined episode, and controls are
-constant over a few steps.
+An ensemble learns the system from episodes. The policy searches for a plan whenever it is called, by the
+cross-entropy method over control sequences. The value of a sequence is the mean reward of several imagined
+episodes (particles), predicted by different networks. By default a search covers the whole plan, with
+controls that are constant over a few steps.
 
 The settings of Meng and Fan (2023) for their comparison: `--reward task`, and the options `ahead=5 piece=1
 population=350 rounds=5 particles=20 model_lr=7.5e-4 model_decay=3e-5 model_held=0 model_epochs=25 growth=0
@@ -54,14 +54,16 @@ class PetsConfig(ModelConfig):
     """Options of PETS.
 
     Attributes:
-        ahead: steps that are planned at once; 0: the horizon of a plan, as for other rewards than `task`.
-            Otherwise a plan is the sequence of the first controls, planned anew at every step.
-        piece: steps over which a control is constant.
-        population: control sequences of a round.
-        rounds: of the cross-entropy method.
-        elite_share: of the population to which the next one is fitted.
+        ahead: number of steps that a search covers; 0: the horizon of a plan, which is required for rewards
+            other
+            than `task`. Otherwise every step has a search of its own, of which the plan takes the first
+            control.
+        piece: number of steps over which a control is constant.
+        population: number of control sequences in a round.
+        rounds: number of rounds of the cross-entropy method.
+        elite_share: share of the population, the best sequences, from which the next round is sampled.
         inertia: weight of the former mean and variance (the paper's alpha).
-        particles: imagined episodes of a control sequence, distributed evenly over the elites.
+        particles: number of imagined episodes per control sequence, distributed evenly over the elites.
     """
 
     environments: int = 8
@@ -80,8 +82,8 @@ class PetsPolicy(Policy):
 
     Args:
         task: specification and system.
-        model: the system as learnt.
-        config: options.
+        model: learnt model of the system.
+        config: options of the search.
     """
 
     judged_at_once = 16
@@ -101,14 +103,17 @@ class PetsPolicy(Policy):
 
     @torch.no_grad()
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a single round over the whole horizon: (B, n) -> (B, T, m)."""
+        """Plans by a single round of the search over the whole horizon: (B, n) -> (B, T, m)."""
         other = PetsPolicy(self.task, self._model, replace(self._config, ahead=0, rounds=1))
         generator = torch.Generator().manual_seed(self._config.seed)
         return other.sequence(x0.float(), generator).to(x0)
 
     @torch.no_grad()
     def sequence(self, x0: Tensor, generator: torch.Generator) -> Tensor:
-        """Plans (B, T, m) from states (B, n): whole ones, or of first controls along the task's model."""
+        """Plans (B, T, m) from states (B, n): by one search, or by a search at every step.
+
+        In the second case each search gives one control, and the task's model moves the states.
+        """
         if not self._config.ahead or self._reward != "task":
             return self._optimised(x0, self.task.horizon, generator)
         x, actions = x0, []
@@ -131,7 +136,7 @@ class PetsPolicy(Policy):
         return torch.cat([self._climbed(part, steps, generator, start) for part, start in parts])
 
     def _climbed(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
-        """As `_optimised`; mean and variance of each round are those of the best of the round before."""
+        """Search of `_optimised`; each round samples by mean and variance of the best of the round before."""
         config, system = self._config, self.task.system
         low, high = system.control_low, system.control_high
         pieces = -(-steps // config.piece)
@@ -161,7 +166,7 @@ class PetsPolicy(Policy):
         return chosen.repeat_interleave(config.piece, 1)[:, :steps]
 
     def _values(self, x0: Tensor, sequences: Tensor, generator: torch.Generator) -> Tensor:
-        """Mean reward over the particles of sequences (B, P, steps, m) from states (B, n): (B, P)."""
+        """Values of control sequences (B, P, steps, m) from states (B, n): mean reward of particles, (B, P)."""
         members, each = self._shape
         batch, count, steps = sequences.shape[:3]
         flat = sequences.flatten(0, 1).repeat(each, 1, 1)
@@ -181,13 +186,13 @@ class PetsPolicy(Policy):
 
 
 class PetsLearner(ModelLearner):
-    """Training of the ensemble on episodes of its own plans; plans are carried out whole, or step by step."""
+    """Training of the ensemble on episodes that are controlled by plans of its own."""
 
     config: PetsConfig
 
     @property
     def policy(self) -> PetsPolicy:
-        """The planner with the model as learnt so far."""
+        """Policy that plans with the present model."""
         return PetsPolicy(self.task, self.model, self.config)
 
     def advance(self) -> float:
@@ -213,7 +218,7 @@ class Pets(Method):
     options = PetsConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
-        """Options of PETS; validations judge few states."""
+        """Resolve the options; a validation judges few states, since planning takes long."""
         found = base_config(task, config, kind=PetsConfig)
         assert isinstance(found, PetsConfig)
         return replace(found, hidden=(200,) * 4, plans=1, every=EVERY, pool=POOL)
@@ -226,7 +231,7 @@ class Pets(Method):
         return PetsLearner(task, config, steps=steps, device=device, ranks=ranks)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> PetsPolicy:  # noqa: ARG002
-        """The planner with the ensemble of a run."""
+        """Load the ensemble of a run as a policy that plans with it."""
         assert isinstance(config, PetsConfig)
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         ensemble = ensemble_of(task, config)
