@@ -112,7 +112,7 @@ class SoftActorCritic(nn.Module):
         }
 
     def normalise(self, seen: Tensor, returns: Tensor) -> None:
-        """Set mean and scale of the observations `seen`, (N, k), and the unit of rewards from returns (E,)."""
+        """Set the units of observations from samples (N, k), that of rewards from returns (E,)."""
         spread = seen.std(0)
         self.centre.copy_(seen.mean(0))
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))

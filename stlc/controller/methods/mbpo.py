@@ -218,8 +218,7 @@ class MbpoLearner(ModelLearner):
     def _earned(self, paths: Tensor, x: Tensor, moved: Tensor, controls: Tensor, ends: Tensor) -> Tensor:
         """Rewards of one imagined step from states `x` to `moved` under `controls`: (B,).
 
-        `ends` marks the episodes that end with the step; `paths` holds the states of these from their
-        beginning.
+        `ends` marks the episodes that end with the step; `paths` are the states of all episodes, (B, T+1, n).
         """
         if self.reward == "task":
             return step_rewards(self.task, x, moved, controls)

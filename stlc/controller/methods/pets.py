@@ -166,7 +166,13 @@ class PetsPolicy(Policy):
         return chosen.repeat_interleave(config.piece, 1)[:, :steps]
 
     def _values(self, x0: Tensor, sequences: Tensor, generator: torch.Generator) -> Tensor:
-        """Values of control sequences (B, P, steps, m) from states (B, n): mean reward of particles, (B, P)."""
+        """Mean reward of control sequences over their particles, (B, P).
+
+        Args:
+            x0: states, (B, n).
+            sequences: controls of P sequences per state, (B, P, steps, m).
+            generator: random numbers of the predictions.
+        """
         members, each = self._shape
         batch, count, steps = sequences.shape[:3]
         flat = sequences.flatten(0, 1).repeat(each, 1, 1)

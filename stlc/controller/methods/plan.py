@@ -39,7 +39,7 @@ class PlanMethod(Method):
     options = PlanConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PlanConfig:
-        """Resolve the options; those of the planner are taken from `config.planner`."""
+        """Resolve the options; the options of the planner are taken from `config.planner`."""
         found = base_config(task, config, kind=PlanConfig)
         assert isinstance(found, PlanConfig)
         asked = config.planner

@@ -1,6 +1,7 @@
 """Proximal policy optimisation over batched episodes (Schulman et al., arXiv 1707.06347, 2017).
 
-One step of the training is one episode in every environment, followed by several epochs over its transitions:
+One step of the training plays one episode in every environment and then passes several times over the
+transitions, with
 the clipped surrogate objective (Eq. 7), advantages by generalised estimation (Schulman et al., arXiv
 1506.02438, Eq. 16), and an entropy bonus. Observations, returns and advantages are normalised.
 """
@@ -62,15 +63,16 @@ class PpoConfig(ActorConfig):
     """Options of PPO.
 
     Attributes:
-        epochs: passes over the transitions of a step.
-        minibatches: gradient steps of a pass.
+        epochs: number of passes over the transitions of a training step.
+        minibatches: number of gradient steps in a pass.
         discount: gamma of the return; 1 since episodes are finite and the elapsed share is observed.
         trace: lambda of the advantage estimates.
         ratio: bound on the change of the probability ratio (the paper's epsilon).
         entropy: weight of the entropy bonus.
-        deviation: initial standard deviation of the controls before squashing.
-        correlation: of the exploration noise of successive steps; white noise leaves hardly any trace in
-            states that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
+        deviation: initial standard deviation of the controls before the tanh.
+        correlation: correlation of the exploration noise of successive steps. White noise would hardly move
+            states
+            that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
     """
 
     environments: int = ENVIRONMENTS
@@ -85,12 +87,12 @@ class PpoConfig(ActorConfig):
 
 
 class Moments(nn.Module):
-    """Mean and standard deviation of vectors seen so far, (k,) each; 0 and 1 before the first.
+    """Running mean and standard deviation of vectors; 0 and 1 until the first vectors are added.
 
     Attributes:
-        mean: (k,) float32.
-        spread: (k,) float32.
-        sums: numbers, sums and sums of squares, (3, k) float64.
+        mean: mean, (k,) float32.
+        spread: standard deviation, (k,) float32.
+        sums: counts, sums and sums of squares, (3, k) float64.
     """
 
     mean: Tensor
@@ -105,7 +107,7 @@ class Moments(nn.Module):
 
     @torch.no_grad()
     def add(self, vectors: Tensor, ranks: Ranks) -> None:
-        """Count vectors of all ranks, (B, k)."""
+        """Add vectors (B, k) of this rank, together with those of all other ranks (processes)."""
         found = vectors.double()
         sums = torch.stack((torch.full_like(found[0], len(found)), found.sum(0), found.square().sum(0)))
         if ranks.size > 1:
@@ -120,12 +122,14 @@ class Moments(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Gaussian policy before squashing, and value, of a normalised observation: two separate networks.
+    """Two separate networks of a normalised observation: a Gaussian policy and a value function.
+
+    The policy gives raw controls, which are then squashed to the control ranges.
 
     Attributes:
         deviation: logarithm of the standard deviation of each raw control, (w,).
-        observations: their mean and spread so far, (k,).
-        returns: mean and spread of the rewards of whole episodes so far, (1,).
+        observations: running mean and standard deviation of the observations, (k,).
+        returns: running mean and standard deviation of the returns of episodes, (1,).
     """
 
     def __init__(self, task: Task, config: PpoConfig) -> None:
@@ -139,12 +143,12 @@ class ActorCritic(nn.Module):
         self.observations, self.returns = Moments(width), Moments(1)
 
     def normalised(self, observation: Tensor) -> Tensor:
-        """Observations on a common scale, (B, k)."""
+        """Observations less their running mean, divided by their standard deviation, (B, k)."""
         seen = self.observations
         return ((observation - seen.mean) / seen.spread).clamp(-MOST, MOST)
 
     def controls(self, raw: Tensor) -> Tensor:
-        """Controls in physical units of raw ones: (B, w) -> (B, m)."""
+        """Map raw controls into the control ranges: (B, w) -> (B, m)."""
         return squash(raw, self._task.system.decl.controls)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -157,14 +161,19 @@ class ActorCritic(nn.Module):
 
         Args:
             seen: normalised observations, (B, k).
-            noise: of the step before, in standard deviations, (B, w).
+            noise: exploration noise of the step before, in standard deviations, (B, w).
             raw: controls before squashing, (B, w).
         """
         values: Tensor = self.critic(seen)[:, 0]
         return self.density(self.actor(seen), noise, raw), values
 
     def drawn(self, noise: Tensor, white: Tensor) -> Tensor:
-        """Noise of a step in standard deviations, from that of the step before and a normal one, (B, w)."""
+        """Exploration noise of a step, (B, w), in standard deviations.
+
+        Args:
+            noise: exploration noise of the step before, (B, w).
+            white: independent standard normal numbers, (B, w).
+        """
         return self._correlation * noise + math.sqrt(1.0 - self._correlation**2) * white
 
     def density(self, mean: Tensor, noise: Tensor, raw: Tensor) -> Tensor:
@@ -177,12 +186,15 @@ class ActorCritic(nn.Module):
 
     @property
     def entropy(self) -> Tensor:
-        """Entropy of the raw controls, (), up to a constant; the same in every state."""
+        """Entropy of the raw controls up to a constant, (); it does not depend on the state."""
         return self.deviation.sum()
 
 
 def _network(widths: Sequence[int], last: float) -> nn.Sequential:
-    """A network with tanh between orthogonal layers; `last` scales the weights of the last one."""
+    """Network with tanh between its layers and orthogonal initial weights.
+
+    The initial weights of the last layer are scaled by `last`.
+    """
     layers: list[nn.Module] = []
     for index, (inputs, outputs) in enumerate(pairwise(widths), start=2):
         layer = nn.Linear(inputs, outputs)
@@ -199,7 +211,7 @@ class Episodes:
     Attributes:
         seen: observations, (T, N, k).
         raw: controls before squashing, (T, N, w).
-        noise: of the steps before, in standard deviations, (T, N, w).
+        noise: exploration noise of the step before each step, in standard deviations, (T, N, w).
         density: logarithm of the probability density of the controls, (T, N).
         rewards: (T, N).
     """
@@ -212,7 +224,7 @@ class Episodes:
 
 
 class PpoLearner(ActorLearner):
-    """Training of an actor and a critic. The same seed and steps give the same weights on one machine."""
+    """Training by PPO. On one machine the same seed and number of steps give the same weights."""
 
     config: PpoConfig
 
@@ -228,7 +240,7 @@ class PpoLearner(ActorLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """The most probable control of every state, on the CPU."""
+        """Policy with the most probable controls, on the CPU."""
         on_processor = self.device.type == "cpu"
         return ActorPolicy(self.task, self.network if on_processor else deepcopy(self.network).cpu())
 
@@ -239,7 +251,11 @@ class PpoLearner(ActorLearner):
         return self.config.lr * max(left, LEAST)
 
     def advance(self) -> float:
-        """Play one episode in every environment and learn from it; return the mean loss, or NaN."""
+        """Play one episode in every environment and learn from it.
+
+        Returns:
+            The mean loss; NaN if the loss or a gradient is not finite.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate
         episodes = self._played()
@@ -258,7 +274,7 @@ class PpoLearner(ActorLearner):
 
     @torch.no_grad()
     def _played(self) -> Episodes:
-        """Play one episode in every environment with random controls."""
+        """Play one episode in every environment with controls drawn from the policy."""
         environments, network = self.environments, self.network
         seen, means, raws, rewards = [environments.reset().to(self.device)], [], [], []
         spread, noises = torch.exp(network.deviation), [self._noise()]
@@ -279,11 +295,11 @@ class PpoLearner(ActorLearner):
         return torch.randn(shape, generator=self.generator).to(self.device)
 
     def _estimated(self, seen: Tensor, rewards: Tensor) -> tuple[Tensor, Tensor]:
-        """Advantages, normalised, and targets of the critic, (T, N) each.
+        """Normalised advantages and targets of the critic, (T, N) each.
 
         Args:
             seen: normalised observations, (T, N, k).
-            rewards: in units of the spread of the returns, (T, N).
+            rewards: rewards divided by the standard deviation of the returns, (T, N).
         """
         config, values = self.config, self.network.critic(seen)[..., 0]
         after = torch.cat((values[1:], torch.zeros_like(values[:1])))  # an episode ends for good
@@ -297,12 +313,15 @@ class PpoLearner(ActorLearner):
         return (advantages - mean) / (spread + 1e-8), advantages + values
 
     def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
-        """Make all gradient steps; return the mean loss, or NaN before a broken step.
+        """Make all gradient steps of a training step on its episodes.
 
         Args:
-            episodes: with normalised observations.
-            advantages: (T N,).
-            targets: of the critic, (T N,).
+            episodes: transitions, with normalised observations.
+            advantages: normalised advantages, (T N,).
+            targets: targets of the critic, (T N,).
+
+        Returns:
+            The mean loss; NaN if a loss or gradient is not finite; later gradient steps are then left out.
         """
         config, total = self.config, 0.0
         seen, raw, noise = (part.flatten(0, 1) for part in (episodes.seen, episodes.raw, episodes.noise))
@@ -328,7 +347,7 @@ class PpoLearner(ActorLearner):
         return total / (config.epochs * -(-len(seen) // size))
 
     def tensors(self) -> dict[str, Tensor]:
-        """State for an exact resumption, bit for bit: no episode is under way between two steps."""
+        """Tensors from which training resumes exactly; no episode is in progress between two steps."""
         own = super().tensors()
         found = dict(own)
         for index, theirs in enumerate(self.ranks.gather(own), start=1):
@@ -337,7 +356,7 @@ class PpoLearner(ActorLearner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state of `tensors` and `facts`."""
+        """Restore the state from what `tensors` and `facts` returned."""
         own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
         super().restore(tensors | own, facts)
         self.network.load_state_dict(below(tensors, "network"))
@@ -345,12 +364,12 @@ class PpoLearner(ActorLearner):
 
 
 class Ppo(Method):
-    """Proximal policy optimisation, by 512 episodes side by side."""
+    """Proximal policy optimisation with 512 episodes in parallel."""
 
     options = PpoConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PpoConfig:
-        """Options of PPO; `--batch` is the number of environments."""
+        """Resolve the options; `--batch` is the number of environments."""
         found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS)
         assert isinstance(found, PpoConfig)
         lr = config.lr or task.system.decl.train.lr or RATE
@@ -364,7 +383,7 @@ class Ppo(Method):
         return PpoLearner(task, config, steps=steps, device=device, ranks=ranks)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:
-        """The actor of a run."""
+        """Load the actor of a run as a policy."""
         assert isinstance(config, PpoConfig)
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         network = network_of(task, config)
@@ -374,7 +393,7 @@ class Ppo(Method):
 
 
 def network_of(task: Task, config: PpoConfig) -> ActorCritic:
-    """A network whose initial weights depend on the seed alone."""
+    """Make a network whose initial weights depend only on the seed of the options."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return ActorCritic(task, config)

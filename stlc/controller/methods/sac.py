@@ -1,6 +1,7 @@
-"""Soft actor-critic (Haarnoja et al., ICML 2018) by stable-baselines3, which only the training needs.
+"""Soft actor-critic (Haarnoja et al., ICML 2018) by stable-baselines3.
 
-The paper's RL_R, RL_S and RL_A are `--reward task`, `robustness` and `accuracy`. Extra `stlc[rl]`.
+RL_R, RL_S and RL_A of Meng and Fan (2023) are this method with `--reward task`, `robustness` and `accuracy`.
+Training needs the extra `stlc[rl]`; the trained policy does not.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Sac(Method):
     options = SacConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> SacConfig:
-        """Options of SAC; `--batch` is the number of transitions of an update."""
+        """Resolve the options; `--batch` is the number of transitions of a gradient step."""
         found = base_config(task, config, kind=SacConfig, batch=BATCH)
         assert isinstance(found, SacConfig)
         lr = config.lr or task.system.decl.train.lr or RATE
@@ -64,7 +65,7 @@ class Sac(Method):
         return SacLearner(task, config, steps=steps, device=device, ranks=ranks)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:
-        """The actor of a run."""
+        """Load the actor of a run as a policy."""
         saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
         actor = SacActor(task, config.hidden)
         with restoring(run):

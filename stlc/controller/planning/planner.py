@@ -123,7 +123,7 @@ class PlanSearch:
         return PlanResult(self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
 
     def open(self) -> Tensor:
-        """Indices of the states to continue with, (k,): below the target, within the budget, not ended."""
+        """Indices of the initial states below the target that are within the budget and not ended, (k,)."""
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
         target = min(self.budget.target - TOLERANCE, torch.inf)
@@ -170,7 +170,7 @@ class PlanSearch:
 
     @contextmanager
     def charged(self, rows: Tensor) -> Iterator[None]:
-        """Charge the block's processor time evenly to the states `rows`, (k,), and report progress."""
+        """Context that charges its processor time evenly to the states `rows`, (k,), and reports progress."""
         before = process_time()
         try:
             yield

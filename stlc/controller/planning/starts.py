@@ -66,7 +66,10 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
 
 
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
-    """First samples of the traces in a file; timers have the values of random initial states."""
+    """First samples of the traces in a file as initial states.
+
+    A trace has no timers (states that the specification adds); they are those of random initial states.
+    """
     if not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))

@@ -1,7 +1,8 @@
 """Episodes of a task on its model, in one batch: the environment of learners that choose an action per step.
 
 An episode begins at a random initial state and has as many steps as a plan. There are the three rewards that
-the paper compares: the one that the system declares for every step (RL_R), the robustness of the episode at
+Meng and Fan (2023) compare: the one that the system declares for every step (RL_R), the robustness of the
+episode at
 its end (RL_S), and at its end whether it satisfies the specification (RL_A).
 """
 
@@ -78,7 +79,7 @@ class Transition:
 
 
 def observe(task: Task, states: Tensor, step: int) -> Tensor:
-    """Inputs of the policy at a step, and the elapsed share of the episode: (B, n) -> (B, k)."""
+    """Observations: the policy's inputs and the elapsed share of the episode at `step`, (B, n) -> (B, k)."""
     seen = task.system.observe(states)
     return torch.cat((seen, seen.new_full((*seen.shape[:-1], 1), step / task.horizon)), -1)
 

@@ -1,6 +1,7 @@
 """`cem`: the cross-entropy method over plans, or over the parameters of a small policy (Rubinstein 1999).
 
-The paper's settings: `population=10000, elites=100, deviation=1, physical=true, rounds=500` over plans, and
+The settings of Meng and Fan (2023): `population=10000, elites=100, deviation=1, physical=true, rounds=500`
+over plans, and
 `over=policy` for navigation.
 """
 
@@ -82,7 +83,7 @@ class Cem:
                 self._climb(search, part, space)
 
     def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
-        """Rounds for some initial states until each has converged, reached its target or spent its budget."""
+        """Sample rounds for initial states `rows` until each has converged, succeeded or spent its budget."""
         mean = space.centre(search.start[rows])
         wide = space.deviation(search.states[rows]).expand_as(mean).clone()
         least = wide * self.floor / self.deviation
@@ -107,7 +108,7 @@ class Cem:
 
 
 class _Plans:
-    """Plans as vectors, (T m,)."""
+    """Space of whole plans: the vector is the plan, (T m,)."""
 
     def __init__(self, task: Task, how: Cem) -> None:
         system = task.system
@@ -128,7 +129,7 @@ class _Plans:
 
 
 class _Policies:
-    """Weights of a network from the observation to the controls, with one hidden layer, as a vector."""
+    """Space of the weights of a small policy: one hidden layer from the observation to the controls."""
 
     def __init__(self, task: Task, how: Cem) -> None:
         self._task, self._hidden, self._std = task, how.hidden, how.deviation

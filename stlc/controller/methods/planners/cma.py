@@ -22,7 +22,7 @@ class Cma:
 
     Attributes:
         sigma: initial standard deviation, in half-widths of the control ranges.
-        population: samples of a generation; 0 for the package's default, 4 + 3 ln(d).
+        population: number of samples per generation; 0 for the package's default, 4 + 3 ln(d).
         diagonal: whether the covariance is diagonal, which is faster for long plans.
     """
 
@@ -47,7 +47,7 @@ class Cma:
                 restarts += 1
 
     def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
-        """One run of CMA-ES for one initial state, until it converges or reaches the target or the budget."""
+        """Run CMA-ES once for initial state `row`, until it converges or reaches target or budget."""
         system, rows = search.task.system, torch.tensor([row])
         low, high = system.control_low.double(), system.control_high.double()
         middle, half = 0.5 * (low + high), 0.5 * (high - low)

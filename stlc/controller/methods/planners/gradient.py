@@ -1,4 +1,4 @@
-"""`gradient`: gradient steps on the robustness of a plan, without a policy (STL_G of the paper)."""
+"""`gradient`: gradient steps on the robustness of a plan, without a policy (STL_G of Meng and Fan 2023)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ class GradientPlanner:
     """Adam on latent plans, which are mapped to the control ranges like the outputs of a policy network.
 
     Attributes:
-        objective: `exact`, by the generated adjoint, or `paper`: smooth robustness with tanh switching.
+        objective: `exact`: exact robustness, with gradients by generated C code; `paper`: smooth robustness
+            with tanh switching.
         steps: number of gradient steps, after which the search begins anew from random latent plans.
         starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
         rate: learning rate of Adam.
-        slope: slope, per unit, that replaces the derivative of jumps and conditions for `exact`.
+        slope: slope that replaces the derivative of jumps and conditions with the objective `exact`.
     """
 
     objective: str = "exact"
@@ -36,7 +37,7 @@ class GradientPlanner:
     slope: float = 2.0
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver for the objective, which has no performance terms."""
+        """Return the solver for the objective; the performance terms of the system file are left out."""
         if self.objective == "paper":
             return partial(self._run, objective=paper_objective(task))
         gamma = task.system.decl.objective.gamma
@@ -50,7 +51,10 @@ class GradientPlanner:
             first = False
 
     def _descend(self, search: PlanSearch, rows: Tensor, objective: Objective, *, first: bool) -> None:
-        """Gradient steps for some initial states, from random latent plans; if `first`, one of these is 0."""
+        """Make gradient steps from random latent plans for the initial states `rows`.
+
+        If `first` is True, one latent plan of each state is 0 instead.
+        """
         task, controls = search.task, search.task.system.decl.controls
         shape = (len(rows), self.starts, task.system.horizon, raw_width(controls))
         raw = torch.randn(shape, generator=search.generator)

@@ -1,4 +1,7 @@
-"""`halving`: many local searches from random plans; the best go on, for longer (successive halving)."""
+"""`halving`: successive halving of local searches.
+
+Many searches begin at random plans; the best of them continue with more evaluations.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +23,15 @@ if TYPE_CHECKING:
 class Halving:
     """Local searches from random piecewise constant plans, by successive halving (Karnin et al. 2013).
 
-    A plan that visits goals in the wrong order improves up to a robustness just below 0, where single moves
-    lead no further. Other beginnings lead elsewhere, so each round begins many searches and continues the
+    A local search from a plan that visits goals in the wrong order ends at a robustness just below 0, which
+    no small change improves. Hence each round begins many searches from different plans and continues the
     best.
 
     Attributes:
-        starts: searches of a start that a round begins.
-        tries: plans of each search in the first rung.
-        keep: one of this many searches goes on to the next rung, with as many times the plans.
-        pieces: most pieces of a random plan.
+        starts: number of searches per initial state that a round begins.
+        tries: number of plans that each search tries before the first selection.
+        keep: factor by which each selection divides the number of searches, and multiplies the plans tried.
+        pieces: maximum number of constant pieces of a random plan.
     """
 
     starts: int = 64
@@ -37,7 +40,7 @@ class Halving:
     pieces: int = 12
 
     def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
-        """Nothing to prepare."""
+        """Return the solver; no preparation is necessary."""
         return self._run
 
     def _run(self, search: PlanSearch) -> None:
@@ -59,7 +62,18 @@ class Halving:
     def _rung(
         self, search: PlanSearch, rows: Tensor, plans: Tensor, searcher: Searcher, tries: int
     ) -> Tensor:
-        """Continue the searches of some starts: (k, p, T, m) -> the same, the best first."""
+        """Continue the searches from the initial states `rows`, with up to `tries` plans each.
+
+        Args:
+            search: the search for plans.
+            rows: indices of the initial states, (k,).
+            plans: present plan of each of the p searches per state, (k, p, T, m).
+            searcher: the local search.
+            tries: maximum number of plans that each search tries.
+
+        Returns:
+            The improved plans, (k, p, T, m), the best of each state first.
+        """
         count = plans.shape[1]
         tries = max(1, search.affordable(rows, tries * count) // count)
         x0 = search.states[rows].repeat_interleave(count, 0)
@@ -71,7 +85,7 @@ class Halving:
         return sorted_
 
     def _random(self, search: PlanSearch, count: int) -> Tensor:
-        """Piecewise constant plans, each with its own number of pieces: (count, starts, T, m)."""
+        """Draw piecewise constant plans with random numbers of pieces, (count, starts, T, m)."""
         system, draw = search.task.system, search.generator
         low, high = system.control_low.double(), system.control_high.double()
         steps, shape = system.horizon, (count, self.starts)

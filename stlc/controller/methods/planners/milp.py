@@ -1,7 +1,7 @@
 """`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018); extra `stlc[plan]`.
 
-For piecewise linear systems, with the big-M encodings of Karaman et al. (2008) and Raman et al. (2014). The
-only planner that can prove that a start is infeasible.
+It applies to piecewise linear systems and uses the big-M encodings of Karaman et al. (2008) and Raman et al.
+(2014). It is the only planner that can prove that no plan from an initial state satisfies the specification.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ MOST_RHO = 1e6
 class Milp:
     """Mixed-integer linear program for each initial state, solved by HiGHS.
 
-    If the program whose solutions include all satisfying plans has no solution, the state is infeasible.
+    The initial state is infeasible if a second program, whose solutions include all satisfying plans, has
+    none.
 
     Attributes:
-        gap: relative gap at which the maximisation of robustness ends.
+        gap: relative optimality gap at which the maximisation of robustness ends.
         prove: whether to prove states without a plan infeasible, by a second program.
     """
 
@@ -83,7 +84,12 @@ class Milp:
     def _solved(
         self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Solve the program for one state: whether it has a solution, and the plan, (T, m), or None."""
+        """Solve the program for one state.
+
+        Returns:
+            `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), None unless
+            found.
+        """
         encoding, cost = _encoded(task, state, target, tight=tight)
         if not encoding.model.feasible:
             return IMPOSSIBLE, None
@@ -115,7 +121,7 @@ def _at(form: Affine, values: Any) -> float:
 def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[Encoding, Affine]:
     """Program whose solutions are plans from a state with a robustness of at least `target`, and its cost.
 
-    If `target` is inf, robustness is maximised. `tight`: see `Encoding`.
+    If `target` is inf, the cost makes the solver maximise robustness. For `tight`, see `Encoding`.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.

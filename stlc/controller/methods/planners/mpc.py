@@ -1,7 +1,8 @@
 """`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT; extra `stlc[mpc]`.
 
-For smooth systems: multiple shooting with the smooth robustness of Pant et al. (2017), after a few initial
-guesses. `simulate --method mpc` plans anew in every step: model predictive control (Sadraddini & Belta 2015).
+It applies to smooth systems and uses multiple shooting with the smooth robustness of Pant et al. (2017), from
+several initial guesses. `simulate --method mpc` plans anew in every step: model predictive control
+(Sadraddini & Belta 2015).
 """
 
 from __future__ import annotations
@@ -34,14 +35,17 @@ NEARLY = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Mpc:
-    """One nonlinear program per start, solved from several initial guesses until one reaches the target.
+    """Nonlinear program for each initial state, solved from several guesses until the target is reached.
 
     Attributes:
-        guesses: the first is the given plan, the others are drawn: controls constant over five pieces.
-        iterations: of the interior-point method from each guess.
-        smoothing: scale of log-sum-exp for extrema within conditions.
-        sharpness: greatest slope of indicators, per unit.
-        margin: robustness that is aimed at above the target, for what is rounded.
+        guesses: number of guesses; the first is the initial guess of the search, the others are random
+            controls
+            that are constant over five pieces.
+        iterations: maximum number of iterations of the interior-point method from each guess.
+        smoothing: scale of log-sum-exp for minima and maxima within conditions.
+        sharpness: greatest slope of the smooth indicators of conditions.
+        margin: robustness added to the target in the program, since the program approximates by smooth
+            functions.
     """
 
     guesses: int = 3
@@ -54,7 +58,8 @@ class Mpc:
         """Write the nonlinear program of the task.
 
         Raises:
-            UsageError: U101, the system or the specification jumps; the finding shows the expression.
+            UsageError: U101, the system or the specification is discontinuous; the message shows the
+                expression.
             MissingError: R301, CasADi is not installed.
         """
         try:
@@ -109,7 +114,11 @@ class Mpc:
     def _improve(
         self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
     ) -> None:
-        """Solve the program from a guess (T, m), offer the plan; once more with what its verdict lacked."""
+        """Solve the program from a guess (T, m) and offer the plan to the search.
+
+        If the exact robustness misses the target, solve again with a margin that is larger by what was
+        missing.
+        """
         target = search.budget.target
         maximise = math.isinf(target)
         limits = shooting.limits(maximise=maximise)
@@ -126,7 +135,7 @@ class Mpc:
             margin += self.margin + target - rho
 
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
-        """The given plan, then drawn ones, (T, m) float64."""
+        """Guess number `number` of a plan, (T, m) float64: 0 is the initial guess, the others are random."""
         if not number:
             return search.start[row]
         system = search.task.system

@@ -20,7 +20,7 @@ class PolicyPlans:
     """The plan that a trained policy selects; one evaluation per initial state, whatever the budget.
 
     Attributes:
-        run: which run: its folder, number, name or specification, or `latest`.
+        run: the run, given by its folder, number, name or specification, or `latest`.
         runs: folder of all runs.
     """
 

@@ -1,4 +1,4 @@
-"""`search`: local search on the exact robustness, with restarts, in C where there is a compiler."""
+"""`search`: local search on exact robustness with restarts; it runs in C if a compiler is installed."""
 
 from __future__ import annotations
 
