@@ -98,8 +98,7 @@ class Ensemble(nn.Module):
     """Ensemble of networks that predict the change of a state in one step, each as a Gaussian.
 
     The networks learn from different samples. Inputs and targets are normalised, since the components of a
-    state
-    have different units. Components that never change in the data are predicted not to change.
+    state have different units. Components that never change in the data are predicted not to change.
 
     Attributes:
         body: the networks, (E, B, inputs) -> (E, B, 2 outputs): means and logarithms of variances.
@@ -272,8 +271,7 @@ def train_ensemble(
     """Train all networks, each on its own bootstrap sample, and select the elites.
 
     If there are validation data, every network keeps the weights with the least validation error, and
-    training ends once no
-    network has improved by 1 % within `fit.patience` passes.
+    training ends once no network has improved by 1 % within `fit.patience` passes.
 
     Args:
         ensemble: the networks; training continues from their present weights.

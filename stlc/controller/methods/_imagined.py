@@ -221,9 +221,8 @@ class ModelLearner(Learner):
     """Training with a learnt model: an ensemble that learns the system from observed episodes.
 
     One step of the training observes one episode in every environment, trains the ensemble if due, and then
-    does
-    what the subclass adds. A checkpoint holds the networks, the stored episodes and the state of the random
-    numbers.
+    does what the subclass adds. A checkpoint holds the networks, the stored episodes and the state of the
+    random numbers.
 
     Attributes:
         episodes: the stored episodes.

@@ -31,8 +31,7 @@ class Guided(NetworkMethod):
         """Resolve the options.
 
         By default the policy proposes four plans, and a step uses as many states at which it failed before as
-        new
-        states.
+        new states.
         """
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)

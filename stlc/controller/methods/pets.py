@@ -55,8 +55,7 @@ class PetsConfig(ModelConfig):
 
     Attributes:
         ahead: number of steps that a search covers; 0: the horizon of a plan, which is required for rewards
-            other
-            than `task`. Otherwise every step has a search of its own, of which the plan takes the first
+            other than `task`. Otherwise every step has a search of its own, of which the plan takes the first
             control.
         piece: number of steps over which a control is constant.
         population: number of control sequences in a round.

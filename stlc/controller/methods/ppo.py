@@ -1,9 +1,8 @@
 """Proximal policy optimisation over batched episodes (Schulman et al., arXiv 1707.06347, 2017).
 
 One step of the training plays one episode in every environment and then passes several times over the
-transitions, with
-the clipped surrogate objective (Eq. 7), advantages by generalised estimation (Schulman et al., arXiv
-1506.02438, Eq. 16), and an entropy bonus. Observations, returns and advantages are normalised.
+transitions, with the clipped surrogate objective (Eq. 7), advantages by generalised estimation (Schulman et
+al., arXiv 1506.02438, Eq. 16), and an entropy bonus. Observations, returns and advantages are normalised.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ class PpoConfig(ActorConfig):
         entropy: weight of the entropy bonus.
         deviation: initial standard deviation of the controls before the tanh.
         correlation: correlation of the exploration noise of successive steps. White noise would hardly move
-            states
-            that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
+            states that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
     """
 
     environments: int = ENVIRONMENTS

@@ -23,9 +23,8 @@ def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
     """Predicted trajectories of plans as a trace file's content, one trace per initial state.
 
     Besides the states the trace holds, of shape (traces, steps), `action.NAME` for every control, in actuator
-    units, and of shape
-    (traces,): `plan_rho`, the plan's robustness, and `infeasible`, 1 if the planner proved that no plan
-    satisfies the specification.
+    units, and of shape (traces,): `plan_rho`, the plan's robustness, and `infeasible`, 1 if the planner
+    proved that no plan satisfies the specification.
     """
     states = task.rollout(result.states, result.plans).numpy()
     commanded = task.system.commanded(

@@ -2,8 +2,7 @@
 
 An episode begins at a random initial state and has as many steps as a plan. There are the three rewards that
 Meng and Fan (2023) compare: the one that the system declares for every step (RL_R), the robustness of the
-episode at
-its end (RL_S), and at its end whether it satisfies the specification (RL_A).
+episode at its end (RL_S), and at its end whether it satisfies the specification (RL_A).
 """
 
 from __future__ import annotations

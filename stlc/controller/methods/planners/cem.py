@@ -1,8 +1,7 @@
 """`cem`: the cross-entropy method over plans, or over the parameters of a small policy (Rubinstein 1999).
 
 The settings of Meng and Fan (2023): `population=10000, elites=100, deviation=1, physical=true, rounds=500`
-over plans, and
-`over=policy` for navigation.
+over plans, and `over=policy` for navigation.
 """
 
 from __future__ import annotations

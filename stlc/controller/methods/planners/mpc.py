@@ -39,8 +39,7 @@ class Mpc:
 
     Attributes:
         guesses: number of guesses; the first is the initial guess of the search, the others are random
-            controls
-            that are constant over five pieces.
+            controls that are constant over five pieces.
         iterations: maximum number of iterations of the interior-point method from each guess.
         smoothing: scale of log-sum-exp for minima and maxima within conditions.
         sharpness: greatest slope of the smooth indicators of conditions.
