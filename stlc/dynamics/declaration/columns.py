@@ -1,4 +1,7 @@
-"""Sections that declare names: `time`, `const`, `def`, `state`, `param` and `control`."""
+"""Sections that declare names: `time`, `const`, `def`, `state`, `param` and `control`.
+
+A column is one scalar state or parameter; a vector state of size n is n columns.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ _FORMULA = raw(EXPRESSION)
 
 @reads({"type": "string"})
 def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
-    """Read a unit."""
+    """Read a unit such as `m/s^2`; report S103 and return None if the text is not a unit."""
     text = cx.reader.text(node, "`unit`")
     try:
         return None if text is None else parse_unit(text)
@@ -63,7 +66,7 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
-    """The section `time`; a horizon of 0 means unknown."""
+    """The section `time`: time step, horizon, integrator. A horizon of 0 means that it is not known."""
 
     dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
     horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
@@ -74,7 +77,7 @@ class Clockwork:
 
 @dataclass(repr=False, eq=False)
 class StateKeys:
-    """The keys of a state."""
+    """The keys that the declaration of one state may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
@@ -91,7 +94,7 @@ class StateKeys:
 
 @dataclass(repr=False, eq=False)
 class ParamKeys:
-    """The keys of a parameter."""
+    """The keys that the declaration of one parameter may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "drawn uniformly from it unless `draw` is given", name="range")
@@ -103,7 +106,7 @@ class ParamKeys:
 
 @dataclass(repr=False, eq=False)
 class ControlKeys:
-    """The keys of a control."""
+    """The keys that the declaration of one control may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
@@ -118,7 +121,7 @@ class ControlKeys:
 
 
 def read_time(node: Node | None, cx: Context) -> Clockwork:
-    """Read the section `time`; `dt` becomes a name."""
+    """Read the section `time`, and declare the name `dt` (the time step) for expressions."""
     if node is None:
         return Clockwork()
     first = node.get("dt") if isinstance(node, Mapping) else None
@@ -198,14 +201,17 @@ def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
 
 
 def name_columns(names: Names, about: str) -> None:
-    """Declare the columns, and the members of their enums, as names for expressions."""
+    """Make the columns in `names`, and the members of their enums, available as names in expressions.
+
+    `about` describes them in messages, for example "parameter".
+    """
     known = column_entries(names.columns, about=about)
     names.entries |= {name: entry for name, entry in known.items() if name not in names.entries}
     names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
 
 
 def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) -> tuple[Column, ...]:
-    """The columns that `unit`, `range`, `enum`, `bool` and `size` describe."""
+    """Return the columns of one state or parameter, made from its keys."""
     called = component_names(name, keys.size)
     if keys.enum is not None:
         labels = _members(keys.enum, where, cx.reader)
@@ -223,7 +229,7 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
 
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
-    """The members of an enum, from `{stop: 0, light: 1}` or `[stop, light]`."""
+    """Return (name, value) of the members of an enum, written `{stop: 0, light: 1}` or `[stop, light]`."""
     members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
         words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
@@ -240,7 +246,10 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
 
 
 def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
-    """Range `[low, high]` of every component, in its unit; an end is a number for all or a vector."""
+    """Return (low, high) of every component, in its unit, read from `range: [low, high]`.
+
+    Each of `low` and `high` is one number for all components, or a vector with one entry per component.
+    """
     node, reader, here = keys.ends, cx.reader, cx.here
     if node is None:
         return None
@@ -265,7 +274,12 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
 
 
 def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
-    """Read the flow and the resets of states with `timer: up | down`, `run`, `reset_when` and `to`."""
+    """Read the timers: states with `timer: up` or `timer: down`.
+
+    Returns their flow, which counts while `run` holds, and one jump for each timer, which sets it to `to`
+    where
+    `reset_when` holds.
+    """
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
     for name, keys in states.items():
@@ -287,7 +301,7 @@ def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign]
 
 
 def _timer_flow(name: str, keys: StateKeys, unit: Unit, cx: Context) -> tuple[Assign, ...]:
-    """Derivative (or next value) of one timer; empty where its condition is invalid."""
+    """Return the derivative (or next value) of one timer; empty if its condition `run` is invalid."""
     where = f"the timer `{name}`"
     direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
     run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
@@ -304,10 +318,13 @@ def _timer_flow(name: str, keys: StateKeys, unit: Unit, cx: Context) -> tuple[As
 
 
 def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
-    """Read the section `param`: columns after the states, and their distributions, in order.
+    """Read the section `param`; return the distributions of the parameters, in order.
 
-    `r: {unit: m, range: [0.6, 1.2]}` is uniform on its range; `draw` gives another distribution, and may
-    stand alone: `r: normal(1 m, 0.1 m)`. Later parameters may read earlier ones.
+    The parameters are appended to the columns, after the states. `r: {unit: m, range: [0.6, 1.2]}` is uniform
+    on
+    its range; `draw` gives another distribution, and may stand alone: `r: normal(1 m, 0.1 m)`. The
+    distribution
+    of a parameter may depend on earlier parameters.
     """
     names = cx.names
     found: list[Assign] = []
@@ -335,7 +352,10 @@ def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 
 
 def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
-    """Keys of a parameter; an expression alone is its `draw`, and determines its unit."""
+    """Read the keys of a parameter.
+
+    `r: normal(1 m, 0.1 m)` is short for `draw`; the unit of the parameter is then that of the expression.
+    """
     if isinstance(entry.value, Scalar):
         number = replace(cx.here, reader=Reader(cx.reader.source)).number(entry.value, "")
         unit = Unit() if number is None or number.bare else number.unit
@@ -354,7 +374,7 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 
 
 def _even(column: Column) -> tuple[ir.Num, str]:
-    """Uniform distribution on the values of a column, and its text."""
+    """Return the uniform distribution over the values that a column can take, and its text."""
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
         return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"
@@ -365,7 +385,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """The column, with the range of its distribution where none is written."""
+    """Return the column; if it has no `range`, then with the usual range of its distribution in `assigns`."""
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])
@@ -375,7 +395,7 @@ def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
 
 
 def read_controls(node: Node | None, cx: Context) -> None:
-    """Read the section `control`."""
+    """Read the section `control`, and declare its controls as names."""
     reader, names = cx.reader, cx.names
     if node is None:
         advice = "control: {u: {range: [-1, 1]}}"
@@ -402,7 +422,7 @@ def read_controls(node: Node | None, cx: Context) -> None:
 def read_levels(
     node: Node | None, where: str, unit: Unit, bounds: tuple[float, float], cx: Context
 ) -> tuple[float, ...]:
-    """Read the values of a control that a search may try, within its range."""
+    """Read `levels`: the values of a control that a search may try, which must lie within `bounds`."""
     items = cx.reader.items(node, f"`levels` of {where}")
     levels = [cx.here.constant(item, f"a level of {where}", unit) for item in items]
     low, high = bounds

@@ -1,4 +1,7 @@
-"""Declaration of a system: bound names, checked units, expressions in the IR; its description. No torch."""
+"""Declaration of a system: declared names, expressions in the IR with checked units, and a description.
+
+Nothing here imports torch.
+"""
 
 from __future__ import annotations
 
@@ -37,32 +40,32 @@ _HASHED_AS = {
 
 @dataclass(frozen=True)
 class SystemDecl:
-    """A system file, validated.
+    """A system file, read and validated.
 
     Attributes:
-        name: as written.
-        doc: one line for people.
-        path: of the file.
-        source: its text.
-        spec: path of its default specification, or None.
-        dt: seconds a step, exact.
+        name: of the system, from the file.
+        doc: description of the system in one line.
+        path: path of the system file.
+        source: text of the system file.
+        spec: path of the default specification, or None.
+        dt: time step in seconds, exact.
         horizon: planning horizon in steps.
-        substeps: integration steps within one step.
-        integrator: name of the integrator.
-        discrete: whether `flow` holds next-state maps instead of derivatives.
+        substeps: integration steps within one time step.
+        integrator: name of the integration method.
+        discrete: whether `flow` gives next values of the states instead of derivatives.
         constants: name -> (value in SI units, unit).
-        signature: the state columns, in order.
+        signature: the state columns (one per scalar state or vector component), in order.
         controls: planned variables, in order: the inputs, or their deviations from `feedback`.
-        flow: derivative (or next value) per column, in its unit per second; unlisted ones are constant.
-        jumps: in file order.
-        clamps: column -> (low, high) to which it is limited.
-        feedback: inner feedback law; None where plans are the actuator commands.
-        scenarios: named overlays.
-        scenario: the applied overlay, if any.
-        functions: external functions for specifications.
-        bases: texts of the extended files, the nearest first.
+        flow: derivative in unit per second (or next value) of each column; columns not listed are constant.
+        jumps: discrete transitions, in file order.
+        clamps: column -> (low, high), to which it is limited after every step.
+        feedback: inner feedback law; None if plans are the actuator commands themselves.
+        scenarios: named changes of the system for deployments.
+        scenario: the scenario applied to this declaration, or None.
+        functions: external functions that specifications may call.
+        bases: texts of the files that this file extends, the nearest first.
         overrides: values of `--set`.
-        places: name of a state, control, constant or definition -> where it is declared.
+        places: name of a state, control, constant or definition -> source location of its declaration.
         warnings: findings that are not errors.
     """
 
@@ -99,7 +102,7 @@ class SystemDecl:
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the text and the overrides, in hexadecimal."""
+        """SHA-256, in hexadecimal, of the file, the files that it extends, and `--set`."""
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
         texts = "".join(base.text for base in self.bases)
         return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
@@ -113,18 +116,18 @@ class SystemDecl:
 
     @property
     def worlds(self) -> tuple[WorldRef, ...]:
-        """Every world that the file names, for `test` and for scenarios."""
+        """Every world (simulator in a Python file) that `test` and the scenarios of the file name."""
         named = (self.test.world, *(scenario.world for scenario in self.scenarios))
         return tuple(world for world in named if world is not None)
 
     @property
     def judges(self) -> tuple[JudgeRef, ...]:
-        """Every specification for closed-loop runs that the file names, for `test` and for scenarios."""
+        """Every specification that `test` and the scenarios of the file name as judge of closed-loop runs."""
         named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
         return tuple(judge for judge in named if judge is not None)
 
     def judges_by(self, spec: Path) -> bool:
-        """True if this specification judges closed-loop runs, so that it applies to recorded traces."""
+        """True if the file names `spec` as judge of closed-loop runs; it is then checked on traces."""
         return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
 
     @property
@@ -133,7 +136,10 @@ class SystemDecl:
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:
-        """Interface that specifications are compiled against; no function is loaded."""
+        """Return the interface that specifications are compiled against.
+
+        External Python functions are named in it but not loaded.
+        """
         names = frozenset(function.name for function in self.functions)
         known = {function.name: function for function in self.functions if function.body is not None}
         path = self.source.name
@@ -199,7 +205,10 @@ def _control(decl: SystemDecl, index: int) -> Row:
 
 
 def _feedback(decl: SystemDecl) -> list[Row]:
-    """Feedback law, one row per control: `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`."""
+    """Return one row per control that describes the feedback law.
+
+    For example `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`.
+    """
     feedback = decl.feedback
     rows: list[Row] = []
     for i, control in enumerate(decl.controls if feedback is not None else ()):
@@ -222,7 +231,7 @@ def _situations(mixture: Sequence[Situation]) -> list[Row]:
 
 
 def _table(title: str, rows: Sequence[Row]) -> list[str]:
-    """A title and aligned rows; no lines without rows."""
+    """Return a table as lines: the title, then the rows with aligned cells; no lines if there are no rows."""
     if not rows:
         return []
     rows = [tuple(map(visible, row)) for row in rows]

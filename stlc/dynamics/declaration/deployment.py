@@ -1,4 +1,4 @@
-"""Sections `backup`, `test` and `scenario`: deployment, events, world, and scenario overlays."""
+"""Sections `backup`, `test` and `scenario`: backup policy, deployment (closed-loop test), scenarios."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ Starts = Literal["any", "savable", "feasible"]
 
 @reads(mapping_of({"type": "array", "items": EXPRESSION}))
 def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
-    """Values of controls that replace the declared ones."""
+    """Read values of controls that the backup policy tries in place of their declared levels."""
     found = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -71,7 +71,7 @@ def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ..
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """The section `backup`: prefixes that the backup policy tries."""
+    """The section `backup`: the control prefixes (first few steps of a plan) that the backup policy tries."""
 
     bins: int = key(integer(2), "values of a control, evenly over its range", 5)
     levels: Mapping[str, tuple[float, ...]] = key(_levels, "values by control, in place of `bins`", {})
@@ -82,7 +82,7 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """Read the section `backup`, or that of a scenario; lengths beyond the horizon are dropped."""
+    """Read the section `backup` of a file or of a scenario; drop prefix lengths beyond the horizon."""
     backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
     if lengths is not None and 0 < horizon < max(backup.lengths):
@@ -98,7 +98,7 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 
 @reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """Read a trigger condition: a state formula, or `rise(…)`, `fall(…)` of one."""
+    """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` of a state formula."""
     expr = cx.here.parse(node, label)
     match expr:
         case None:
@@ -111,15 +111,15 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 
 @reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """Read a step of the deployment, as a time or in steps; 0 is the start."""
+    """Read an instant of the deployment, as a time or in steps, and return it in steps; 0 is the start."""
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 
 @dataclass(frozen=True, slots=True)
 class EventDecl:
-    """An exogenous event between two steps, unknown to the planner.
+    """An exogenous event: a change of states between two steps, which the planner does not foresee.
 
-    `edge`: fire only where `when` has just become true (`rise`) or false (`fall`).
+    `edge`: the event happens only where `when` has just become true (`rise`) or false (`fall`).
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -150,7 +150,7 @@ def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
 
 @dataclass(frozen=True, slots=True)
 class WorldRef:
-    """Class of a world, in a Python file beside the system file."""
+    """Reference to a world: a Python class, beside the system file, that simulates the true system."""
 
     path: Path
     name: str
@@ -159,11 +159,11 @@ class WorldRef:
 
 @dataclass(frozen=True, slots=True)
 class JudgeRef:
-    """Specification that judges closed-loop runs.
+    """Reference to a specification that judges closed-loop runs.
 
     Attributes:
-        path: of its file.
-        written: the path as written in the system file, which identifies a run's copy.
+        path: path of the file.
+        written: the path as it stands in the system file; a run stores its copy under this name.
         span: source location of the path.
     """
 
@@ -200,7 +200,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
 
 @reads(items_of({"type": "string"}))
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
-    """Read names of constants; a vector has one name for all components."""
+    """Read the names of uncertain constants; a vector is named as a whole, not by component."""
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
     items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]
     for item in items:
@@ -211,7 +211,7 @@ def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TestDecl:
-    """The section `test`: number of steps and agents, replanning period, and events of a deployment."""
+    """The section `test`: length, number of agents, replanning period and events of a deployment."""
 
     __test__ = False
 
@@ -233,10 +233,12 @@ class TestDecl:
 
 @dataclass(frozen=True, slots=True)
 class ErrorsDecl:
-    """Errors of actuators, parameters and sensors, as shares.
+    """Errors of actuators, parameters and sensors, as fractions (0.1 is 10 %).
 
-    For a direction (squash `angle`) the error is a share of a radian. Parameters are the numbers in the
-    dynamics (`stlc.dynamics.scenarios.perturbed`). Clocks, which are states in seconds, are exact.
+    For a control with squash `angle` (a direction) the error is a fraction of one radian. Parameters are the
+    numbers in the dynamics (see `stlc.dynamics.scenarios.perturbed`). States with the unit second are clocks
+    and
+    have no error.
     """
 
     actuator_gain: float = key(fraction, "constant relative error of every control of an agent", 0.0)
@@ -247,7 +249,7 @@ class ErrorsDecl:
 
 @reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
-    """Read constants and their changed values, as text."""
+    """Read new values of constants, kept as text, by name."""
     found: dict[str, str] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -265,7 +267,10 @@ def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @reads(mapping_of(VECTOR))
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
-    """Read terms added to derivatives (or next values), in the unit of the state per second."""
+    """Read a disturbance: terms added to derivatives (or next values) of states.
+
+    Terms of derivatives are in the unit of the state per second.
+    """
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
         columns = states_of(entry, label, cx)
@@ -277,7 +282,7 @@ def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
-    """An entry of `scenario`: a named overlay of a deployment."""
+    """An entry of `scenario`: a named set of changes to a deployment."""
 
     name: str
     doc: str = key(LINE, "one line for people", "")
@@ -302,7 +307,7 @@ class ScenarioDecl:
 
 
 def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
-    """Read the section `scenario`: all overlays, in order; each is checked, whether applied or not."""
+    """Read the section `scenario`: all scenarios, in order. Each is checked, whether or not it is applied."""
     return tuple(
         _scenario(entry, cx)
         for entry in cx.reader.entries(node, "`scenario`")

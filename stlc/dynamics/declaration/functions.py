@@ -1,4 +1,4 @@
-"""Section `functions`: references to Python functions, not loaded, and kinematics from robot descriptions."""
+"""Section `functions`: references to Python functions (not loaded here), kinematics from URDF files."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", 
 
 @dataclass(frozen=True, slots=True)
 class FunctionDecl:
-    """External function for specifications: in Python, or given as IR expressions.
+    """External function that specifications may call: in Python, or given as IR expressions.
 
     Attributes:
-        name: its name in `extern fn`.
-        module: the module, or the file beside the system file, that holds it.
-        attribute: its name there.
-        library: array library of its arguments; None accepts the caller's arrays.
+        name: its name in the declaration `extern fn` of a specification.
+        module: Python module, or file beside the system file, that holds it.
+        attribute: its name within that module.
+        library: array library of its arguments; None accepts the arrays of any caller.
         span: source location of its name.
-        body: IR expressions from one vector to one, where the file defines them; None for Python.
-        base: of kinematics, the link that positions are relative to; "" is the root.
+        body: IR expressions that compute the result vector from one argument vector; None for Python.
+        base: for kinematics, the link that positions are relative to; "" is the root.
     """
 
     name: str
@@ -44,7 +44,10 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """The function with declared sizes. Raises SystemFileError (S208) for other sizes."""
+        """Return the function's body if it has the declared sizes (None: a scalar).
+
+        Raises SystemFileError (S208) for other sizes.
+        """
         assert self.body is not None
         takes, gives = len(self.body.formals), len(self.body.outputs)
         if (arguments, result) == ((takes,), gives):
@@ -58,7 +61,7 @@ class FunctionDecl:
 
 @dataclass(repr=False, eq=False)
 class FunctionKeys:
-    """Keys of an external function."""
+    """The keys that one entry of `functions` may have."""
 
     kind: str | None = key(word(_OWN), "origin of the function", required=True)
     target: str | None = key(TEXT, "of `python`: `package.module:function` or `file.py:function`")
@@ -71,10 +74,12 @@ class FunctionKeys:
 
 
 def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
-    """Read external functions; those with IR expressions become names that expressions may call.
+    """Read the section `functions`; a function with IR expressions can also be called in the system file.
 
-    `f: {kind: python, target: "package.module:function"}`, or `"file.py:function"` beside the file;
-    `ee: {kind: urdf, file: arm.urdf, tip: flange}`: the position of that link, from those of its joints.
+    `f: {kind: python, target: "package.module:function"}`, or `"file.py:function"` for a file beside the
+    system
+    file. `ee: {kind: urdf, file: arm.urdf, tip: flange}`: the position of the link `flange` from the joint
+    positions.
     """
     found = [_function(entry, cx) for entry in cx.reader.entries(node, "`functions`")]
     kept = tuple(function for function in found if function is not None)
@@ -117,7 +122,7 @@ def _python(entry: Entry, keys: FunctionKeys, where: str, cx: Context) -> Functi
 
 
 def _kinematics(entry: Entry, keys: FunctionKeys, cx: Context) -> FunctionDecl | None:
-    """Forward kinematics of one link."""
+    """Read the forward kinematics of one link from a URDF file."""
     file, tip, place = keys.file or "", keys.tip or "", entry.place("file")
     path = Path(place.source.name).parent / file
     try:

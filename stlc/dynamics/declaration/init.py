@@ -50,7 +50,7 @@ class GridDecl:
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """Initial states from a file that holds an array for each column; all samples of all traces are used."""
+    """Initial states from a file with one array per column; every sample is a possible state."""
 
     path: Path
     names: tuple[str, ...]
@@ -59,14 +59,14 @@ class FileDecl:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Component of the mixture of initial states: assignments in order, then one of the branches.
+    """Component of the mixture of initial states: its assignments in order, then one of its branches.
 
     Attributes:
         name: for messages and tables; "" for an unnamed branch.
-        weight: share among its siblings, not normalised.
+        weight: relative probability among the components of the same mixture, not normalised.
         draws: assignments in order; later ones may read earlier ones. Names that are not columns are local.
-        branches: sub-mixture of continuations.
-        points: given states, one of which is taken before the draws.
+        branches: mixture of continuations, one of which is drawn after `draws`; may be empty.
+        points: grid or file of states, one of which is taken before `draws`; None without one.
     """
 
     name: str
@@ -81,12 +81,12 @@ class InitDecl:
     """Distribution of initial states: a mixture with rejection by conditions.
 
     Attributes:
-        mixture: of situations.
-        where: conditions that every state must meet.
-        where_text: as written.
-        params: drawn before a situation is picked; situations may redraw them.
-        override: drawn last, replacing draws of situations.
-        span: for messages.
+        mixture: the situations, of which one is picked by weight.
+        where: conditions that every state must meet; other states are rejected.
+        where_text: source text of these conditions.
+        params: assignments drawn before a situation is picked; situations may draw them again.
+        override: assignments drawn last, which replace draws of situations.
+        span: source location of the section, for messages.
     """
 
     mixture: tuple[Situation, ...]
@@ -99,7 +99,7 @@ class InitDecl:
 
 @dataclass(repr=False, eq=False)
 class SituationKeys:
-    """Keys of a situation, and of each of its branches."""
+    """The keys of a situation and of each of its branches."""
 
     name: str = key(NAME, "for messages and tables", "", label=OF)
     weight: float = key(number(), "share among its siblings, not normalised", 1.0)
@@ -111,7 +111,7 @@ class SituationKeys:
 
 @dataclass(repr=False, eq=False)
 class InitKeys:
-    """The section `init`."""
+    """The keys of the section `init`."""
 
     mixture: tuple[Node, ...] = key(list_of(section(SituationKeys), ""), "situations", ())
     where: Node | None = key(raw(items_of(EXPRESSION)), "conditions on every initial state")
@@ -123,7 +123,7 @@ class InitKeys:
 
 @dataclass(repr=False, eq=False)
 class AxisKeys:
-    """Evenly spaced values of a grid."""
+    """The keys of evenly spaced values along one axis of a grid."""
 
     from_: Node | None = key(raw(EXPRESSION), "first value", name="from", required=True)
     to: Node | None = key(raw(EXPRESSION), "last value", required=True)
@@ -165,7 +165,10 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
 
 
 def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
-    """Read situations, of which at least one must have a positive weight."""
+    """Read the situations of a mixture; at least one must have a positive weight.
+
+    `outer` holds the assignments made before, which the situations may read.
+    """
     situations = [_situation(item, outer) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
         outer.cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
@@ -173,7 +176,7 @@ def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
 
 
 def _situation(node: Node, outer: _Draws) -> Situation:
-    """Read one situation, or one of its branches."""
+    """Read one situation, or one of its branches; `outer` holds the assignments made before it."""
     keys = read(SituationKeys, outer.cx, node, "a situation")
     draws = _Draws(outer.cx, outer.ready, outer.locals)
     draws.read(keys)
@@ -185,12 +188,12 @@ def _situation(node: Node, outer: _Draws) -> Situation:
 
 
 class _Draws:
-    """The assignments of one situation; local names are resolved where they are first needed.
+    """The assignments of one situation; a local name (from `let`) is drawn just before its first use.
 
     Attributes:
         found: assignments, in order.
-        ready: columns, and components of local names, that have a value so far.
-        locals: local names that have a value so far.
+        ready: columns, and components of local names, that already have a value.
+        locals: local names that already have a value.
     """
 
     def __init__(
@@ -205,11 +208,11 @@ class _Draws:
 
     @property
     def drawing(self) -> Context:
-        """Context for expressions that may draw, and that read only names with a value."""
+        """Context for random expressions that read only names that already have a value."""
         return self.cx.drawing(self.locals, self.ready)
 
     def require_all(self, called: str, node: Node) -> None:
-        """Report states without initial value."""
+        """Report states that have no initial value; `called` names the situation at `node` in the message."""
         undrawn = [column.name for column in self.cx.names.columns if column.name not in self.ready]
         missing = list(dict.fromkeys(map(base_name, undrawn)))
         if missing and not self.failed:
@@ -218,7 +221,7 @@ class _Draws:
             self.cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
 
     def read(self, keys: SituationKeys | InitKeys) -> None:
-        """Read `let`, `draw` and `also`, in the order of their dependencies."""
+        """Read `let`, `draw` and `also`, with every local name before the expressions that use it."""
         reader = self.cx.reader
         before = len(reader.findings)
         for entry in reader.entries(keys.let, "`let`"):
@@ -238,7 +241,7 @@ class _Draws:
         self.failed = len(reader.findings) > before
 
     def _draw(self, entry: Entry, where: str) -> None:
-        """Read the value of one state."""
+        """Read the initial value of one state."""
         columns = states_of(entry, where, self.cx)
         if not columns:
             return
@@ -247,14 +250,14 @@ class _Draws:
         self.ready |= {column.name for column in columns}
 
     def _needed(self, node: Node) -> None:
-        """Resolve the local names that an expression mentions."""
+        """Add the assignments of the local names (from `let`) that an expression mentions."""
         texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
         for name in list(self.unresolved):
             if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
                 self._let(name)
 
     def _let(self, name: str) -> None:
-        """Resolve a local name, and the local names that it reads."""
+        """Add the assignment of a local name (from `let`), after those of the local names that it reads."""
         if name not in self.unresolved:
             return
         node = self.unresolved.pop(name)
@@ -279,7 +282,7 @@ class _Draws:
 
 
 def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
-    """Read initial states from a grid or a file; `draw` gives the states that are not in it."""
+    """Read initial states from a grid or a file; `draw` gives the states that the grid or file lacks."""
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
@@ -301,7 +304,10 @@ def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
 
 
 def _grid(node: Node, cx: Context) -> GridDecl:
-    """Read `{x: {from: -1, to: 1, count: 21}, sign: [stop, light]}`: every combination of the values."""
+    """Read a grid such as `{x: {from: -1, to: 1, count: 21}, sign: [stop, light]}`.
+
+    The grid consists of every combination of the values.
+    """
     axes = []
     for entry in cx.reader.entries(node, "`grid`"):
         columns = states_of(entry, "`grid`", cx)
@@ -316,7 +322,7 @@ def _grid(node: Node, cx: Context) -> GridDecl:
 
 
 def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
-    """Values of one axis, in the unit of the column; an invalid one is replaced by 0."""
+    """Return the values of a column along its axis of the grid, in its unit; an invalid value becomes 0."""
     where = f"the values of `{column.name}`"
     if isinstance(entry.value, Mapping):
         return _spaced(column, entry.value, where, cx)
@@ -346,7 +352,7 @@ def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[flo
 
 
 def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
-    """Read `from: starts.npz`, relative to the system file; states that are not drawn come from there."""
+    """Read `from: starts.npz`, a path relative to the system file; `names` are its columns."""
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None

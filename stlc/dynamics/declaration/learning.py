@@ -54,13 +54,13 @@ OUTCOME = {
 
 @reads(EXPRESSION)
 def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
-    """Read a number in SI units from absolute zero."""
+    """Read a number and convert it to SI units; a temperature in degC becomes kelvin, offset included."""
     value = cx.here.number(node, label)
     return None if value is None else absolute(value).num
 
 
 def _term_label(found: Mapping[str, Node]) -> str:
-    """Label of a performance term: its name, or its expression."""
+    """Return the label of a performance term in messages: its name, or else its expression."""
     name = found.get("name")
     shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
     return f"the term `{shown}`"
@@ -77,7 +77,12 @@ class Term:
 
 @reads(items_of(json_schema(Term)), Term)
 def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
-    """Read performance terms; they may use `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
+    """Read the performance terms of the objective.
+
+    A term may read the outcome of a plan (`sat`: satisfied, `rho`: robustness), the step `k`, the time `t`,
+    and
+    `x_start`, the value at the start of the plan, for each state `x`.
+    """
     known = cx.names.entries
     entries: dict[str, Entry] = {
         name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()
@@ -106,7 +111,10 @@ def _at_start(number: Number) -> Number:
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveDecl:
-    """The section `objective`: loss of the paper (Eq. 8-10), a robustness hinge plus performance terms."""
+    """The section `objective`: training loss (Eq. 8-10 of the paper).
+
+    The loss is a hinge on the robustness plus weighted performance terms.
+    """
 
     gamma: float = key(number(), "robustness at which the hinge ends", 0.5)
     smoothing: float = key(number(1e-9), "scale of the smooth robustness", 500.0)
@@ -121,15 +129,15 @@ class ObjectiveDecl:
 class Feedback:
     """Linear feedback law: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
-    `v` is the plan; all values are in the units of the columns.
+    `v` is the planned control; all values are in the units of the columns.
 
     Attributes:
-        gain: K, a row per control with an entry per state.
-        state: x0, one per state.
-        control: u0, one per control.
+        gain: K, one row per control with one entry per state.
+        state: x0, one entry per state.
+        control: u0, one entry per control.
         low: lower ends of the actuators' ranges.
-        high: upper ends.
-        authority: a, the largest contribution of the feedback, one per control.
+        high: upper ends of the actuators' ranges.
+        authority: a, the largest contribution of the feedback, one entry per control.
     """
 
     gain: tuple[tuple[float, ...], ...]
@@ -172,7 +180,7 @@ def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackDecl:
-    """The entry `feedback` of the policy; `stlc.dynamics.model.feedback` computes the gain."""
+    """The entry `feedback` of the policy, from which `stlc.dynamics.model.feedback` computes a gain."""
 
     around: Mapping[str, float] = key(_around, "point of operation: states and controls", {})
     weights: Mapping[str, float] = key(_weights, "weights of the regulator's cost, by state or control", {})
@@ -184,7 +192,7 @@ class FeedbackDecl:
 
 @reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the requested feedback: `lqr`, or a mapping."""
+    """Read the entry `feedback`: the word `lqr`, or a mapping of its settings."""
     request = None
     if not isinstance(node, Scalar):
         request = read(FeedbackDecl, cx, node, label)
@@ -202,7 +210,10 @@ def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
-    """Read one item of `observe`: a number, a formula, or the components of a vector."""
+    """Read one item of `observe`; return (input of the policy, its text) for each component.
+
+    An item is a number, a formula (observed as 0 or 1), or a vector.
+    """
     expr = cx.here.parse(node, "an observation")
     if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
         value = cx.here.truth(node, "an observation")
@@ -216,7 +227,7 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 @reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the images of states and controls under a symmetry; unlisted ones are unchanged.
+    """Read the images of states and controls under a mirror symmetry; those not listed are unchanged.
 
     `stlc.controller.training.diagnose.check_mirror` checks the symmetry before a training.
     """
@@ -250,7 +261,7 @@ INTEGERS = Kind(_integers, {"anyOf": [_WHOLE, {"type": "array", "items": _WHOLE}
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecl:
-    """The section `policy`: network and inputs, mirror symmetry of the system, inner feedback."""
+    """The section `policy`: network, its inputs, mirror symmetry of the system, and inner feedback."""
 
     type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
     hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))
@@ -271,7 +282,7 @@ class PolicyDecl:
 
 @dataclass(frozen=True, slots=True)
 class TrainDecl:
-    """The section `train`: defaults of this system; None leaves the choice to the method."""
+    """The section `train`: training settings of this system; None leaves one to the method."""
 
     budget: float | None = key(
         Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION), "time for training"
