@@ -1,4 +1,4 @@
-"""Loading of a system file as a declaration: all sections, all findings at once. No torch."""
+"""Loading of a system file as a declaration; the findings of all sections are reported together. No torch."""
 
 from __future__ import annotations
 
@@ -105,7 +105,10 @@ class SystemKeys:
 
 
 def system_schema() -> Json:
-    """JSON Schema of system files, for editors; nothing is required in a file that extends another one."""
+    """JSON Schema of system files, for editors.
+
+    No key is required in a file that extends another one.
+    """
     found = json_schema(SystemKeys)
     required = found.pop("required")
     return {**found, "anyOf": [{"required": required}, {"required": [_EXTENDS]}]}
@@ -115,20 +118,20 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
     """Load the declaration of a system file.
 
     Args:
-        path: of the file.
-        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is not a
-            constant of this file is left to the specification.
+        path: path of the file.
+        overrides: new values by dotted key (`train.lr`), or by the name of a constant, parameter or top-level
+            field; any other name without a dot is ignored here, as it may be a name of the specification.
 
     Raises:
         UsageError: the file does not exist.
         SpecError: the file is not text.
-        SystemFileError: with all findings.
+        SystemFileError: the file is invalid; carries all findings.
     """
     return parse_system(read_source(path), Path(path), overrides or {})
 
 
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """Parse a system file's text; relative paths start from the folder of `path`."""
+    """Parse the text of a system file; relative paths in it start from the folder of `path`."""
     reader = Reader(source)
     found, bases = _sections(source, overrides or {}, reader)
     version = reader.integer(found.stlc, "`stlc`")
@@ -159,7 +162,10 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
 def _sections(
     source: Source, overrides: MappingType[str, str], reader: Reader
 ) -> tuple[SystemKeys, tuple[Source, ...]]:
-    """Sections of a file merged with the files that it extends and with `overrides`; texts of those files."""
+    """Read the sections of a file, merged with the files that it extends and with `overrides`.
+
+    Returns also the texts of the extended files.
+    """
     root, bases = extended(load_yaml(source, sink=reader.findings), reader)
     root = overridden(root, overrides, reader)
     return read(SystemKeys, Context.of(reader, Names()), root, "a system file"), bases
@@ -168,7 +174,7 @@ def _sections(
 def _declaration(
     found: SystemKeys, reader: Reader, path: Path, overrides: MappingType[str, str]
 ) -> SystemDecl:
-    """Read all sections, in the order in which names are declared."""
+    """Read all sections, those that declare names first, and return the declaration."""
     named = _named(found, reader)
     names, cx = named.cx.names, named.cx
     timer_flow, timer_jumps = read_timers(named.states, cx)
@@ -212,7 +218,7 @@ def _declaration(
 def _report_idle(
     node: Node | None, cx: Context, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
 ) -> None:
-    """Report W603 for controls that have no effect."""
+    """Report W603 for controls that neither `flow` nor a jump reads."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
     used = {name for num in (*moved, *(jump.guard for jump in jumps)) for name in names_in(num)}
     known = {entry.key.text: entry.key.span for entry in cx.reader.entries(node, "`control`")}
@@ -232,8 +238,9 @@ class _Named:
     Attributes:
         cx: context that knows all declared names, and the time step.
         clock: the section `time`.
-        states: keys of each state, timers among them.
-        drawn: parameters and latches, drawn before the states.
+        states: keys of each state, timers included.
+        drawn: distributions of the parameters, and initial values of the states that record which jumps with
+            `once` have happened; all are assigned before the other states are drawn.
         functions: external functions.
     """
 
@@ -261,7 +268,7 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 
 @dataclass(frozen=True, slots=True)
 class MovingParts:
-    """Context, and the sections `flow` and `jump`, of a valid declaration."""
+    """Context and nodes of the sections `flow` and `jump` of a valid file, to read these sections again."""
 
     cx: Context
     flow: Node | None
@@ -269,7 +276,7 @@ class MovingParts:
 
 
 def moving_parts(decl: SystemDecl) -> MovingParts:
-    """Parts of a file that determine the motion of its states."""
+    """Return the sections that determine the motion of the states, and the context to read them in."""
     reader = Reader(decl.source)
     found, _ = _sections(decl.source, decl.overrides, reader)
     return MovingParts(_named(found, reader).cx, found.flow, found.jump)
@@ -279,11 +286,11 @@ def moving_parts(decl: SystemDecl) -> MovingParts:
 
 
 def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]]:
-    """Merge a document with the files that it extends; return also their texts.
+    """Merge a system file (as YAML mapping) with the files that it extends; return also their texts.
 
-    Sections that are mappings are merged entry by entry, with precedence for the extending file; a null entry
-    (`~`) removes that of the extended file, and anything else is replaced. Every value keeps its source
-    location. S209 is reported where a file cannot be read or extends itself.
+    Sections that are mappings are merged entry by entry, and the extending file takes precedence. A null
+    entry (`~`) removes the entry of the extended file; any other value replaces it. Every value keeps its
+    source location. S209 is reported if a file cannot be read or extends itself.
     """
     sources: list[Source] = []
     seen = {Path(reader.source.name).resolve()}
@@ -313,7 +320,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
-    """Merge one document over another, entry by entry; with `sections` also the mappings within."""
+    """Merge the mapping `own` over `base`, entry by entry; with `sections` also the mappings inside."""
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
         key, value, old = entry.key, entry.value, base.get(entry.key.text)
@@ -330,10 +337,11 @@ def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
 
 
 def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
-    """Replace the fields of a document that `overrides` names.
+    """Replace the fields of a system file (as YAML mapping) that `overrides` names.
 
-    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, a parameter, or
-    a top-level field with a single value. Other plain names are left to the specification.
+    A key with dots names a field (`train.lr`, `init.mixture.0.weight`). A key without dots names a constant,
+    a parameter, or a top-level field with a single value; if it names none of these, it is skipped, as it may
+    belong to the specification.
     """
     known, params = _keys(root.get("const")), _keys(root.get("param"))
     for name, text in overrides.items():
@@ -354,12 +362,12 @@ def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) 
 
 
 def _keys(node: Node | None) -> dict[str, Node]:
-    """The entries of a section by name."""
+    """Return the keys of a section by name; empty if the section is missing."""
     return {entry.key.text: entry.value for entry in node.entries} if isinstance(node, Mapping) else {}
 
 
 def _value(key: str, text: str, reader: Reader) -> Node | None:
-    """Value of an override, parsed as a YAML text of its own."""
+    """Parse the text of one override as YAML; None if it is invalid."""
     source = Source(f"--set {key}", text)
     try:
         return load_node(source, sink=reader.findings)
@@ -369,7 +377,10 @@ def _value(key: str, text: str, reader: Reader) -> Node | None:
 
 
 def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
-    """`node` with the value at `path` replaced; missing keys are added."""
+    """Return `node` with the value at `path` replaced by `value`; keys that `path` lacks are added.
+
+    `key` is the whole dotted key, for messages.
+    """
     head, rest = path[0], path[1:]
     match node:
         case Sequence(items=items) if head.isdigit() and int(head) < len(items):
@@ -385,7 +396,7 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
 
 
 def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
-    """Report a path that does not exist."""
+    """Report that `head`, a part of the dotted key `key`, does not exist in `node`, and return `node`."""
     keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
     near = closest(head, keys)
     guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
@@ -394,7 +405,7 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """Initial states with those that `--set` names replaced: a value (`x=3m`) or a distribution."""
+    """Apply the overrides that name states: `x=3m` or a distribution replaces the initial value of `x`."""
     params = {base_name(assign.name) for assign in init.params}
     found: list[Assign] = []
     for name, text in overrides.items():

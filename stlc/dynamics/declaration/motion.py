@@ -37,7 +37,7 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Assign:
-    """A column (or a local name) and its new value, in the unit of that column."""
+    """New value of a column (or of a local name), in the unit of that column."""
 
     name: str
     value: ir.Num
@@ -48,7 +48,7 @@ class Assign:
 
 
 def read_sets(cx: Context, node: Node | None, label: str) -> tuple[Assign, ...]:
-    """Read new values of states, in order."""
+    """Read new values of states, as in `set` of an event, in order."""
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
         found.extend(shared_draws(state_assigns(entry, label, cx)))
@@ -60,7 +60,7 @@ SETS = Kind(read_sets, mapping_of(VECTOR))
 
 
 def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
-    """Read the value of a state: one for each component of a vector."""
+    """Read the value of a state; return one assignment, or one per component of a vector."""
     columns = states_of(entry, where, cx)
     if not columns:
         return ()
@@ -83,7 +83,7 @@ def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
 def components(
     columns: tuple[Column, ...], node: Node, where: str, unit: Unit, cx: Context
 ) -> tuple[Assign, ...]:
-    """Read the values of the components of a vector."""
+    """Read the value of a vector; return one assignment per component."""
     values = cx.here.stored_each(node, where, unit, len(columns))
     if values is None:
         return ()
@@ -94,7 +94,7 @@ def components(
 
 
 def component_texts(node: Node, size: int) -> tuple[str, ...]:
-    """The text of each component of a vector."""
+    """Return the source text of each component of a vector."""
     if isinstance(node, ListNode):
         return tuple(written(item) for item in node.items)
     text = written(node)
@@ -102,7 +102,7 @@ def component_texts(node: Node, size: int) -> tuple[str, ...]:
 
 
 def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
-    """Value of a column: members by name for an enum, formulas for a bool, units checked."""
+    """Read the value of one column: members by name for an enum, formulas for a bool, units checked."""
     where = f"`{column.name}`"
     boolean, here = column.kind == "bool", cx.here
     value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
@@ -114,7 +114,7 @@ def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
 
 
 def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
-    """Columns of the state that a key names (S202 for other keys)."""
+    """Return the columns of the state that a key names; report S202 if there is no such state."""
     name = entry.key.text
     columns = cx.names.group(name)
     if columns:
@@ -127,7 +127,7 @@ def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
 
 
 def rate_unit(unit: Unit) -> Unit:
-    """Unit of a derivative; undeclared for an undeclared unit."""
+    """Return the unit of the derivative of a column; undeclared if that of the column is undeclared."""
     return unit / SECOND if unit.text else replace(unit)
 
 
@@ -165,7 +165,10 @@ def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 
 @dataclass(frozen=True, slots=True)
 class JumpDecl:
-    """A jump: where the guard holds at the start of a step, the resets replace the flow (Eq. 6)."""
+    """A jump: a guard and resets.
+
+    If the guard holds at the start of a step, the resets replace the flow in that step (Eq. 6 of the paper).
+    """
 
     name: str = key(NAME, "for messages", "", label=OF)
     guard: ir.Formula = key(FORMULA, "condition on the state", label="a guard", required=True)
@@ -194,7 +197,10 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
 
 
 def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
-    """Add a state for every jump with `once` that records whether it has happened; initially false."""
+    """Declare a bool state for every jump with `once`, which becomes true when the jump happens.
+
+    Returns the initial values of these states: false.
+    """
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
         once = item.get("once") if isinstance(item, Mapping) else None
@@ -221,10 +227,10 @@ def latch_name(jump: str) -> str:
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """Move samplers shared by several assignments before them, as local names.
+    """Draw a sampler, such as `uniform(0, 1)`, only once, as a local name, if several assignments share it.
 
-    `p: "uniform(0, 1) * [1, 2]"` names one random number; `p: "uniform(low, high)"` with vectors names one
-    for each component.
+    `p: "uniform(0, 1) * [1, 2]"` multiplies one random number by each component; `p: "uniform(low, high)"`
+    with vectors draws one random number per component.
     """
     if len(assigns) < 2:
         return tuple(assigns)
@@ -236,7 +242,7 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
     known: dict[int, ir.Num] = {}
 
     def rewritten(num: ir.Num) -> ir.Num:
-        """The number with shared samplers replaced by names."""
+        """Return the number with every shared sampler replaced by the local name that holds its value."""
         if id(num) not in known:
             changed = map_parts(num, rewritten)
             if id(num) in shared:
@@ -250,6 +256,6 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
 
 
 def _samplers(num: ir.Num) -> set[int]:
-    """Identities of the samplers in a number."""
+    """Return the identities (`id`) of the samplers that occur in a number."""
     parts = subexpressions(num)
     return {id(part) for part in parts if isinstance(part, ir.Op) and part.name in _SAMPLERS}

@@ -1,1 +1,1 @@
-"""Initial states."""
+"""Drawing of initial states."""

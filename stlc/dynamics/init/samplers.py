@@ -1,6 +1,7 @@
-"""Random initial states: samplers such as `uniform`, and situations of a mixture, with an explicit generator.
+"""Random initial states, drawn with an explicit generator.
 
-A situation is picked by weight, its variables are drawn in order, and states that fail `where` are rejected.
+A situation of the mixture is picked by its weight, its variables are drawn in order from samplers such as
+`uniform`, and states that violate a condition of `where` are rejected.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Number of rows to draw, and a random generator; float64 on the generator's device."""
+    """A number of rows (states) to draw, and the random generator; values are float64 on its device."""
 
     count: int
     generator: torch.Generator
@@ -49,7 +50,7 @@ class Rows:
         return self._drawn(torch.randn)
 
     def blank(self) -> Tensor:
-        """Zeros, (count,), to broadcast constants."""
+        """Zeros, (count,), to which constants are broadcast."""
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
@@ -61,7 +62,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """One occurrence of a sampler; equal expressions are drawn independently."""
+    """One occurrence of a sampler; two occurrences with equal arguments are drawn independently."""
 
     name: str
     sampler: str
@@ -70,7 +71,7 @@ class _Call:
 
 
 class Drawing:
-    """An assignment with its samplers compiled."""
+    """An assignment compiled for drawing: its samplers, and the expression that uses their values."""
 
     def __init__(self, assign: Assign) -> None:
         self.name = assign.name
@@ -80,7 +81,7 @@ class Drawing:
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
-        """Value in every row, (count,) float64; `env` holds at least one (count,) column."""
+        """Return the value in every row, (count,) float64; `env` must hold at least one column (count,)."""
         if self._calls:
             env = dict(env)
             for call in self._calls:
@@ -90,7 +91,7 @@ class Drawing:
         return value.expand(rows.count)
 
     def _extract(self, num: ir.Num) -> ir.Num:
-        """The number with every sampler replaced by a column drawn before."""
+        """Replace every sampler in a number by a column, and append the sampler to the list of draws."""
         if id(num) in self._seen:
             return self._seen[id(num)]
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:
@@ -105,7 +106,7 @@ class Drawing:
 
 
 def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
-    """Draw from a sampler, one number per row."""
+    """Draw one number per row from the sampler of that name with arguments `args`."""
     match sampler, args:
         case "uniform", [low, high]:
             return torch.lerp(low, high, rows.uniforms())
@@ -140,7 +141,7 @@ Table = dict[str, Tensor]
 
 
 class _Draws:
-    """A situation with compiled draws."""
+    """A situation compiled for drawing."""
 
     def __init__(self, situation: Situation) -> None:
         self.weight = situation.weight
@@ -153,7 +154,7 @@ class _Draws:
             self.points = _File(situation.points)
 
     def __call__(self, table: Table, rows: Rows) -> Table:
-        """`table` with the names of this situation added, (count,) each."""
+        """Draw this situation; return `table` with its names added, (count,) each."""
         if self.points is not None:
             table = {**table, **self.points(rows)}
         for drawing in self.draws:
@@ -162,7 +163,7 @@ class _Draws:
 
 
 class _Mixture:
-    """Mixture of situations; one is picked for every row."""
+    """Mixture of situations compiled for drawing; one situation is picked for every row."""
 
     def __init__(self, situations: tuple[Situation, ...]) -> None:
         self.parts = tuple(_Draws(situation) for situation in situations)
@@ -183,11 +184,11 @@ class _Mixture:
 
 
 class InitialStates:
-    """Distribution of a declaration's initial states.
+    """Distribution of the initial states of a declaration.
 
     Attributes:
-        drawn: number of states proposed so far.
-        accepted: number of states that met every condition.
+        drawn: number of states proposed since construction.
+        accepted: number of these that met every condition.
     """
 
     def __init__(self, decl: InitDecl, names: tuple[str, ...]) -> None:
@@ -206,9 +207,9 @@ class InitialStates:
         return self.accepted / self.drawn if self.drawn else 1.0
 
     def sample(self, n: int, generator: torch.Generator) -> Tensor:
-        """Draw initial states, (n, dim) float64 on the generator's device.
+        """Draw n initial states, (n, dim) float64 on the generator's device.
 
-        Raises SystemFileError (S301) where (nearly) every proposed state is rejected.
+        Raises SystemFileError (S301) if (nearly) every proposed state is rejected.
         """
         if not self.decl.where:
             self.drawn, self.accepted = self.drawn + n, self.accepted + n
@@ -231,7 +232,7 @@ class InitialStates:
         return torch.cat(found)
 
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
-        """Propose states before rejection, (n, dim)."""
+        """Draw states without applying the conditions of `where`, (n, dim)."""
         rows = Rows(n, generator)
         table = {"": rows.blank()}
         for drawing in self._params:
@@ -242,18 +243,18 @@ class InitialStates:
         return torch.stack([table[name] for name in self.names], 1)
 
     def holds(self, states: Tensor) -> Tensor:
-        """Mask of the states (n, dim) that meet every condition of `where`, (n,)."""
+        """Mask (n,) of the states (n, dim) that meet every condition of `where`."""
         return self._each_holds(states).all(0)
 
     def _each_holds(self, states: Tensor) -> Tensor:
-        """Mask of the states per condition of `where`, (conditions, n)."""
+        """Mask (conditions, n): whether each of the states (n, dim) meets each condition of `where`."""
         env = dict(zip(self.names, states.unbind(1), strict=True))
         marks = self._where(env, TORCH, _HARD)
         found = [mark.expand(len(states)) > 0.5 for mark in marks.values()]
         return torch.stack(found) if found else torch.ones(0, len(states), dtype=torch.bool)
 
     def require_many(self, n: int = 256, *, seed: int = 0) -> None:
-        """Raise SystemFileError (S301) where less than 1 % of proposed states is accepted."""
+        """Draw n states; raise SystemFileError (S301) if less than 1 % of proposed states is accepted."""
         before = self.drawn, self.accepted
         self.sample(n, torch.Generator().manual_seed(seed))
         drawn, accepted = self.drawn - before[0], self.accepted - before[1]
@@ -267,19 +268,19 @@ class InitialStates:
         )
 
     def _finding(self, code: str, message: str, label: str, note: tuple[str, ...] = ()) -> Diagnostic:
-        """A finding about the conditions of `where`."""
+        """Make a diagnostic located at the conditions of `where`."""
         advice = "draw the states closer to what `where` asks for"
         return Diagnostic(code, message, self.decl.span, label, help=(advice,), note=note)
 
     def _rates(self) -> tuple[str, ...]:
-        """Share of proposed states that meet each condition, the smallest first."""
+        """Return lines that state which share of proposed states meets each condition, the smallest first."""
         proposed = self._propose(RATED, torch.Generator().manual_seed(0))
         rates = self._each_holds(proposed).double().mean(1).tolist()
         told = sorted(zip(rates, self.decl.where_text, strict=True))
         return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """W601 where few of the proposed states were accepted."""
+        """Return W601 if few of the proposed states were accepted, else nothing."""
         if self.acceptance >= FEW:
             return ()
         message = f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`"
@@ -290,7 +291,10 @@ class InitialStates:
 
 
 class _Grid:
-    """Grid of states: combinations are computed from their index (the last axis is fastest), never stored."""
+    """Random points of a grid of states.
+
+    A point is computed from its index (the last axis varies fastest), so the grid is never stored.
+    """
 
     def __init__(self, decl: GridDecl) -> None:
         self._axes = [(name, torch.tensor(values, dtype=torch.float64)) for name, values in decl.axes]
@@ -311,14 +315,17 @@ class _Grid:
 
 
 class _File:
-    """States from the rows of a file."""
+    """Random states out of those that a file holds."""
 
     def __init__(self, decl: FileDecl) -> None:
         self._decl = decl
         self._columns: dict[str, Tensor] = {}
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
-        """Draw rows. Raises SystemFileError (S303) where the file does not hold the states."""
+        """Draw states: name of a column -> (count,).
+
+        Raises SystemFileError (S303) if the file lacks a column or its values are unusable.
+        """
         if not self._columns:
             self._columns = self._read()
         first = next(iter(self._columns.values()))
@@ -352,7 +359,10 @@ class _File:
 
 
 def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """All samples of a column, (count,); a component of a vector may be a slice of its last axis."""
+    """Return all samples of a column as (count,), or None if the arrays lack it.
+
+    A component `p[1]` of a vector may be stored as slice 1 of the last axis of the array `p`.
+    """
     base, bracket, index = name.partition("[")
     values = arrays.get(name)
     if values is None and bracket and base in arrays and arrays[base].ndim:
@@ -365,7 +375,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Indices below `count`, (rows,), each equally often, in random order."""
+    """Return random indices below `count`, one per row; each index occurs equally often (up to one)."""
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)
     orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]

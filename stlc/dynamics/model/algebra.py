@@ -1,4 +1,4 @@
-"""Arithmetic on numbers of the IR: names that they read, substitution, sums and products."""
+"""Arithmetic on numbers of the IR: the names that a number reads, substitution, sums and products."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def names_in(node: ir.Num | ir.Formula) -> frozenset[str]:
 
 
 def map_parts(node: N, rewrite: Callable[[ir.Num], ir.Num]) -> N:
-    """A number with its direct parts rewritten, or a state formula with the numbers of its predicates."""
+    """Apply `rewrite` to the operands of a number, or to the numbers in a state formula's predicates."""
     return map_children(node, numbers=rewrite, formulas=lambda part: map_parts(part, rewrite))
 
 
 def substitute(node: N, table: Mapping[str, ir.Num]) -> N:
-    """A number or a state formula with the columns of `table` replaced."""
+    """Replace the columns that `table` names by its numbers, in a number or a state formula."""
     return map_leaves(node, lambda leaf: table.get(leaf.name, leaf) if isinstance(leaf, ir.Signal) else leaf)
 
 
@@ -37,7 +37,7 @@ def multiply(left: ir.Num, right: ir.Num) -> ir.Num:
 
 
 class Assignments:
-    """Assignments that name intermediate results, so that none is duplicated.
+    """Growing list of assignments that name intermediate results, so that each is computed once.
 
     Attributes:
         lets: (name, number), in order.
@@ -47,7 +47,10 @@ class Assignments:
         self.lets: list[tuple[str, ir.Num]] = []
 
     def name(self, num: ir.Num, pattern: str) -> ir.Num:
-        """A column that holds `num`; `{}` in the pattern of its name is the number of the assignment."""
+        """Append an assignment of `num` to a new name, and return a reference to it.
+
+        `{}` in `pattern`, the form of the name, is replaced by the number of the assignment.
+        """
         if isinstance(num, ir.Const | ir.Signal):
             return num
         self.lets.append((pattern.format(len(self.lets)), num))

@@ -14,7 +14,7 @@ EPS = 1e-6
 
 
 def raw_width(controls: tuple[ControlDecl, ...]) -> int:
-    """Number of network outputs per step: two for an angle (a planar vector), one for other controls."""
+    """Number of network outputs per step: two (a planar vector) for an angle, one for any other control."""
     return sum(2 if control.squash == "angle" else 1 for control in controls)
 
 
@@ -34,7 +34,7 @@ def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
 
 
 def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
-    """Controls on the scale [-1, 1]."""
+    """Map network outputs to controls on the scale [-1, 1], one tensor per control."""
     columns = iter(raw.unbind(-1))
     out: list[Tensor] = []
     for control in controls:

@@ -1,14 +1,15 @@
 """Inner feedback: controls are planned as deviations from a stabilising linear law.
 
 An open-loop plan over a horizon cannot hold an unstable plant: for x' = 4 x + u a deviation of 1e-7 grows to
-1e-7 exp(4 T). With `policy: {feedback: …}` actuators get at every step
+1e-7 exp(4 T). With `policy: {feedback: …}` the actuators receive at every step
 
     clip(u0 + v + clip(K (x0 - x), -a, a), low, high)
 
 where `v` is planned, so that rollouts, searches and gradients see a stabilised plant. `a` is the authority of
-the feedback, by default half the range of the actuator; the range of `v` covers range and authority together,
-so that every control remains available in every state. The gain of `lqr` is that of the linear-quadratic
-regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a long horizon.
+the feedback, by default half the range of the actuator. The range of `v` is that of the actuator widened by
+`a` on both sides, so that every control remains available in every state. The gain of `lqr` is that of the
+linear-quadratic regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a long
+horizon.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ class NoFeedbackError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """The linearised step x+ - x0 = A (x - x0) + B (u - u0) + rest.
+    """The linearised step x+ - x0 = A (x - x0) + B (u - u0) + rest, for the n moving (time-varying) states.
 
     Attributes:
-        a: (n, n), of the moving states.
-        b: (n, m).
+        a: A, (n, n).
+        b: B, (n, m).
         rest: (n,), displacement by one step from (x0, u0).
-        scale: (n,), half the range of each moving state, 1 where it has none.
-        moving: their names.
+        scale: (n,), half the range of each moving state; 1 for a state without range.
+        moving: names of the moving states.
     """
 
     a: Doubles
@@ -69,12 +70,12 @@ class Linear:
 
     @property
     def growth(self) -> float:
-        """Growth factor of the fastest mode per step."""
+        """Growth factor per step of the fastest mode: the spectral radius of A."""
         return float(np.abs(np.linalg.eigvals(self.a)).max(initial=0.0))
 
 
 def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
-    """Add the requested inner feedback to a declaration.
+    """Return the declaration with the requested inner feedback; its controls become deviations.
 
     Raises NoFeedbackError: an unstable mode is uncontrollable, or a control is an `angle`.
     """
@@ -108,10 +109,10 @@ def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
 
 
 def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubles]:
-    """Operating point: state (n,) and control (m,), in the units of the columns.
+    """Return the operating point: state (n,) and control (m,), in the units of the columns.
 
-    States that are not given are 0, or the middle of a range that excludes 0; controls are those within their
-    ranges that hold the states best.
+    A state that `around` does not give is 0, or the middle of its range if that excludes 0. The other
+    controls are those within their ranges that keep the state as constant as possible.
     """
     state = np.array(
         [
@@ -135,13 +136,16 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask of the moving states to be held at the operating point: those that the dynamics depend on."""
+    """Mask of the moving states to keep constant at the operating point: the dynamics depend on them."""
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
 
 def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
-    """Linearise the exact step at a point (n,), (m,) by central differences, in the units of the columns."""
+    """Linearise the exact step at `state` (n,) and `control` (m,) by central differences.
+
+    All values are in the units of the columns.
+    """
     columns, names = decl.signature.columns, decl.signature.names
     moved = {assign.name for assign in decl.flow}
     moving = [
@@ -175,7 +179,7 @@ def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
 
 
 def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
-    """One exact step without feedback from states and controls: (k, n + m) -> (k, n)."""
+    """Step exactly, without feedback, from `points` of a state and a control each: (k, n + m) -> (k, n)."""
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
     env = dict(zip(names, points.T, strict=True))
@@ -193,8 +197,9 @@ def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
 def _lqr(decl: SystemDecl, weights: Mapping[str, float], state: Doubles, control: Doubles) -> Doubles:
     """Gain of the linear-quadratic regulator, (m, n), in the units of the columns.
 
-    Costs are squares of deviations divided by half the range, times `weights`; a state that nothing depends
-    on (a position in an open field) has no cost unless weighted, as plans may move it.
+    The cost is the weighted sum of squares of deviations, each divided by half its range. A state that the
+    dynamics do not depend on (a position in an open field) has no cost unless `weights` names it, so that
+    plans can move it freely.
     """
     linear = linearised(decl, state, control)
     held, names = _held(linear), decl.signature.names
@@ -218,10 +223,10 @@ def _lqr(decl: SystemDecl, weights: Mapping[str, float], state: Doubles, control
 
 
 def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
-    """Limit gain (m, n) of the Riccati recursion.
+    """Limit of the gain (m, n) in the Riccati recursion with costs `q` of states and `r` of controls.
 
-    Unlike the algebraic equation it works where an integrator is uncontrollable and no stabilising solution
-    exists.
+    Unlike the algebraic Riccati equation, the recursion also works if an integrator is uncontrollable, so
+    that no stabilising solution exists.
     """
     cost: Doubles = q.copy()
     gain: Doubles = np.zeros((b.shape[1], len(a)))
@@ -240,7 +245,7 @@ def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
 
 
 def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
-    """W602 where plans are open-loop controls of a plant that is too unstable over a horizon."""
+    """Return W602 if the plant is so unstable that errors grow too much over a horizon, else nothing."""
     growth = growth_of(decl)
     if not growth > GROWING:
         return ()
@@ -258,9 +263,9 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 
 
 def growth_of(decl: SystemDecl) -> float:
-    """Growth of the fastest mode over a horizon, linearised at rest; 1 where it cannot be computed.
+    """Growth factor of the fastest mode over a horizon, linearised at the operating point.
 
-    With an inner feedback, that of the closed loop.
+    With an inner feedback it is that of the closed loop. It is 1 if it cannot be computed.
     """
     feedback = decl.feedback
     try:

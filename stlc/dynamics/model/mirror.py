@@ -25,16 +25,17 @@ HARD = Hard()
 
 
 class Mirror:
-    """The symmetry that `policy: {mirror: …}` declares; it is its own inverse.
+    """The symmetry that `policy: {mirror: …}` declares: a map of states and controls that is its own inverse.
 
     Attributes:
-        side: index of the column that tells a state from its image; the larger value is the representative.
+        side: index of the column that tells a state from its mirror image. Of the two, the state with
+            the larger value is the representative: the one that the policy is evaluated in.
     """
 
     def __init__(
         self, images: Sequence[Assign], names: Sequence[str], controls: Sequence[ControlDecl]
     ) -> None:
-        """Compile the images of states and controls; the first one is that of a state."""
+        """Compile the images of states and controls; the first of `images` must be that of a state."""
         self._names = tuple(names)
         self._controls = tuple(controls)
         known = {control.name for control in controls}
@@ -55,14 +56,20 @@ class Mirror:
         return moved
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Representatives of states and their images, (B, n), and a mask (B,) of those that are images."""
+        """Map states (B, n) to their representatives (B, n).
+
+        Returns also a mask (B,) of the states that were replaced by their images.
+        """
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
         return torch.where(swapped[..., None], image, x), swapped
 
 
 def _applied(program: ArrayProgram, x: Tensor, names: Sequence[str]) -> Tensor:
-    """`x` with the columns that the program computes replaced: (…, k) -> (…, k)."""
+    """Replace the columns of `x` that the program computes: (…, k) -> (…, k).
+
+    `names` are the names of all k columns.
+    """
     columns = dict(zip(names, x.unbind(-1), strict=True))
     images = program(columns, TORCH, HARD) if program.columns else {}
     return torch.stack([images.get(name, column) for name, column in columns.items()], -1)

@@ -1,4 +1,4 @@
-"""Rollouts: columns of shape (time, batch), computed with few array operations."""
+"""Rollouts: time series of each state, (time, batch), computed with few array operations."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ Columns = dict[str, Tensor]
 
 @dataclass
 class _Columns:
-    """The columns of a rollout computed so far: states at all T+1 samples, and numbers at the T steps.
+    """Values of a rollout in progress of T steps.
 
-    `now` maps every name to its values at the T steps, shape (T, B), or (B,) if constant.
+    Attributes:
+        states: name of a state -> its T+1 samples, or its initial value (B,) before these are computed.
+        now: name of any value -> its values at the T steps, (T, B), or (B,) if constant.
     """
 
     states: Columns
@@ -34,7 +36,7 @@ class _Columns:
     switch: Switch
 
     def run(self, program: ArrayProgram) -> Columns:
-        """All outputs of a program, as tensors."""
+        """Evaluate a program at all T steps at once, and return its outputs as tensors."""
         like = next(iter(self.states.values()))
         outputs = program(self.now, TORCH, self.switch)
         return {
@@ -42,16 +44,16 @@ class _Columns:
         }
 
     def enter(self, name: str, column: Tensor) -> None:
-        """Add a state whose T+1 samples are all computed."""
+        """Add a state, given its T+1 samples (T+1, B)."""
         self.states[name] = column
         self.now[name] = column[:-1]
 
     def full(self, values: Tensor) -> Tensor:
-        """Values at every step, shape (T, B)."""
+        """Expand values, constant or not, to every step: (T, B)."""
         return values.expand(self.steps, self.batch)
 
     def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
-        """Values that are constant over the loop, and values that change from step to step."""
+        """Split values into constants and those that change over time, as one tensor per step."""
         fixed: dict[str, Tensor] = {}
         timed: list[tuple[str, Sequence[Tensor]]] = []
         for name in names:
@@ -64,7 +66,7 @@ class _Columns:
 
 
 class _Accumulated(torch.autograd.Function):
-    """Running sum: start (B,) and increments (T, B) -> (T+1, B). Faster than `cumsum`."""
+    """Running sum: start (B,) and increments (T, B) -> (T+1, B), with its gradient. Faster than `cumsum`."""
 
     @staticmethod
     def forward(ctx: Any, start: Tensor, increments: Tensor) -> Tensor:  # noqa: ARG004
@@ -86,7 +88,7 @@ class _Accumulated(torch.autograd.Function):
 
 
 def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
-    """The running sum of `_Accumulated`, as one operation while a program is exported."""
+    """Running sum as in `_Accumulated`; a single operation while a program is exported."""
     if torch.compiler.is_exporting():
         return torch.cat((start[None], increments)).cumsum(0)
     column: Tensor = _Accumulated.apply(start, increments)  # type: ignore[no-untyped-call]
@@ -94,7 +96,7 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """Stage of a rollout with compiled programs."""
+    """A stage of a rollout (`RolloutStage`) with compiled programs."""
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
@@ -117,7 +119,7 @@ class _StageRunner:
             self._loop(columns)
 
     def _loop(self, columns: _Columns) -> None:
-        """Step the components that depend on their own past, one sample at a time."""
+        """Step the states that depend on their own past, one time step after another."""
         stage = self.stage
         env, timed = columns.sliced(self.outside)
         kept = (*stage.stepped.values(), *stage.lets)
@@ -139,7 +141,7 @@ class _StageRunner:
 
 
 class Stepper:
-    """A compiled step: run once on (B,) columns, or over time on (T, B) controls."""
+    """A compiled step of a system: run once on a batch of states, or repeatedly over time."""
 
     def __init__(self, step: ModelStep) -> None:
         self.next = dict(step.next)
@@ -148,7 +150,7 @@ class Stepper:
         self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
-        """Columns one step later; those that do not move are the same tensors."""
+        """Return the columns (B,) one step later; a state that does not move keeps its tensor."""
         env = {**state, **controls}
         for block in self.once:
             env.update(block(env, TORCH, switch))
@@ -159,7 +161,10 @@ class Stepper:
         return {**state, **{name: value.expand_as(like) for name, value in moved.items()}}
 
     def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
-        """Roll out (B,) columns and (T, B) controls: (T+1, B) columns; constant ones are expanded views."""
+        """Roll out from states (B,) under controls (T, B); return (T+1, B) by name.
+
+        States that do not move are expanded views.
+        """
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}
         columns = _Columns(dict(start), {**steady, **controls}, steps, batch, switch)

@@ -1,8 +1,9 @@
-"""Evaluation order of a step's components over a rollout.
+"""Order in which the numbers and states of a step are computed in a rollout.
 
-Not all components need a loop over time. They are ordered by dependencies: one that depends only on earlier
-ones is computed for all steps at once, one that adds a known increment is a cumulative sum, and only
-components with feedback are stepped, after the loop invariants have been computed.
+Not all states need a loop over time. They are ordered by dependencies: a state that depends only on earlier
+ones is computed for all steps at once, a state to which a known increment is added is a cumulative sum, and
+only states that depend on themselves in another way are stepped in a loop. What is constant in that loop, or
+known for all steps, is computed before it.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 @dataclass(frozen=True, slots=True)
 class RolloutStage:
-    """Components that can be computed together once their inputs are available.
+    """States and numbers that can be computed together once the earlier stages are.
 
     Attributes:
         early: numbers computed for all steps at once, before the rest of the stage.
-        follows: state -> name of its next value, an early number of this stage or of one before.
-        sums: state -> name of the early number that is its increment.
-        blocks: computed in every step, in order.
-        stepped: state -> name of its next value in `blocks`.
-        lets: names in `blocks` that later stages read.
+        follows: state -> name of the number in `early`, of this or an earlier stage, that is its next value.
+        sums: state -> name of the number in `early` that is its increment per step.
+        blocks: numbers computed in a loop over the steps; each block reads only earlier ones.
+        stepped: state -> name of the number in `blocks` that is its next value.
+        lets: names of numbers in `blocks` that later stages read.
     """
 
     early: Lets
@@ -41,7 +42,7 @@ class RolloutStage:
 
 
 def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
-    """Stages of a step, ordered so that each reads only states and numbers of earlier ones."""
+    """Split a step into stages; each reads only states and numbers of itself and earlier stages."""
     numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
@@ -63,7 +64,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 
 
 class _StageWriter:
-    """Builder of the stage that computes one dependency level."""
+    """Builder of one stage, which holds all groups of the same depth in the dependency graph."""
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
         self.numbers = numbers
@@ -77,7 +78,7 @@ class _StageWriter:
         self.lets: list[str] = []
 
     def add(self, group: Sequence[str]) -> None:
-        """Add one strongly connected group of names."""
+        """Add one group of names that depend on each other (a strongly connected component)."""
         name = group[0]
         if len(group) == 1 and name not in self.reads[name]:
             if name in self.numbers:
@@ -103,14 +104,14 @@ class _StageWriter:
         self.lets += [name for name in body if name in read_outside]
 
     def stage(self) -> RolloutStage:
-        """The gathered groups as a stage."""
+        """Return the stage that holds all groups added."""
         return RolloutStage(
             self.early, self.follows, self.sums, blocks(self.body), self.stepped, tuple(self.lets)
         )
 
 
 def blocks(numbers: Lets) -> tuple[Lets, ...]:
-    """Numbers in blocks, each of which reads only earlier blocks."""
+    """Split numbers into blocks, each of which reads only earlier blocks."""
     level: dict[str, int] = {}
     for name, num in numbers.items():
         level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
@@ -119,7 +120,7 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """Increment of a state that is a running sum; None for other states."""
+    """Return the increment of a state if its next value is the state plus that increment, else None."""
     if len(states) != 1 or len(body) != 1:
         return None
     (state,) = states
@@ -170,12 +171,12 @@ def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
 
 @dataclass
 class Hoist:
-    """Hoisting of loop invariants out of numbers.
+    """Rewriter that moves loop-invariant parts of numbers out of a loop.
 
     Attributes:
         moving: names that change within the loop.
-        early: name -> invariant number; extended as numbers are split.
-        prefix: of the generated names.
+        early: name -> loop-invariant number, to be computed before the loop; grows with each call of `split`.
+        prefix: prefix of the generated names.
     """
 
     moving: frozenset[str]
@@ -183,7 +184,7 @@ class Hoist:
     early: dict[str, ir.Num] = field(default_factory=dict)
 
     def split(self, num: ir.Num) -> ir.Num:
-        """`num` with its largest loop-invariant parts replaced by columns of `early`."""
+        """Replace the largest loop-invariant parts of `num` by names, and add these parts to `early`."""
         if not names_in(num) & self.moving:
             return self._steady(num)
         match num:
@@ -197,7 +198,7 @@ class Hoist:
                 return map_parts(num, self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
-        """Name for a loop invariant; constants and columns are unchanged."""
+        """Return a name in `early` for a loop-invariant number; constants and columns as they are."""
         if isinstance(num, ir.Const | ir.Signal):
             return num
         for name, known in self.early.items():
@@ -208,7 +209,7 @@ class Hoist:
         return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """Choice with invariant condition: the condition becomes a mask."""
+        """Rewrite a choice whose condition is loop-invariant: the condition becomes a mask in `early`."""
         if yes == ir.Const(0.0):
             keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))
@@ -216,7 +217,7 @@ class Hoist:
         return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
-        """Sum with its invariant terms combined."""
+        """Rewrite a sum: its loop-invariant terms are combined into one number in `early`."""
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
         steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
@@ -225,7 +226,7 @@ class Hoist:
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
     def _product(self, num: ir.Num) -> ir.Num:
-        """Product with its invariant factors combined."""
+        """Rewrite a product: its loop-invariant factors are combined into one number in `early`."""
         factors = _factors(num)
         moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
         steady = [factor for factor in factors if not names_in(factor) & self.moving]
@@ -234,7 +235,7 @@ class Hoist:
 
 
 def _terms(num: ir.Num, sign: int = 1) -> list[tuple[int, ir.Num]]:
-    """The signed terms of a sum."""
+    """Return (sign, term) of the terms of a sum, nested sums expanded."""
     match num:
         case ir.Op("add", (left, right)):
             return [*_terms(left, sign), *_terms(right, sign)]
@@ -247,7 +248,7 @@ def _terms(num: ir.Num, sign: int = 1) -> list[tuple[int, ir.Num]]:
 
 
 def _factors(num: ir.Num) -> list[ir.Num]:
-    """The factors of a product."""
+    """Return the factors of a product, nested products expanded."""
     match num:
         case ir.Op("mul", (left, right)):
             return [*_factors(left), *_factors(right)]
@@ -256,7 +257,7 @@ def _factors(num: ir.Num) -> list[ir.Num]:
 
 
 def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
-    """Sum of signed terms, positive ones first."""
+    """Return the sum of (sign, term) pairs, with the positive terms first."""
     (sign, total), *rest = sorted(terms, key=lambda pair: pair[0] < 0)
     total = total if sign > 0 else ir.Op("neg", (total,))
     for sign, term in rest:
@@ -265,7 +266,7 @@ def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
 
 
 def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
-    """Invariant terms as one number, constants folded."""
+    """Add loop-invariant terms to one number; constants among them are added up."""
     constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
     variable = [(sign, term) for sign, term in terms if not isinstance(term, ir.Const)]
     if not variable:

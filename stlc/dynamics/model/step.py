@@ -15,11 +15,11 @@ from stlc.dynamics.model.integrators._tableau import State
 
 @dataclass(frozen=True, slots=True)
 class ModelStep:
-    """Straight-line code: each assignment reads states, controls and earlier assignments.
+    """One step as a list of assignments; each reads states, controls and earlier assignments.
 
     Attributes:
         lets: (name, number), in order.
-        next: name of a moving state -> its value one step later.
+        next: name of a state that moves -> its value one step later.
     """
 
     lets: tuple[tuple[str, ir.Num], ...]
@@ -29,9 +29,9 @@ class ModelStep:
 def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.
 
-    `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice. Guards and resets
-    read the state at the start of the step, clamps act after each substep, and of two jumps on one component
-    the later one wins.
+    With `soft` a jump is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow` of its guard g;
+    otherwise it is an exact choice. Guards and resets read the state at the start of the step, limits
+    (`clamp`) are applied after each substep, and if two jumps set the same state the later one wins.
     """
     writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
@@ -48,9 +48,9 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
 
 
 def commands(decl: SystemDecl) -> dict[str, ir.Num]:
-    """Actuator commands from the state and the plan: name of a control -> number.
+    """Actuator commands computed from the state and the plan: name of a control -> number.
 
-    {} without inner feedback. Computed once per step, as in a sampled-data controller.
+    Empty without inner feedback. Commands are computed once per step, as in a sampled-data controller.
     """
     feedback = decl.feedback
     if feedback is None:
@@ -69,7 +69,7 @@ def commands(decl: SystemDecl) -> dict[str, ir.Num]:
 
 
 def _given(jump: JumpDecl, given: State) -> JumpDecl:
-    """The jump with controls replaced by actuator commands."""
+    """Return the jump with its controls replaced by the actuator commands `given`."""
     if not given:
         return jump
     resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
@@ -77,7 +77,7 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
 
 
 def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
-    """All substeps of the continuous part; `given` are the actuator commands."""
+    """Integrate the flow over all substeps of a step; `given` are the actuator commands."""
 
     def named(at: State) -> State:
         return {name: writer.name(num, name + "#{}") for name, num in at.items()}
@@ -97,7 +97,7 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 
 
 def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
-    """The state with the resets of one jump blended in."""
+    """Return the state after one jump; `state` is that after the flow and the jumps before."""
     changed = dict(state)
     for assign in jump.resets:
         flowed = changed[assign.name]
@@ -109,14 +109,14 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
 
 
 def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
-    """`I yes + (1 - I) no` with the paper's I_w (Eq. 6); equal to a choice wherever I is exactly 0 or 1."""
+    """Return `I yes + (1 - I) no` with the smooth indicator I_w of Eq. 6; a choice where I is 0 or 1."""
     weight = ir.Indicator(cond, sharpness)
     kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
     return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
-    """Component clamped to its range, where one is declared."""
+    """Limit the value `num` of a state to the range of its `clamp`, if it has one."""
     if name not in decl.clamps:
         return num
     low, high = decl.clamps[name]

@@ -44,12 +44,13 @@ class System:
     number of steps, `n` the number of states, `m` the number of controls.
 
     Attributes:
-        decl: the declaration.
-        timers: states that a specification adds, the last columns.
-        parameters: constants of a trajectory that a specification adds, the columns before the timers.
-        added: the columns of both.
-        signature: the state columns, in order.
-        initial: the distribution of initial states, without what a specification adds.
+        decl: declaration from the system file.
+        timers: clocks and the like that a specification adds to the state; they are its last columns.
+        parameters: random constants of a trajectory that a specification adds; their columns precede the
+            timers.
+        added: columns of `parameters` and `timers`.
+        signature: all state columns, in order.
+        initial: distribution of the initial states that the system file declares, without `added`.
     """
 
     def __init__(
@@ -67,29 +68,35 @@ class System:
     def load(
         cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
     ) -> System:
-        """Load a system file, by path or by name (`stlc.files.find_system`), with a scenario applied.
+        """Load a system file, by path or by name (`stlc.files.find_system`), and apply a scenario.
 
-        Raises UsageError where it does not exist, SystemFileError where it is invalid.
+        Raises UsageError if it does not exist, SystemFileError if it is invalid.
         """
         decl = load_system_decl(find_system(str(path)), overrides or {})
         return cls(decl if scenario is None else under(decl, scenario))
 
     @cached_property
     def truth(self) -> System:
-        """True system where the scenario has a model mismatch; without parameters."""
+        """The true system, which differs from this model if the scenario has a model mismatch.
+
+        It has no parameters or timers of a specification in that case.
+        """
         real = truth(self.decl)
         return self if real is self.decl else System(real)
 
     def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
-        """The same system with parameters, and with timers as its last columns.
+        """Return the same system with the parameters and timers of a specification as its last state columns.
 
-        Parameters are drawn per trajectory and constant. Timers follow from the previous states, without
-        gradient. Initial states are mission starts.
+        Parameters are drawn once per trajectory. Timers are updated from the previous states, without
+        gradient. At initial states the mission starts, so timers have their initial values.
         """
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
     def interface(self) -> Interface:
-        """The interface that specifications are compiled against. Raises SystemFileError (S208)."""
+        """The interface that specifications are compiled against, with external functions loaded.
+
+        Raises SystemFileError (S208) if a function cannot be loaded.
+        """
         return replace(self.decl.interface(), functions=load_functions(self.decl))
 
     # ---------------------------------------------------------------- description
@@ -126,7 +133,7 @@ class System:
 
     @property
     def actuators(self) -> tuple[tuple[float, float], ...]:
-        """Ranges of the actuators; with inner feedback the ranges of plans are wider."""
+        """(low, high) of each actuator; with inner feedback the ranges of planned controls are wider."""
         if self.decl.feedback is None:
             return tuple((control.low, control.high) for control in self.decl.controls)
         return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
@@ -139,13 +146,16 @@ class System:
     # -------------------------------------------------------------------- motion
 
     def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """One step: (B, n), (B, m) -> (B, n)."""
+        """Make one step from states (B, n) under planned controls (B, m); return the next states (B, n)."""
         before = self._named(x)
         moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
         return torch.stack([moved[name] for name in self.names], 1)
 
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """Append drawn parameters, and timers at mission start, to states: (B, n - added) -> (B, n)."""
+        """Append the columns that a specification adds: (B, n - added) -> (B, n).
+
+        Its parameters are drawn; its timers get their values at the start of the mission.
+        """
         if not self.added:
             return states
         table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
@@ -161,20 +171,29 @@ class System:
         return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
 
     def added_later(self, x: Tensor) -> Tensor:
-        """Parameters and timers one step later, independent of the control: (B, n) -> (B, added)."""
+        """Return the parameters and timers of the specification one step later: (B, n) -> (B, added).
+
+        They do not depend on the control.
+        """
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
 
     def commanded(self, x: Tensor, u: Tensor) -> Tensor:
-        """Actuator commands in states (B, n) for plans `u` (B, m); `u` itself without inner feedback."""
+        """Actuator commands (B, m) in states (B, n) for planned controls `u` (B, m).
+
+        These are `u` itself without inner feedback.
+        """
         if self._commands is None:
             return u
         found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
         return torch.stack([found[name] for name in self.control_names], 1)
 
     def planned(self, x: Tensor, command: Tensor) -> Tensor:
-        """Plans in states (B, n) for which actuators get `command` (B, m), where possible."""
+        """Planned controls (B, m) for which the actuators receive `command` (B, m) in states (B, n).
+
+        This inverts `commanded` where the actuators' ranges allow it.
+        """
         if self._commands is None:
             return command
         feedback = self.decl.feedback
@@ -190,12 +209,12 @@ class System:
         return ArrayProgram(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """Roll out: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
+        """Roll out from states (B, n) under plans (B, T, m); return (B, T+1, n), initial state first."""
         columns = self.rollout_columns(x0, u, switch)
         return torch.stack([columns[name].t() for name in self.names], 2)
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
-        """Rollout as (T+1, B) columns by name; constant columns are expanded views."""
+        """Roll out as `rollout` does; return (T+1, B) by state name; constant states are expanded views."""
         if (
             x0.shape[1:] != (len(self.names),)
             or u.shape[2:] != (len(self.decl.controls),)
@@ -217,7 +236,7 @@ class System:
         return {timer.name: after[timer.name] for timer in self.timers}
 
     def _timers_over_time(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """Timers over time, from the timers at the start and the states over time."""
+        """Roll out the timers from `start` (B,), given the other states over time, (T+1, B)."""
         if not self.timers:
             return {}
         with torch.no_grad():
@@ -228,12 +247,12 @@ class System:
 
     @cached_property
     def _timer_step(self) -> Stepper:
-        """Compiled dynamics of the timers."""
+        """Compiled update of the timers."""
         return Stepper(ModelStep((), {timer.name: timer.update for timer in self.timers}))
 
     @cached_property
     def exact_step(self) -> ModelStep:
-        """One exact step in the IR, timers included, for code generators."""
+        """One step in the IR with exact choices for jumps and with timers, for code generators."""
         step = build_step(self.decl, soft=False)
         return ModelStep(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
 
@@ -260,11 +279,12 @@ class System:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Draw initial states, (n, dim), with parameters, and timers at mission start.
+        """Draw n initial states, (n, dim), including the parameters and timers that a specification adds.
 
-        The same seed gives the same states, whatever the dtype.
+        Timers have their values at the start of the mission. The same seed gives the same states, whatever
+        the dtype.
 
-        Raises SystemFileError (S301) where `where` rejects (nearly) everything.
+        Raises SystemFileError (S301) if `where` rejects (nearly) every state.
         """
         if generator is None:
             generator = torch.Generator()
@@ -278,7 +298,7 @@ class System:
     # -------------------------------------------------------------- policy, objective
 
     def observe(self, x: Tensor) -> Tensor:
-        """Inputs of the policy, parameters and timers last: (…, n) -> (…, k)."""
+        """Inputs of the policy: (…, n) -> (…, k); added parameters and timers come last."""
         if self._observation is None:
             return x
         seen = self._observation(self._named(x), TORCH, HARD)
@@ -286,21 +306,21 @@ class System:
 
     @cached_property
     def observed(self) -> tuple[ir.Num, ...]:
-        """Inputs of the policy as numbers over the states, parameters and timers last."""
+        """Inputs of the policy as numbers over the states; those of added parameters and timers come last."""
         states = (ir.Signal(name) for name in self.decl.signature.names)
         added = (ir.Signal(column.name) for column in self.added)
         return (*(self.decl.policy.observe or states), *added)
 
     @cached_property
     def _observation(self) -> ArrayProgram | None:
-        """The inputs of the policy as a program; None where they are the states."""
+        """Compiled inputs of the policy; None if they are the states themselves."""
         seen = {str(i): num for i, num in enumerate(self.observed)}
         return ArrayProgram(seen) if self.decl.policy.observe else None
 
     def reward(self, after: Tensor, u: Tensor) -> Tensor:
-        """The declared reward of a step into states (B, n) under actuator commands (B, m): (B,).
+        """The declared reward of a step into states `after` (B, n) under actuator commands `u` (B, m): (B,).
 
-        Raises UsageError (U101) where the file declares none.
+        Raises UsageError (U101) if the file declares no reward.
         """
         found: Tensor = self._reward({**self._named(after), **self._inputs(u)}, TORCH, HARD)["reward"]
         return found.expand(len(after))
@@ -310,7 +330,10 @@ class System:
         return ArrayProgram({"reward": self.require_reward()})
 
     def require_reward(self) -> ir.Num:
-        """The declared reward of a step. Raises UsageError (U101) where the file declares none."""
+        """The declared reward of a step as a number in the IR.
+
+        Raises UsageError (U101) if the file declares no reward.
+        """
         if self.decl.train.reward is not None:
             return self.decl.train.reward
         message = f"the system `{self.decl.name}` declares no reward of a step"
@@ -319,7 +342,7 @@ class System:
 
     @cached_property
     def mirror(self) -> Mirror | None:
-        """The declared symmetry; None without one."""
+        """The declared mirror symmetry, or None."""
         images = self.decl.policy.mirror
         return Mirror(images, self.names, self.decl.controls) if images else None
 
@@ -361,7 +384,7 @@ class System:
         rho: Tensor,
         switch: Switch,
     ) -> Tensor:
-        """Mean over time of the output `cost` of a program, (B,)."""
+        """Mean over time of the output `cost` of a program, (B,); 0 without a program."""
         if program is None:
             return torch.zeros_like(sat)
         like = next(iter(columns.values()))
@@ -373,13 +396,13 @@ class System:
 
     @cached_property
     def _named_first(self) -> tuple[str, ...]:
-        """States whose value at the start of the plan a term reads."""
+        """Names of the states whose value at the start of the plan (`x_start`) a performance term reads."""
         read = {name for term in self.decl.objective.terms for name in names_in(term.value)}
         return tuple(name for name in self.names if name + START in read)
 
     @cached_property
     def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
-        """Terms of the objective as programs."""
+        """The numbers of `objective`, compiled."""
         states, controlled = (
             None if total is None else ArrayProgram({"cost": total}) for total in self.objective
         )
@@ -387,7 +410,7 @@ class System:
 
     @cached_property
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
-        """Weighted sums of the performance terms on states, and of those that read a control."""
+        """Weighted sums of the performance terms without controls, and of those with; None if empty."""
         sums: list[ir.Num | None] = [None, None]
         given = commands(self.decl)
         for term in self.decl.objective.terms:
@@ -401,7 +424,7 @@ class System:
     # -------------------------------------------------------------------- health
 
     def require_finite(self, x: Tensor) -> None:
-        """Raise SystemFileError (S302) where states (…, n) hold NaN or infinity."""
+        """Raise SystemFileError (S302) if states (…, n) hold NaN or infinity."""
         bad = ~torch.isfinite(x.detach())
         if not bool(bad.any()):
             return
@@ -419,9 +442,9 @@ class System:
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
-        """Test the system on initial states and random plans of at most `PROBED` steps; return warnings.
+        """Simulate n initial states under random plans of at most `PROBED` steps; return warnings.
 
-        Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
+        Raises SystemFileError if states cannot be drawn (S301) or become NaN or infinite (S302).
         """
         x0 = self.sample(n, seed=seed, dtype=torch.float64)
         self.require_finite(x0)

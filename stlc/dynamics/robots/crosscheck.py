@@ -1,7 +1,7 @@
-"""Check of the compiled forward kinematics against pytorch-kinematics.
+"""Comparison of the compiled forward kinematics with the package pytorch-kinematics.
 
 `stlc.dynamics.robots.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
-multiplies batches of transforms. Where that package is installed, `stlc system check` compares the two.
+multiplies batches of transforms. If that package is installed, `stlc system check` compares the two.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _NEAR = 1e-5
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Result of comparing one function.
+    """Result of comparing the kinematics of one external function.
 
     Attributes:
-        name: of the function.
-        distance: the largest difference, m; None where not compared.
+        name: name of the function.
+        distance: largest distance between the two positions, in metres; None if not compared.
         why: reason for not comparing.
     """
 
@@ -47,11 +47,11 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
     """Compare forward kinematics with pytorch-kinematics at random joint positions.
 
     Args:
-        function: of the kind `urdf`.
-        seed: of the positions, uniform in [-pi, pi] rad or m.
+        function: an external function of the kind `urdf`.
+        seed: seed of the joint positions, which are uniform in [-pi, pi] rad or m.
 
     Raises:
-        SystemFileError: S208, the two do not agree.
+        SystemFileError: S208, the two positions differ.
     """
     assert function.body is not None
     if find_spec("pytorch_kinematics") is None:
@@ -89,7 +89,7 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 
 
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
-    """Values of the function, (n, joints) -> (n, 3) m."""
+    """Positions in metres, computed by evaluating the IR expressions: (n, joints) -> (n, 3)."""
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
     program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)

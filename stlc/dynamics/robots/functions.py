@@ -1,4 +1,4 @@
-"""External functions, loaded on demand, on arrays of NumPy or torch."""
+"""External functions, loaded on demand, which work on arrays of NumPy or torch."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """Files that a system file refers to, by path below its folder, else by file name.
+    """Return the other files that a system file refers to.
 
-    These are the extended files, those of functions, and those of initial states.
+    These are the files that it extends, those of its functions, and those of initial states. The key is the
+    path below the folder of the system file, or else the file name.
     """
     home = decl.path.parent.resolve()
     named = [Path(base.name) for base in decl.bases]
@@ -93,14 +94,14 @@ class PythonFunction:
     call: Callable[..., Array]
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Bound:
-        """The function on components; see `stlc.compile.frontend.interface.InterfaceFunction`."""
+        """Return the function with the sizes that a specification declares; see `InterfaceFunction`."""
         return Bound(self.decl, self.call, arguments, result)
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Function with the sizes that a specification declares."""
+    """External function with the sizes of arguments and result that a specification declares."""
 
     decl: FunctionDecl
     call: Callable[..., Array]
@@ -108,7 +109,10 @@ class Bound:
     result: int | None
 
     def __call__(self, *components: Array) -> Sequence[Array]:
-        """Call the function; return all components. Raises SystemFileError (S208) where it fails."""
+        """Call the function on the components of its arguments; return the components of its result.
+
+        Raises SystemFileError (S208) if the call fails or the result has another shape.
+        """
         given = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
         wanted = given if self.decl.library is None else self.decl.library == "torch"
         torch: Any = importlib.import_module("torch") if given or wanted else None
@@ -130,7 +134,7 @@ class Bound:
         return [found] if self.result is None else [found[..., i] for i in range(self.result)]
 
     def _checked(self, values: Sequence[Array], batch: tuple[int, ...]) -> Array:
-        """The result, checked for the declared shape."""
+        """Return the result as one array of the declared shape, or raise SystemFileError (S208)."""
         try:
             found = self.call(*values)
             shape = tuple(found.shape)

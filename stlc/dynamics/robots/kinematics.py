@@ -38,12 +38,12 @@ class Joint:
     """A joint, in the frame of its parent link.
 
     Attributes:
-        name: as written.
-        kind: type of the joint.
+        name: name in the robot description.
+        kind: type of the joint, such as `revolute`.
         parent: link that it is attached to.
         child: link that it moves.
-        offset: origin of the child, (3,) m.
-        rotation: of the child at rest, (3, 3).
+        offset: origin of the child's frame, (3,), in metres.
+        rotation: rotation matrix of the child's frame at joint position 0, (3, 3).
         axis: unit vector in the frame of the child, (3,).
     """
 
@@ -81,14 +81,17 @@ def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
 
 
 def read_urdf(path: Path) -> str:
-    """The text of a file. Raises OSError, or ValueError where it is too large or not UTF-8."""
+    """Return the text of a URDF file. Raises OSError, or ValueError if it is too large or not UTF-8."""
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"it is larger than {MAX_BYTES // 1_000_000} MB")
     return path.read_text(encoding="utf-8")
 
 
 def robot_of(text: str) -> ElementTree.Element:
-    """Root element of a description. Raises ValueError where it is not URDF, or not plain XML."""
+    """Return the root element of a robot description.
+
+    Raises ValueError if the text is not URDF, or uses XML features (such as entities) that are refused.
+    """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a robot description has no document type and no entities")
     try:
@@ -162,7 +165,10 @@ NAME = "v{}"
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
-    """Position of the tip in the frame of the base, (3,) m, from the positions of the moving joints."""
+    """IR expressions for the tip's position in the frame of the base, (3,) in metres.
+
+    The arguments are the positions of the moving joints.
+    """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
     writer = Assignments()
@@ -177,7 +183,7 @@ def position(joints: Sequence[Joint]) -> ir.Body:
 
 
 def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> Point:
-    """A point rotated about an axis (Rodrigues)."""
+    """Rotate a point about an axis by `angle` (Rodrigues' formula)."""
     along = _linear(np.outer(axis, axis), point)
     across = tuple(writer.name(num, NAME) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
     if all(num == ir.Const(0.0) for num in across):
@@ -192,7 +198,7 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> 
 
 
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) -> Point:
-    """A point translated along an axis."""
+    """Translate a point along an axis by `length`."""
     return tuple(
         writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
         for part, share in zip(point, axis, strict=True)

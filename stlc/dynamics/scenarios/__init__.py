@@ -1,1 +1,1 @@
-"""Scenarios, and systems that deviate from their model."""
+"""Scenarios, and true systems that deviate from their model."""

@@ -1,9 +1,9 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
-Unless `test: {uncertain: […]}` names them, uncertain numbers are the constants and literals that `flow` and
-the resets of jumps compute with. Conditions read positions and instants (where a station is, when a light
-changes), which are not properties of the plant; exponents, indices and function arguments are mathematics. So
-these numbers, and constants that a condition also reads, are exact.
+`test: {uncertain: […]}` lists the uncertain constants. Without it, all constants and literals that `flow` and
+the resets of jumps compute with are uncertain, with two exceptions. Conditions read positions and instants
+(where a station is, when a light changes), which are not properties of the plant, so constants that a
+condition reads are exact. Exponents, indices and arguments of functions are mathematics, and exact as well.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Uncertain:
-    """An uncertain number.
+    """An uncertain number of the dynamics.
 
     Attributes:
-        factor: the column that multiplies it; 1 for the model's value.
-        text: as written: `vy`, `0.01 m/rad`.
-        states: those whose equations or resets read it.
+        factor: name of the column that multiplies it; the value 1 gives the model.
+        text: source text of the number, such as `vy` or `0.01 m/rad`.
+        states: names of the states whose equations or resets read it.
     """
 
     factor: str
@@ -53,14 +53,14 @@ class Uncertain:
 
 @dataclass(frozen=True, slots=True)
 class Perturbable:
-    """Declaration whose `flow` and `jumps` read a factor for each of its uncertain numbers."""
+    """Declaration in which every uncertain number of `flow` and `jumps` is multiplied by a factor."""
 
     decl: SystemDecl
     numbers: tuple[Uncertain, ...]
 
 
 def perturbable(decl: SystemDecl) -> Perturbable:
-    """Dynamics of a declaration with a factor at every uncertain number."""
+    """Return the declaration with each uncertain number of its dynamics multiplied by a factor."""
     parts = moving_parts(decl)
     names = parts.cx.names
     used, listed = _UsedNumbers(names), decl.test.uncertain
@@ -88,7 +88,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """The declaration with replaced equations of real states and replaced guards."""
+    """Return the declaration with new equations of its real states, and with new jumps."""
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
 
     def replaced(assigns: tuple[Assign, ...], others: tuple[Assign, ...]) -> tuple[Assign, ...]:
@@ -104,7 +104,7 @@ def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl
 
 
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
-    """States whose equations or jumps read a factor."""
+    """Return the names of the states whose equations or jumps read the column `factor`."""
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
         guarded = factor in names_in(jump.guard)
@@ -126,7 +126,11 @@ def _place(node: ast.Quantity) -> str:
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:
-    """Number times a factor; a point of a scale has no relative error and is unchanged."""
+    """Multiply a number by a factor.
+
+    A number whose unit has an arbitrary zero (such as degC) is returned unchanged, as a relative error of it
+    has no meaning.
+    """
     if number.unit.offset:
         return number
     return replace(number, num=multiply(number.num, factor), exact=None)
@@ -147,7 +151,7 @@ _COMPUTED: Mapping[type[ast.Node], tuple[str, ...]] = {
 
 
 def _computed(node: ast.Node) -> tuple[str, ...]:
-    """Fields whose numbers an expression computes with."""
+    """Names of an expression's fields that hold operands of arithmetic, not exponents or indices."""
     match node:
         case ast.Binary(op="%" | "^"):
             return ("left",)
@@ -158,7 +162,7 @@ def _computed(node: ast.Node) -> tuple[str, ...]:
 
 
 class _UsedNumbers:
-    """Numbers that expressions compute with, and constants that conditions read."""
+    """Collector of the numbers that expressions compute with, and of the constants that conditions read."""
 
     def __init__(self, names: Names) -> None:
         self.names = names
@@ -204,7 +208,7 @@ class _UsedNumbers:
         return replace(node, **changed)
 
     def _compare(self, part: ast.Node) -> None:
-        """Record the constants that a condition, an exponent or an index reads."""
+        """Record the constants in a condition, an exponent or an index, which are exact."""
         for node in descendants(part):
             if isinstance(node, ast.Name):
                 found = self.names.entries.get(node.name)
@@ -217,11 +221,11 @@ class _UsedNumbers:
 
 
 class PerturbedSystem(System):
-    """True dynamics of several agents, each with factors of its own; all are stepped in one batch.
+    """True dynamics of several agents, each with its own factors; all agents are stepped in one batch.
 
     Args:
-        factored: the dynamics, with a factor at every uncertain number.
-        factors: (agents, numbers), 1 where a number is exact.
+        factored: dynamics in which every uncertain number is multiplied by a factor.
+        factors: (agents, numbers); 1 for a number without error.
     """
 
     def __init__(self, factored: Perturbable, factors: Tensor) -> None:
@@ -229,5 +233,5 @@ class PerturbedSystem(System):
         self._factors = {each.factor: factors[:, index] for index, each in enumerate(factored.numbers)}
 
     def _inputs(self, u: Tensor) -> Columns:
-        """Controls, and the factors of uncertain numbers."""
+        """Return the controls and the factors of the uncertain numbers as columns by name."""
         return {**super()._inputs(u), **{name: factor.to(u) for name, factor in self._factors.items()}}

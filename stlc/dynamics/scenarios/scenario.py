@@ -1,6 +1,6 @@
-"""Scenarios: overlays of a system for deployment.
+"""Scenarios: named changes of a system for deployment.
 
-Every system has `mismatch`, `disturb` and `noise`, optionally with a percentage after a hyphen.
+Every system has the scenarios `mismatch`, `disturb` and `noise`, optionally with a percentage after a hyphen.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ERRORS = {
 
 
 def standard(name: str) -> ScenarioDecl | None:
-    """A standard scenario such as `mismatch-20`; None for other names."""
+    """Return a standard scenario such as `mismatch-20`; None for any other name."""
     found = _STANDARD.fullmatch(name)
     if found is None:
         return None
@@ -44,7 +44,10 @@ def standard(name: str) -> ScenarioDecl | None:
 
 
 def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
-    """Scenario of that name, from the file or a standard one. Raises UsageError (U101)."""
+    """Return the scenario of that name, from the file or a standard one.
+
+    Raises UsageError (U101) if there is none.
+    """
     for scenario in decl.scenarios:
         if scenario.name == name:
             return scenario
@@ -59,21 +62,23 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """Constants that a scenario changes, for specification and model alike."""
+    """Return the constants that a scenario changes, in specification and model alike, as text by name."""
     return find_scenario(load_system_decl(path, overrides), name).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:
-    """Apply a scenario to a system; of its model only the scenario's constants change.
+    """Apply a scenario to a system.
 
-    Raises UsageError (U101) where the scenario does not exist.
+    Of the model that plans are made with, only the scenario's constants (`const`) change.
+
+    Raises UsageError (U101) if the scenario does not exist.
     """
     scenario = find_scenario(decl, name)
     return _laid_over(_with_constants(decl, scenario.constants) if scenario.constants else decl, name)
 
 
 def truth(decl: SystemDecl) -> SystemDecl:
-    """The true system where the scenario has a model mismatch."""
+    """Return the true system: the declaration with the model mismatch of its scenario, or else unchanged."""
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:
         return decl

@@ -1,4 +1,4 @@
-"""Integrators, one per module, each with a `TABLEAU`."""
+"""Integrators, one per module; each module defines its Butcher tableau as `TABLEAU`."""
 
 from stlc.dynamics.model.integrators._tableau import Tableau
 from stlc.registry import PackageRegistry

@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta methods as tableaux, applied to numbers of the IR.
+"""Explicit Runge-Kutta methods as Butcher tableaux, applied to numbers of the IR.
 
 The result of a step is an expression, so one tableau serves rollouts in torch, NumPy programs and generated
 C.
@@ -21,12 +21,12 @@ Rate: TypeAlias = Callable[[State], State]
 class Tableau:
     """Butcher tableau of an explicit Runge-Kutta method.
 
-    Weights are integers over a common divisor, so that equal ones share a product.
+    Weights are integers over a common divisor, so that terms with equal weights share one product.
 
     Attributes:
         stages: row i holds the coefficients of the earlier derivatives in stage i; the first row is empty.
-        weights: of the derivatives in the result, times `divisor`.
-        divisor: of the weights.
+        weights: weights of the derivatives in the result, times `divisor`.
+        divisor: common divisor of the weights.
     """
 
     stages: tuple[tuple[float, ...], ...]
@@ -34,7 +34,7 @@ class Tableau:
     divisor: float = 1.0
 
     def __call__(self, rate: Rate, state: State, length: float) -> State:
-        """State after one step of `length`; `rate` gives the derivatives of the moving components."""
+        """Return the state after a step of `length` seconds; `rate` computes the derivatives."""
         slopes: list[State] = []
         for row in self.stages:
             slopes.append(rate(_moved(state, slopes, row, length)))
@@ -42,7 +42,7 @@ class Tableau:
 
 
 def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], length: float) -> State:
-    """`state + length * sum(weight * slope)`; components that do not move are unchanged."""
+    """Return `state + length * sum(weight * slope)`; a component without slope is unchanged."""
     groups: dict[float, list[State]] = {}
     for weight, slope in zip(weights, slopes, strict=True):
         if weight:
@@ -57,7 +57,7 @@ def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], leng
 
 
 def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
-    """Weighted sum of one component's derivatives; those with equal weights are added first."""
+    """Return the weighted sum of one component's derivatives; `groups`: weight -> the derivatives."""
     total: ir.Num | None = None
     for weight, slopes in groups.items():
         part = slopes[0][name]

@@ -1,4 +1,4 @@
-"""Explicit Euler: first order, one evaluation."""
+"""Explicit Euler method: first order, one evaluation of the derivative per step."""
 
 from stlc.dynamics.model.integrators._tableau import Tableau
 

@@ -1,4 +1,4 @@
-"""Heun's method: second order, two evaluations."""
+"""Heun's method: second order, two evaluations of the derivative per step."""
 
 from stlc.dynamics.model.integrators._tableau import Tableau
 

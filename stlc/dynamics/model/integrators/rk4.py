@@ -1,4 +1,4 @@
-"""The classical Runge-Kutta method: fourth order, four evaluations."""
+"""The classical Runge-Kutta method: fourth order, four evaluations of the derivative per step."""
 
 from stlc.dynamics.model.integrators._tableau import Tableau
 
