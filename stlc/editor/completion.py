@@ -1,7 +1,7 @@
-"""Completion at a cursor: words that the grammar accepts there, and names of the kind that it accepts.
+"""Completion at a cursor: words and names that the grammar accepts there.
 
-The parser reads the declaration up to the cursor and gives the terminals that may follow; if it fails before
-the cursor, everything is offered.
+The parser reads the declaration up to the cursor and returns the terminals that may follow. If it fails
+before the cursor, all names, functions and keywords are offered.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ _FIRST_UNITS = ("s", "steps", "ms", "min", "m", "m/s", "m/s^2", "rad", "deg", "1
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A completion.
+    """One proposal in a completion list.
 
     Attributes:
-        text: inserted in place of the partial word.
-        kind: of the symbol or word.
-        detail: one line beside it.
-        doc: Markdown shown for the selected offer.
-        order: offers with smaller numbers come first.
+        text: text inserted in place of the partial word.
+        kind: kind of the symbol or word, such as `Keyword`.
+        detail: one line shown beside the text.
+        doc: Markdown shown when the proposal is selected.
+        order: sort key; proposals with smaller numbers come first.
     """
 
     text: str
@@ -76,14 +76,14 @@ class Offer:
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """The offers at a cursor, and the offset of the text that they replace."""
+    """The proposals at a cursor, and the offset at which the partial word that they replace starts."""
 
     start: int
     offers: tuple[Offer, ...]
 
 
 def complete(document: Document, offset: int) -> Completion:
-    """Completions at `offset`; the text after it is ignored."""
+    """Return the completion at `offset`; the text after the cursor is ignored."""
     text = document.source.text[:offset]
     if _SILENT.fullmatch(text[text.rfind("\n") + 1 :]):
         return Completion(offset, ())
@@ -109,13 +109,13 @@ def complete(document: Document, offset: int) -> Completion:
 
 
 def _piece_start(text: str) -> int:
-    """Start of the last declaration of a text."""
+    """Return the offset at which the last declaration of a text starts."""
     starts = declaration_starts(text)
     return starts[bisect_right(starts, len(text)) - 1]
 
 
 def _units_at(piece: str, text: str) -> str | None:
-    """Partial text of a unit in brackets; None if the cursor is not in one."""
+    """Return the part of a unit typed so far inside `[…]`; None if the cursor is not in a unit."""
     head, bracket, tail = piece.rpartition("[")
     written = _UNIT_PREFIX.search(text)
     assert written is not None
@@ -129,7 +129,7 @@ def _units_at(piece: str, text: str) -> str | None:
 
 
 def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
-    """Offers for the tokens that the parser accepts next."""
+    """Yield proposals for the terminals `accepted`, which the parser accepts next."""
     yield from _keywords(accepted)
     if "UNIT" in accepted:
         yield from _units()
@@ -151,13 +151,13 @@ def _everything(document: Document, offset: int) -> Iterator[Offer]:
 
 
 def _preferred() -> set[str]:
-    """Reserved words, each in the spelling that the language prefers."""
+    """Return the reserved words without their aliases (`G` is an alias of `always`)."""
     aliases = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
     return {word for word in RESERVED if aliases.get(word, word) == word}
 
 
 def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
-    """Offers for the accepted terminals that are words."""
+    """Yield proposals for those accepted terminals that are keywords."""
     for terminal in accepted:
         plain = terminal[1:].lower() if terminal.startswith("_") else ""
         for word in _TERMINALS.get(terminal, (plain,) if plain in _PLAIN_WORDS else ()):
@@ -165,7 +165,7 @@ def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:
-    """Offers for the symbols in scope that stand for values, nearest first."""
+    """Yield proposals for the names in scope that can stand in an expression, the innermost scope first."""
     for symbol in inside(document.spec, offset):
         yield Offer(own_name(symbol.name), "Reference", about(document, symbol), order=1)
     for symbol in document.names.values.values():
@@ -179,7 +179,7 @@ def _functions() -> Iterator[Offer]:
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
-    """Completions where only a name can stand: types, or undeclared states of the system."""
+    """Yield proposals where only a name can stand: types, or states not yet declared as signals."""
     words = [lexeme.text for lexeme in lexemes(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):
         yield from (Offer(name, "Class", text) for name, text in TYPES.items())
@@ -194,7 +194,7 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
 
 
 def _shared(document: Document, alias: str) -> Iterator[Offer]:
-    """Completions after the alias of an imported module."""
+    """Yield proposals for the text after `alias.`, the declarations of an imported module."""
     for module in document.modules:
         if module.alias == alias:
             for item in shared(module):

@@ -1,4 +1,4 @@
-"""Analysis of a specification in an editor: findings, symbols and their meaning."""
+"""Analysis of a specification that is open in an editor: findings, symbols, resolved names and formulas."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _MAX_LABELS = 8
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A diagnostic and its place in the text.
+    """A diagnostic and its location in the edited text.
 
     Attributes:
-        diagnostic: as on the command line.
-        span: place in the edited text.
+        diagnostic: the diagnostic as on the command line.
+        span: location in the edited text.
         mild: whether it prevents training but not monitoring.
     """
 
@@ -59,14 +59,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Document:
-    """Analysis of one version of a text, from which all requests are answered.
+    """Analysis of one version of a text, from which all requests of the editor are answered.
 
     Attributes:
-        source: the text, under the path of its file.
+        source: the text, with the path of its file.
         spec: syntax tree of the declarations without syntax errors.
         unread: diagnostics of the declarations with syntax errors.
         system: declaration of the system that the text names, or None.
-        missing: diagnostics of a named system that cannot be loaded.
+        missing: diagnostics of that system if it cannot be loaded.
     """
 
     source: Source
@@ -82,12 +82,12 @@ class Document:
 
     @property
     def grid(self) -> Grid:
-        """Time step and horizon of the system; empty without one."""
+        """Time step and horizon of the system; both None without a system."""
         return Grid() if self.system is None else Grid(self.system.dt, self.system.horizon)
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """Imported modules; empty where a file cannot be read."""
+        """Imported modules; empty if the file of one cannot be read."""
         try:
             return load_modules(self.spec)
         except StlcError:
@@ -95,13 +95,13 @@ class Document:
 
     @cached_property
     def meaning(self) -> Meaning:
-        """Resolved names and intervals."""
+        """The part of the specification that can be resolved: names, columns, formulas and intervals."""
         interface = None if self.system is None else self.system.interface()
         return understand(self.spec, self.modules, interface=interface, grid=self.grid)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings of `stlc lint`, in the order of the text."""
+        """Findings of `stlc lint`, in text order."""
         found = [self._about_system(self.missing)] if self.missing else []
         within = None if self.system is None else Surroundings(self.system.interface(), self.grid)
         linted = self.unread or lint(self.source, within=within)
@@ -111,7 +111,7 @@ class Document:
         return tuple(sorted(found, key=lambda one: one.span.start))
 
     def _place(self, finding: Diagnostic) -> Finding:
-        """A finding placed in this text; one in another file is placed where that file is named."""
+        """Locate a diagnostic in this text; one in another file is placed where this text names that file."""
         span = finding.span
         if span is not None and span.source.name == self.source.name:
             return Finding(finding, self.source.span(span.start, span.end))
@@ -128,7 +128,7 @@ class Document:
 
 
 class Systems:
-    """Cache of system files, reread when they change."""
+    """Cache of loaded system files; a file is read again when it has changed."""
 
     def __init__(self) -> None:
         self._known: dict[Path, tuple[tuple[int, int], SystemDecl | StlcError]] = {}
@@ -155,7 +155,7 @@ def _load(path: Path) -> SystemDecl | StlcError:
 
 
 def analyse(source: Source, systems: Systems) -> Document:
-    """Analyse a text with the system that it names."""
+    """Analyse a text together with the system that it names."""
     spec, unread = read(source)
     if spec.system is None:
         return Document(source, spec, unread, None, ())
@@ -177,9 +177,9 @@ _INK = re.compile(r"[^\r\n]")
 
 
 def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
-    """The tree of all declarations without syntax errors, and the diagnostics of the others.
+    """Parse a text; return the tree of all declarations without syntax errors, and diagnostics of the others.
 
-    Spans of the tree point into `source` or into a text of the same length.
+    Source locations in the tree refer to `source`, or to a text of the same length with blanks.
     """
     try:
         return parse(source), ()
@@ -197,7 +197,10 @@ def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
 
 
 def _without(source: Source, faults: tuple[Diagnostic, ...]) -> Source:
-    """The text with each faulty declaration blanked out; entirely blank if a fault lies in no declaration."""
+    """Return the text with every declaration that has a syntax error replaced by blanks.
+
+    The whole text is replaced if an error lies in no declaration.
+    """
     starts = declaration_starts(source.text)
     ends = [*starts[1:], len(source.text)]
     text = source.text
@@ -219,14 +222,14 @@ _OUTWARD = ("always", "historically", "release")
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The resolved part of a specification.
+    """The part of a specification that can be resolved.
 
     Attributes:
-        scope: name table of the file.
-        columns: signals and parameters by the name of their declaration, with their ranges.
-        formulas: requirements and assumptions, and definitions without arguments that are formulas.
-        grid: time grid of the system; empty without one.
-        interface: of the system, if there is one.
+        scope: table of the names in the file.
+        columns: name of a declared signal or parameter -> its scalar columns, with unit and range.
+        formulas: requirements, assumptions, and definitions without arguments that are formulas, by name.
+        grid: time step and horizon of the system; both None without a system.
+        interface: what the specification can refer to in the system, or None.
     """
 
     scope: Scope
@@ -236,7 +239,7 @@ class Meaning:
     interface: Interface | None = field(default=None, repr=False)
 
     def value(self, name: str) -> Value | None:
-        """Value of a signal, constant, region or definition without arguments; None if unresolved."""
+        """Return the value of a signal, constant, region or definition without arguments, or None."""
         entry = self.scope.entries.get(name)
         if isinstance(entry, Known):
             return entry.value
@@ -249,7 +252,7 @@ class Meaning:
             return None
 
     def steps(self, name: str) -> int | None:
-        """Lookahead of a formula in steps; None if the grid is unknown."""
+        """Return how many steps ahead a formula reads; None if the time step is unknown."""
         formula = self.formulas.get(name)
         if formula is None:
             return None
@@ -260,7 +263,10 @@ class Meaning:
         return reach(simplify(lowered)).future
 
     def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
-        """The interval written at `span`, and its window in steps if the grid is known."""
+        """Return the interval of a temporal operator written at `span`.
+
+        With it comes its window in steps; None if the time step is unknown.
+        """
         for formula in self.formulas.values():
             for node in nodes(formula):
                 if isinstance(node, typed.Temporal | typed.Until) and node.interval.span == span:
@@ -276,7 +282,10 @@ class Meaning:
 def understand(
     spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
 ) -> Meaning:
-    """Resolve as much of a specification as possible; findings are dropped, as the compiler reports them."""
+    """Resolve as much of a specification as possible.
+
+    Errors are not reported here, as the compiler reports them.
+    """
     scope = Scope(temporal=True, time_unit=spec.time_unit)
     file = declared(spec, modules, interface, {}, scope)
     columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
@@ -294,7 +303,7 @@ def _ranged(
 
 
 def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
-    """Formulas by name; a requirement precedes a definition of the same name."""
+    """Return the formulas of a specification by name; a requirement hides a definition of the same name."""
     found: dict[str, typed.Formula] = {}
     for item in spec.items:
         if isinstance(item, ast.Def):
@@ -315,12 +324,12 @@ def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
 
 @dataclass(frozen=True, slots=True)
 class Borrowed:
-    """A name imported from a module: the part after the dot.
+    """A use of an imported name, `module.name`: the part after the dot.
 
     Attributes:
-        span: place of the name in the text.
+        span: location of that part in the text.
         module: the imported module.
-        item: declaration of the name in the module; None where it has no such name.
+        item: declaration of the name in the module; None if the module has no such name.
     """
 
     span: Span
@@ -329,12 +338,12 @@ class Borrowed:
 
 
 def shared(module: Module) -> tuple[ast.Item, ...]:
-    """Declarations of a module that others can use: all but its requirements."""
+    """Return the declarations of a module that can be imported: all but its requirements."""
     return tuple(item for item in module.spec.items if not isinstance(item, ast.Require | ast.Assume))
 
 
 def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Borrowed | None:
-    """The imported name under the cursor at `offset`."""
+    """Return the imported name under the cursor at `offset`, or None."""
     by_alias = {module.alias: module for module in modules}
     for node in (part for item in spec.items for part in descendants(item)):
         if not isinstance(node, ast.Attr) or not isinstance(node.base, ast.Name):
@@ -354,10 +363,10 @@ def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Bor
 
 
 def definition(document: Document, offset: int) -> tuple[Span, ...]:
-    """Places of the declaration of the name at a cursor.
+    """Return the source locations that "go to definition" leads to from the cursor.
 
-    A use leads to its declaration; the declaration of a signal, parameter or constant to its entry in the
-    system file; from `system "file"` into that file; from `module.name` into the module.
+    A name leads to its declaration; the declaration of a signal, parameter or constant to its entry in the
+    system file; `system "file"` to that file; and `module.name` to the declaration in the module.
     """
     place = document.spec.system_span
     if place is not None and place.start <= offset <= place.end:
@@ -375,7 +384,7 @@ def definition(document: Document, offset: int) -> tuple[Span, ...]:
 
 
 def system_place(document: Document, symbol: Symbol) -> Span | None:
-    """Place of a symbol in the system file, if it is declared there."""
+    """Return the source location of a symbol in the system file; None if it is not declared there."""
     if document.system is None or symbol.kind not in ("signal", "param", "const", "extern"):
         return None
     item = symbol.item
@@ -384,7 +393,7 @@ def system_place(document: Document, symbol: Symbol) -> Span | None:
 
 
 def outline(document: Document) -> tuple[tuple[Symbol, Span], ...]:
-    """The declarations of a file, in order, each with all of its text."""
+    """Return the declarations of a file in order, each with the source location of its whole text."""
     names = document.names
     found = [
         (one.symbol, one.symbol.item.span)

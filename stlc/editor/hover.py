@@ -1,4 +1,4 @@
-"""Hover text of the word under the cursor: sort, unit, range, value, time in seconds and steps."""
+"""Hover text of the word under the cursor: sort, unit, range, value, and times in seconds and steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
 
 
 def hover(document: Document, offset: int) -> tuple[Span, str] | None:
-    """The span under the cursor and its hover text, in Markdown; None if there is none."""
+    """Return the source location of the word under the cursor and its hover text in Markdown, or None."""
     found = document.names.at(offset)
     if found is not None:
         return found.span, about(document, found.symbol)
@@ -45,7 +45,10 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
 
 
 def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
-    """The lexeme at an offset (of two adjacent ones the word), and the text of the one before."""
+    """Return the lexeme (word, number or sign) at an offset, and the text of the lexeme before it.
+
+    Between two adjacent lexemes, a word or number takes precedence over a sign.
+    """
     found, before, last = None, "", ""
     for lexeme in lexemes(text):
         if lexeme.start > offset:
@@ -61,7 +64,7 @@ def _is_temporal(lexeme: Lexeme) -> bool:
 
 
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
-    """Span from the word under the cursor to the end of its interval."""
+    """Return the source location from the word under the cursor to the end of the operator's interval."""
     word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
     if node.interval is None:
         return document.source.span(*word)
@@ -98,7 +101,7 @@ def duration(steps: int, grid: Grid) -> str:
 
 
 def about(document: Document, symbol: Symbol) -> str:
-    """Hover text of a symbol: its declaration, `##` comment, and summary."""
+    """Return the hover text of a symbol: its declaration, its `##` comment, and a summary."""
     item = symbol.item
     parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
@@ -108,24 +111,24 @@ def about(document: Document, symbol: Symbol) -> str:
 
 
 def _code(item: ast.Item) -> str:
-    """A declaration as a fenced code block, safe for names with back quotes."""
+    """Return a declaration as a fenced Markdown code block, which back quotes in names cannot end."""
     return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
 
 
 def _comment(doc: str) -> str:
-    """A `##` comment with mark-up escaped."""
+    """Return the text of a `##` comment with Markdown characters escaped."""
     return "\n".join(map(markdown, doc.split("\n")))
 
 
 def about_shared(item: ast.Item, key: str) -> str:
-    """Hover text of a declaration in an imported file."""
+    """Return the hover text of a declaration in an imported file; `key` names the file."""
     origin = "library std" if key == STD else markdown_code(key)
     parts = [_code(item), f"from {origin}", _comment(item.doc)]
     return "\n\n".join(filter(None, parts))
 
 
 def summary(document: Document, symbol: Symbol) -> str:
-    """Sort, unit and range in one line."""
+    """Return sort, unit and range of a symbol in one line."""
     return next(iter(_facts(document, symbol)), symbol.kind)
 
 
@@ -200,7 +203,7 @@ def _ahead(document: Document, name: str) -> str:
 
 
 def _temporal_at(spec: ast.Spec, offset: int) -> ast.Temporal | ast.Until | None:
-    """The innermost temporal operator with its word or interval under the cursor."""
+    """Return the innermost temporal operator whose word or interval is under the cursor, or None."""
     found = None
     for node in descendants(spec):
         if isinstance(node, ast.Temporal | ast.Until) and _touches(node, offset):
@@ -245,7 +248,7 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
 
 
 def _seconds(time: typed.Time, grid: Grid) -> str:
-    """A bound in seconds, exactly."""
+    """Return a bound of an interval in seconds, exactly."""
     if grid.dt is None or (time.horizons and grid.horizon is None):
         return ""
     seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))

@@ -1,4 +1,4 @@
-"""Rename of a symbol at all its occurrences, without changing any other binding."""
+"""Renaming of a symbol at all its occurrences, so that every other name keeps its meaning."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAME = re.compile(r"[^\W\d]\w*")
 
 
 class RenameError(Exception):
-    """Reason for which a name cannot be changed."""
+    """Raised, with the reason, if a name cannot be changed."""
 
 
 _FROM_ELSEWHERE = ("module", "extern", "param")
@@ -26,18 +26,19 @@ _FROM_ELSEWHERE = ("module", "extern", "param")
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """Occurrence at `offset` if its symbol can be renamed, else None."""
+    """Return the occurrence at `offset` if its symbol can be renamed, else None."""
     found = document.names.at(offset)
     return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
 
 
 def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
-    """The edits that give the symbol at `offset` the name `new`.
+    """Return the edits that give the symbol at `offset` the name `new`.
 
-    A renamed signal still reads the same column: `from "old"` is added to its declaration.
+    A renamed signal still reads the same state of the system: `from "old"` is added to its declaration.
 
     Raises:
-        RenameError: there is nothing to rename, the text has errors, or `new` would capture another name.
+        RenameError: nothing at `offset` can be renamed, the text has errors, or `new` already has a meaning
+            at one of the occurrences.
     """
     found = can_rename(document, offset)
     if found is None:
@@ -60,7 +61,7 @@ def _line(document: Document) -> int:
 
 
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
-    """Edit that adds `from "old"` to a renamed signal."""
+    """Return the edit that adds `from "old"` to a renamed signal's declaration; none for other symbols."""
     if not isinstance(item, ast.Signal) or item.column is not None:
         return []
     together = [other.name for other in document.spec.items if other.span == item.span]
@@ -71,7 +72,7 @@ def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
 
 
 def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
-    """Raise RenameError unless every name keeps its binding."""
+    """Raise RenameError unless every name refers to the same declaration after the edits as before."""
     text = edited(document.source.text, edits)
     try:
         after = names_of(parse(Source(document.source.name, text)))
@@ -82,11 +83,11 @@ def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> Non
 
 
 def _bindings(names: SymbolNames) -> list[int]:
-    """For every occurrence, in order, the index of the first one of the same symbol."""
+    """Return, for every occurrence in text order, the index of the first one of the same symbol."""
     first: dict[Span, int] = {}
     return [first.setdefault(one.symbol.span, index) for index, one in enumerate(names.occurrences)]
 
 
 def _declared(names: SymbolNames) -> tuple[int, int, int]:
-    """Numbers of distinct declared values, types and rules."""
+    """Count the distinct declared values, types and rules."""
     return len(names.values), len(names.types), len(names.rules)

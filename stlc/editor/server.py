@@ -27,9 +27,10 @@ _BREAK = re.compile(r"\r\n|\r|\n")
 
 
 class Layout:
-    """Lines of a text. Positions beyond the end of a line or of the text are clipped to that end.
+    """Conversion between offsets in a text and positions (line, column) of the language server protocol.
 
-    Lines end as in the protocol; those of pygls also end at separators of Unicode.
+    A position beyond the end of a line or of the text means that end. Lines end at CR, LF or CRLF, as the
+    protocol says; the library pygls also ends them at Unicode separators.
     """
 
     def __init__(self, text: str, codec: PositionCodec) -> None:
@@ -41,12 +42,12 @@ class Layout:
         self._ends = [*(found.start() for found in breaks), len(text)]
 
     def place(self, offset: int) -> lsp.Position:
-        """Position of the character at `offset`."""
+        """Return the position of the character at `offset`."""
         row = bisect_right(self._starts, offset) - 1
         return lsp.Position(row, self._units(self.text[self._starts[row] : min(offset, self._ends[row])]))
 
     def offset(self, place: lsp.Position) -> int:
-        """Offset of a position; within the units of a character, that of the character."""
+        """Return the offset of a position; one within a multi-unit character means its start."""
         if place.line >= len(self._starts):
             return len(self.text)
         left = place.character
@@ -58,7 +59,7 @@ class Layout:
 
 
 class Server(LanguageServer):
-    """Language server with all open specifications, each analysed once per change."""
+    """Language server; it holds all open specifications and analyses each once per change."""
 
     def __init__(self) -> None:
         super().__init__("stlc", __version__, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)
@@ -66,47 +67,47 @@ class Server(LanguageServer):
         self.documents: dict[str, Document] = {}
 
     def analyse(self, uri: str) -> Document:
-        """Analyse the text at a URI anew."""
+        """Analyse the current text of the file at a URI, and store the result."""
         text = self.workspace.get_text_document(uri).source
         source = Source(uris.to_fs_path(uri) or uri if uri.startswith("file:") else uri, text)
         self.documents[uri] = analyse(source, self.systems)
         return self.documents[uri]
 
     def document(self, params: Any) -> Document:
-        """The analysed text that a request is about."""
+        """Return the analysis of the file that the parameters of a request name."""
         uri = params.text_document.uri
         return self.documents.get(uri) or self.analyse(uri)
 
     def cursor(self, params: Any) -> tuple[Document, int]:
-        """The analysed text that a request is about, and the offset of its position."""
+        """Return the analysis of the file that a request names, and the offset of the cursor in it."""
         document = self.document(params)
         return document, self.offset(document, params.position)
 
     def publish(self, uri: str) -> None:
-        """Analyse a text and publish its diagnostics."""
+        """Analyse the file at a URI and send its diagnostics to the editor."""
         shown = [self.diagnostic(finding) for finding in self.analyse(uri).findings]
         self.text_document_publish_diagnostics(lsp.PublishDiagnosticsParams(uri, shown))
 
     # ---------------------------------------------------------------- values of the protocol
 
     def offset(self, document: Document, position: lsp.Position) -> int:
-        """Offset of a position of the client."""
+        """Return the character offset of a position that the editor sent."""
         return Layout(document.source.text, self.workspace.position_codec).offset(position)
 
     def range(self, span: Span) -> lsp.Range:
-        """A span as an LSP range."""
+        """Convert a source location to an LSP range."""
         layout = Layout(span.source.text, self.workspace.position_codec)
         return lsp.Range(layout.place(span.start), layout.place(span.end))
 
     def location(self, span: Span) -> lsp.Location:
-        """A span as an LSP location; an unsaved text keeps the URI under which it was opened."""
+        """Convert a source location to an LSP location; an unsaved text keeps its URI."""
         name = span.source.name
         if "://" not in name and not name.startswith("untitled:"):
             name = uris.from_fs_path(str(Path(name).resolve())) or name
         return lsp.Location(name, self.range(span))
 
     def diagnostic(self, finding: Finding) -> lsp.Diagnostic:
-        """A finding as an LSP diagnostic, with its secondary places and advice."""
+        """Convert a finding to an LSP diagnostic, with its secondary locations and advice."""
         inner = finding.diagnostic
         warns = finding.mild or inner.severity == "warning"
         return lsp.Diagnostic(
@@ -123,7 +124,7 @@ class Server(LanguageServer):
 
 
 def _lines(finding: Diagnostic) -> list[str]:
-    """Message of a diagnostic with its advice, line by line."""
+    """Return the message and advice of a diagnostic, line by line."""
     head = f"{finding.message}: {finding.label}" if finding.label else finding.message
     advice = [f"help: {line}" for line in finding.help]
     fix = [] if finding.fix is None or not finding.fix.text else [f"fix: {finding.fix.text}"]
@@ -144,7 +145,7 @@ def _closed(server: Server, params: lsp.DidCloseTextDocumentParams) -> None:
 
 
 def _files_changed(server: Server, _: Any) -> None:
-    """Analyse all texts again, as a system file may have changed."""
+    """Analyse all open texts again after a change of files on disk, such as a system file."""
     for uri in tuple(server.documents):
         server.publish(uri)
 
@@ -168,7 +169,7 @@ def _completion(server: Server, params: lsp.CompletionParams) -> lsp.CompletionL
 
 
 def _item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
-    """An offer as an LSP completion item that replaces the partial word."""
+    """Convert a proposal to an LSP completion item that replaces the partial word at `place`."""
     return lsp.CompletionItem(
         label=offer.text,
         kind=lsp.CompletionItemKind[offer.kind],
@@ -243,7 +244,7 @@ def _rename(server: Server, params: lsp.RenameParams) -> lsp.WorkspaceEdit:
 
 
 def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[lsp.TextEdit]:
-    """Edits that format the whole text; none if it has syntax errors."""
+    """Return the edits that format the whole text; none if it has syntax errors."""
     source = server.document(params).source
     try:
         text = format_text(source)
@@ -254,7 +255,7 @@ def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[ls
 
 
 def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeAction]:
-    """Code actions: the fixes of the findings in a range."""
+    """Return the automatic repairs of the findings in a range, as LSP code actions."""
     document = server.document(params)
     first, last = (server.offset(document, place) for place in (params.range.start, params.range.end))
     actions = []
@@ -297,7 +298,7 @@ _FEATURES: dict[str, tuple[Any, Any]] = {
 
 
 def make_server() -> Server:
-    """A server with all its features."""
+    """Return a language server with all request handlers registered."""
     server = Server()
     for name, (feature, options) in _FEATURES.items():
         server.feature(name, options)(feature)

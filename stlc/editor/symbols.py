@@ -1,4 +1,4 @@
-"""Symbols of a specification and their occurrences."""
+"""Symbols (declared names) of a specification and their occurrences in the text."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ Kind: TypeAlias = Literal[
 
 
 def _kind(item: ast.Item) -> Kind:
-    """Kind of a declaration: the keyword, which names the class of its node."""
+    """Return the kind of a declaration, which is its keyword."""
     return cast("Kind", type(item).__name__.lower())
 
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A named entity of a specification.
+    """A declared name of a specification, or one bound by a quantifier or argument list.
 
     Attributes:
-        name: without backticks.
-        kind: sort of declaration.
-        span: place where the name is declared.
-        item: the declaration, or the one that contains it; None for a module and for a variable.
+        name: the name without backticks.
+        kind: kind of the declaration, such as `signal`.
+        span: source location of the name in its declaration.
+        item: the declaration, or the one that contains it; None for an imported module and for a variable.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Occurrence:
 
     @property
     def declares(self) -> bool:
-        """True if the symbol is declared here."""
+        """True if this occurrence is the declaration of the symbol."""
         return self.span == self.symbol.span
 
 
@@ -68,10 +68,10 @@ class SymbolNames:
     """The symbols of a specification, in three separate namespaces.
 
     Attributes:
-        values: signals, constants, definitions and whatever else stands in expressions.
-        types: enums.
-        rules: requirements and assumptions.
-        occurrences: in the order of the text.
+        values: names that can stand in expressions: signals, constants, definitions and others.
+        types: names of enums.
+        rules: names of requirements and assumptions.
+        occurrences: all places where a symbol is named, in text order.
     """
 
     values: Mapping[str, Symbol]
@@ -80,12 +80,12 @@ class SymbolNames:
     occurrences: tuple[Occurrence, ...]
 
     def at(self, offset: int) -> Occurrence | None:
-        """The occurrence under the cursor at `offset`."""
+        """Return the occurrence under the cursor at `offset`, or None."""
         touching = [one for one in self.occurrences if one.span.start <= offset <= one.span.end]
         return max(touching, key=lambda one: one.span.start, default=None)
 
     def of(self, symbol: Symbol) -> tuple[Occurrence, ...]:
-        """Occurrences of a symbol."""
+        """Return all occurrences of a symbol."""
         return tuple(one for one in self.occurrences if one.symbol == symbol)
 
 
@@ -93,7 +93,10 @@ Scope: TypeAlias = Mapping[str, Symbol]
 
 
 def names_of(spec: ast.Spec) -> SymbolNames:
-    """Names of a specification and their occurrences. A duplicate refers to the first declaration."""
+    """Return the symbols of a specification and their occurrences.
+
+    Of several declarations of one name, the first counts; the others are occurrences of it.
+    """
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}
     rules: dict[str, Symbol] = {}
@@ -114,7 +117,7 @@ def names_of(spec: ast.Spec) -> SymbolNames:
 
 
 def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
-    """Arguments and variables in scope at `offset`, innermost last."""
+    """Return the arguments and bound variables that are in scope at `offset`, the innermost last."""
     found: list[Symbol] = []
     for item in spec.items:
         if item.span.start <= offset <= item.span.end:
@@ -136,14 +139,14 @@ def _symbol(lexeme: Lexeme, kind: Kind, near: Span, item: ast.Item | None = None
 
 
 def _words(span: Span, start: int | None = None, end: int | None = None) -> list[Lexeme]:
-    """The words of a part of a text."""
+    """Return the words in a part of a text, from `start` to `end` (by default the whole span)."""
     first = span.start if start is None else start
     last = span.end if end is None else end
     return [one for one in lexemes(span.source.text, first, last) if one.kind in ("word", "quoted")]
 
 
 def _module(module: ast.Import) -> Symbol:
-    """The alias of a module, by default its file name."""
+    """Return the symbol of an imported module: its alias, or else its file name."""
     words = _words(module.span)
     if module.alias is None and module.is_file:
         name = module.target.replace("\\", "/").rpartition("/")[2].removesuffix(".stl").removesuffix(".stlc")
@@ -168,7 +171,7 @@ def _arguments(item: ast.Item) -> dict[str, Symbol]:
 
 
 def _bound(node: ast.Node) -> dict[str, Symbol]:
-    """The variables that a quantifier or a freeze binds."""
+    """Return the variables that a quantifier or a freeze operator binds, by name."""
     match node:
         case ast.Quantifier(span, _, var):
             return {var: _symbol(_words(span)[1], "variable", span)}
@@ -209,7 +212,7 @@ def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
 
 
 def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
-    """Occurrences of bound names in a part of a declaration, without built-in names."""
+    """Yield the occurrences of symbols within a part of a declaration; built-in names are left out."""
     match node:
         case ast.Name(span, name, quoted):
             if name in scope and (quoted or name not in ("T", "end", "dt")):

@@ -32,7 +32,7 @@ _NAME = r"`[^`\n]+`|[^\W\d]\w*"
 
 
 def textmate() -> dict[str, Any]:
-    """The grammar, as the JSON of a `.tmLanguage.json` file."""
+    """Return the grammar as the JSON content of a `.tmLanguage.json` file."""
     parts = _repository()
     return {
         "name": "Signal Temporal Logic",
@@ -44,7 +44,7 @@ def textmate() -> dict[str, Any]:
 
 
 def _repository() -> dict[str, Any]:
-    """Named groups of patterns; where several match, the first one wins."""
+    """Return the named groups of patterns; if several patterns match at one position, the first wins."""
     return {
         "comment": {
             "patterns": [_of("comment.line.documentation", r"##(?!#).*$"), _of("comment.line", _COMMENT)]
@@ -74,7 +74,7 @@ _COMMENT = r"(?:#|//).*$"
 
 
 def _declarations() -> list[dict[str, Any]]:
-    """Keyword and name; requirements have their own scope."""
+    """Patterns for keyword and name of a declaration; requirements have a TextMate scope of their own."""
     rules = ("require", "assume")
     callables = ("def", "region", "enum")
     rest = [word for word in DECLARATIONS if word not in (*rules, *callables, "extern", "import")]
@@ -95,7 +95,7 @@ def _declarations() -> list[dict[str, Any]]:
 
 
 def _pragmas() -> list[dict[str, Any]]:
-    """`spec name`, `system "file"`, `time s`: keywords only at the beginning of a line."""
+    """Patterns for `spec name`, `system "file"` and `time s`: keywords only at the start of a line."""
     head = rf"^\s*({_any(PRAGMAS)})\s+"
     return [
         _captures(rf"{head}({_NAME})", {"1": "keyword.control.pragma", "2": "entity.name.type"}),
@@ -104,7 +104,7 @@ def _pragmas() -> list[dict[str, Any]]:
 
 
 def _numbers() -> dict[str, Any]:
-    """A number and its unit; a `%` followed by an operand is the modulo operator."""
+    """Pattern for a number with its unit; `%` before an operand is not a unit but the modulo operator."""
     number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
     percent = rf"%(?!\s*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
     return _captures(
@@ -114,7 +114,7 @@ def _numbers() -> dict[str, Any]:
 
 
 def _unit() -> str:
-    """A product of powers of units, without blanks."""
+    """Regular expression for a unit: a product of powers without blanks, such as `m/s^2`."""
     one = f"(?:{PATTERNS['UNITS']}|[%1](?=/)){PATTERNS['EXPONENT']}?"
     return rf"{one}(?:[*/·]{PATTERNS['UNITS']}{PATTERNS['EXPONENT']}?)*"
 

@@ -1,4 +1,4 @@
-"""Linter of a specification: findings of the compiler and of the lint rules, and their repairs."""
+"""Linter of a specification: findings of the compiler and of the lint rules, and automatic repairs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ ROUNDS = 20
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """Repaired text.
+    """Result of automatic repairs.
 
     Attributes:
-        source: text after the repairs.
+        source: the text after the repairs.
         findings: findings that remain.
-        count: number of repaired findings.
+        count: number of findings that were repaired.
     """
 
     source: Source
@@ -38,13 +38,13 @@ class Fixed:
 
 
 def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
-    """Apply repairs until no repairable finding remains.
+    """Repair a text in rounds until no finding with an automatic repair remains.
 
-    A round that would introduce new errors is discarded. Overlapping repairs wait for the next round.
+    A round that would introduce new errors is undone. Of overlapping repairs, one is left to the next round.
 
     Args:
         source: the text.
-        check: text -> its findings.
+        check: function that returns the findings in a text.
     """
     findings, count = tuple(check(source)), 0
     for _ in range(ROUNDS):
@@ -66,7 +66,7 @@ def _errors(findings: Iterable[Diagnostic]) -> int:
 
 
 def _apart(repairs: Iterable[Fix]) -> list[Fix]:
-    """Return non-overlapping repairs; of two overlapping ones the first."""
+    """Return repairs that do not overlap; of two overlapping ones, the first is kept."""
     chosen: list[Fix] = []
     taken: set[tuple[int, int]] = set()
     for repair in repairs:
@@ -87,11 +87,11 @@ def edited(text: str, edits: Iterable[Edit]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Selection of warnings; errors are always reported.
+    """Choice of the warnings to report; errors are always reported.
 
     Attributes:
-        select: prefixes of codes; empty for the default ones, "ALL" for every one.
-        ignore: prefixes of codes to omit.
+        select: prefixes of the codes to report; empty for those active by default, "ALL" for every code.
+        ignore: prefixes of the codes not to report; takes precedence over `select`.
     """
 
     select: tuple[str, ...] = ()
@@ -105,7 +105,7 @@ class Selection:
                 raise UsageError(Diagnostic("U101", f"there is no code `{prefix}`", help=(advice,)))
 
     def wants(self, code: str) -> bool:
-        """True if findings with this code are reported."""
+        """True if findings with this code are to be reported."""
         if not code.startswith("W"):
             return True
         if self.ignore and code.startswith(self.ignore):
@@ -117,7 +117,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """System and purpose for which a specification is linted."""
+    """The system (interface, time grid) and the purpose that a specification is linted for."""
 
     interface: Interface
     grid: Grid
@@ -134,8 +134,8 @@ def lint(
 
     Args:
         source: the text.
-        within: system and purpose; without a system, checks that need one are skipped.
-        selection: of warnings.
+        within: system and purpose; None skips the checks that need a system.
+        selection: choice of the warnings to report.
     """
     try:
         spec = parse(source)
@@ -150,7 +150,7 @@ def lint(
 
 
 def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
-    """Findings of the compiler."""
+    """Return the findings of the compiler."""
     warnings: list[Diagnostic] = []
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
@@ -162,6 +162,6 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
-    """Sort key: findings in the text itself by position, then all others."""
+    """Sort key of a finding: those in the text itself come first, by position, then those in other files."""
     own = finding.span is not None and finding.span.source is source
     return not own, finding.span.start if own and finding.span else 0

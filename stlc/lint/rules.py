@@ -1,4 +1,4 @@
-"""Lint rules on the syntax as written; the compiler checks sorts, units and times."""
+"""Lint rules on the syntax tree or the text; sorts, units and times are checked by the compiler."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _WHY: dict[AmbiguityKind, str] = {
 
 
 def missing_parentheses(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Yield W301 for parts that other tools parse differently."""
+    """Yield W301 for expressions that other STL tools would parse differently for lack of parentheses."""
     return (_finding("W301", part) for part in ambiguities(spec))
 
 
 def unclear_implications(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Yield W302 for `and` or `or` with `->`, which most tools parse as here."""
+    """Yield W302 for `and` or `or` next to `->` without parentheses; most tools parse it as stlc does."""
     parts = ambiguities(spec, implications=True)
     return (_finding("W302", part) for part in parts if part.kind == "implication")
 
@@ -60,7 +60,7 @@ _WORDS = {
 
 
 def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Yield W106 for foreign spellings such as `G`, `ev`, `&&`, `=>`."""
+    """Yield W106 for operators spelled as in other tools, such as `G`, `ev`, `&&`, `=>`."""
     source = spec.source
     end = Lexeme("sign", "", len(source.text), len(source.text))
     for item, following in pairwise([*lexemes(source.text), end]):
@@ -80,7 +80,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """Return the spelling in this language of a word or sign of another tool."""
+    """Return the spelling in this language of another tool's word or sign; None to keep it."""
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":
@@ -91,7 +91,7 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if the replacement of a sign would merge with the following word."""
+    """True if the word that replaces a sign would run into the word or number after it."""
     return following.start == item.end and following.kind in ("word", "number")
 
 
@@ -106,7 +106,7 @@ _KINDS: dict[type[ast.Declaration], str] = {
 
 
 def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Yield W105 for unused declarations, except signals, which the system may need."""
+    """Yield W105 for declarations that are never used; signals are exempt, as the system may need them."""
     used = Counter(_uses(spec))
     for item in spec.items:
         kind = _KINDS.get(type(item))
@@ -130,12 +130,15 @@ def _unused(message: str, span: Span, where: str = "") -> Diagnostic:
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
-    """Yield all names that are read below a node."""
+    """Yield every name that is read in the subtree of a node."""
     return (node.name for node in descendants(root) if isinstance(node, ast.Name | ast.TypeRef))
 
 
 def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Yield W504 for a file with signals but no requirement (files to be imported have no signals)."""
+    """Yield W504 for a file that declares signals but no requirement.
+
+    A file without signals is meant to be imported, so it is exempt.
+    """
     kinds = {type(item) for item in spec.items}
     if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
         name = spec.name or spec.source.name
@@ -151,11 +154,11 @@ Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 
 @dataclass(frozen=True, slots=True)
 class LintRule:
-    """Lint rule.
+    """A lint rule.
 
     Attributes:
-        check: well-formed specification -> findings.
-        usual: active by default.
+        check: function that returns the findings in a specification without syntax errors.
+        usual: whether the rule is active by default.
     """
 
     check: Check

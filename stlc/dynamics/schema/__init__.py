@@ -1,1 +1,1 @@
-"""YAML nodes with source locations, records of keys, names and expressions: tools to read sections."""
+"""Tools to read sections: YAML nodes with source locations, records of keys, declared names, expressions."""

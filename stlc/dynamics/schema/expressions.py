@@ -1,4 +1,4 @@
-"""Expressions in a system file: parsed in place, typed by the compiler."""
+"""Expressions in a system file: parsed where they stand, then given sorts and units by the compiler."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ class Expressions:
     """Compiler of the expressions of a section.
 
     Attributes:
-        reader: where findings go.
-        scope: meaning of names.
-        ready: columns that have a value here; None for all.
-        amounts: whether numbers are increments of columns; of a temperature in degC, a difference.
-        rewrite: change of every parsed expression before it is resolved; None leaves it as written.
+        reader: collects the findings.
+        scope: table of the names that expressions may use.
+        ready: columns that already have a value; an expression that reads another one is an error. None: all.
+        amounts: whether numbers are increments of columns; one in degC is then a temperature difference.
+        rewrite: function applied to every parsed expression before its names are resolved; None changes
+            nothing.
     """
 
     reader: Reader
@@ -61,13 +62,16 @@ class Expressions:
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
-        """The compiler with additional names."""
+        """Return a compiler that knows more names, and with `samplers` also functions such as `uniform`.
+
+        `ready` are the columns that already have a value; None means all.
+        """
         return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 
     # ------------------------------------------------------------------ parsing
 
     def parse(self, node: Node | None, where: str) -> ast.Expr | None:
-        """Parse a field."""
+        """Parse the expression in a field; `where` names the field in messages. None if it is invalid."""
         if not isinstance(node, Scalar) or node.is_null:
             if node is not None:
                 self.reader.wrong(node, where, "an expression")
@@ -101,12 +105,12 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """Number of a field, in SI units from the zero of its unit."""
+        """Read a number, converted to SI units; a temperature in degC keeps the zero of that unit."""
         expr = self.parse(node, where)
         return None if expr is None else self._typed(resolve_number, expr)
 
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
-        """Components of a field, as from `number`: one expression, or a list of them."""
+        """Read a number or a vector, one expression or a list of them; return components as `number` does."""
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
             found = tuple(number for number in each if number is not None)
@@ -115,16 +119,16 @@ class Expressions:
         return None if expr is None else self._typed(resolve_numbers, expr)
 
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
-        """State formula of a field."""
+        """Read the state formula in a field; None if it is invalid."""
         expr = self.parse(node, where)
         return None if expr is None else self.formula_of(expr)
 
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
-        """State formula of an expression."""
+        """Return the state formula that an expression stands for; None if it is invalid."""
         return self._typed(resolve_state_formula, expr)
 
     def check(self, expr: ast.Expr) -> None:
-        """Report errors in an expression of any sort."""
+        """Report errors in an expression, whether it is a number, a vector or a formula."""
         rejected: list[list[Diagnostic]] = []
         resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (
             resolve_numbers,
@@ -145,7 +149,11 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """Result of a resolver of the compiler; None with its findings, or S202 for columns without value."""
+        """Resolve an expression with `resolve`, a function of the compiler.
+
+        Returns None if that reports errors, or (with S202) if a column that the result reads has no value
+        yet.
+        """
         sink: list[Diagnostic] = []
         try:
             found = resolve(expr, replace(self.scope, sink=sink))
@@ -162,22 +170,22 @@ class Expressions:
         return found
 
     def _report(self, findings: Sequence[Diagnostic]) -> None:
-        """Report findings of the compiler under the codes of system files."""
+        """Report findings of the compiler, with their codes replaced by those of system files."""
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     # --------------------------------------------------------------------- values
 
     def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
-        """Number as stored in a column of `unit`."""
+        """Read a number and convert it to `unit`, that of the column in which it is stored."""
         number = self.number(node, where)
         if number is None or node is None:
             return None
         return self._in_unit(number, node, where, unit)
 
     def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
-        """Components of a vector of `size` as stored in columns of `unit`.
+        """Read the components of a vector of length `size`, converted to `unit`, that of their columns.
 
-        One number stands for all components; a random one is drawn for each.
+        A single number is repeated for all components; a single random number is drawn anew for each.
         """
         numbers = self.numbers(node, where)
         if numbers is None:
@@ -194,7 +202,7 @@ class Expressions:
         return kept if len(kept) == size else None
 
     def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
-        """Number as stored in a column of `unit`; None with E203 reported."""
+        """Convert a number to `unit`, that of its column; None, with E203 reported, if they do not fit."""
         if self._fits(number, unit):
             place = first_line(node.span)
             if self.amounts and number.unit.offset:
@@ -212,7 +220,7 @@ class Expressions:
         return None
 
     def truth(self, node: Node | None, where: str) -> ir.Num | None:
-        """A number or a formula as 0 or 1 of a bool column."""
+        """Read a number or a formula as the value of a bool column: 0 or 1."""
         expr = self.parse(node, where)
         match expr:
             case None:
@@ -226,18 +234,18 @@ class Expressions:
                 return self.stored(node, where, Unit())
 
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
-        """Compile-time constant, as stored in a column of `unit`."""
+        """Read a constant that is known at compile time, converted to `unit`, that of its column."""
         value = self.stored(node, where, unit)
         found = None if value is None or node is None else self._constants((value,), node, where)
         return None if found is None else found[0]
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
-        """Compile-time constants, as stored in columns of `unit`."""
+        """Read a vector of constants known at compile time, converted to `unit`, that of their columns."""
         values = self.stored_each(node, where, unit, size)
         return None if values is None else self._constants(values, node, where)
 
     def _constants(self, values: tuple[ir.Num, ...], node: Node, where: str) -> tuple[float, ...] | None:
-        """Values of numbers that are all known."""
+        """Return the values of numbers; report and return None if one is not a constant."""
         found = tuple(value.value for value in values if isinstance(value, ir.Const))
         if len(found) < len(values):
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
@@ -245,7 +253,7 @@ class Expressions:
         return found
 
     def duration(self, node: Node | None, where: str) -> Fraction | None:
-        """Exact duration in seconds; a bare number is in seconds."""
+        """Read an exact duration in seconds; a number without unit is in seconds."""
         number = self.number(node, where)
         if number is None or node is None:
             return None
@@ -255,7 +263,7 @@ class Expressions:
         return number.exact
 
     def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
-        """Number of steps, given as `25 steps`, `25` or a time."""
+        """Read a number of steps, written as `25 steps`, as `25`, or as a time."""
         if node is None:
             return None
         expr = self.parse(node, where)
@@ -289,12 +297,12 @@ class Expressions:
 
 
 def _columns(found: Number | tuple[Number, ...] | ir.Formula) -> frozenset[str]:
-    """Columns that a number, several numbers or a formula read."""
+    """Names of the columns that a number, several numbers or a formula read."""
     if isinstance(found, tuple):
         return frozenset().union(*map(_columns, found))
     return names_in(found.num if isinstance(found, Number) else found)
 
 
 def written(node: Node | None) -> str:
-    """The text of a field, on one line, for tables."""
+    """Source text of a field, joined to one line, for tables."""
     return " ".join(node.text.split()) if isinstance(node, Scalar) else ""

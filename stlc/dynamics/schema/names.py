@@ -1,4 +1,4 @@
-"""Declared names of a system file, and the context in which its values are read."""
+"""Declared names of a system file, and the context in which the values of a section are read."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Squash: TypeAlias = Literal["tanh", "clip", "angle"]
 
 @dataclass(frozen=True, slots=True)
 class ControlDecl:
-    """One control input, or one component of a vector of them.
+    """One control input, or one component of a vector of control inputs.
 
     Attributes:
-        name: as written.
-        unit: of the stored numbers.
+        name: name in the system file.
+        unit: unit of its values.
         low: lower end of the range, in `unit`.
-        high: upper end of the range.
-        squash: map from a network output to a value in the range.
-        levels: values for searches; if empty, the range is sampled evenly.
+        high: upper end of the range, in `unit`.
+        squash: name of the map from a network output to a value in the range.
+        levels: values that a search may try; if empty, values spread evenly over the range.
     """
 
     name: str
@@ -45,7 +45,7 @@ class ControlDecl:
 
 
 def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
-    """A name with its number, or every component of its vector, changed."""
+    """Apply `change` to the number, or to each component of the vector, that a name stands for."""
     match entry:
         case Known(value=Number() as number):
             return replace(entry, value=change(number))
@@ -56,26 +56,27 @@ def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
 
 
 def base_name(column: str) -> str:
-    """Name of the vector that a column is a component of; for other columns their own name."""
+    """Return the name of the vector that has this column as component; else the column's own name."""
     return column.partition("[")[0]
 
 
 def component_names(name: str, size: int | None) -> tuple[str, ...]:
-    """Columns of a state or control: its name, or one for each component of a vector."""
+    """Return the column names of a state or control: `x` itself, or `x[0]`, `x[1]`, … for a vector."""
     return (name,) if size is None else tuple(f"{name}[{index}]" for index in range(size))
 
 
 @dataclass
 class Names:
-    """The names declared so far.
+    """Names declared in a system file; filled while its sections are read.
 
     Attributes:
         constants: name -> (value in SI units, unit).
-        columns: the states, in order.
-        controls: the inputs, in order.
-        entries: all names for expressions.
-        places: name -> where it is declared.
-        rewrite: change of every parsed expression before it is resolved; None leaves it as written.
+        columns: state columns (scalar states and components of vectors), in order.
+        controls: control inputs, in order.
+        entries: everything that a name can stand for in an expression.
+        places: name -> source location of its declaration.
+        rewrite: function applied to every parsed expression before its names are resolved; None changes
+            nothing.
     """
 
     constants: dict[str, tuple[float, Unit]] = field(default_factory=dict)
@@ -91,13 +92,13 @@ class Names:
         return Expressions(reader, scope, rewrite=self.rewrite)
 
     def group(self, name: str) -> tuple[Column, ...]:
-        """Columns of a state: one, or the components of a vector; empty for other names."""
+        """Return the columns of a state: one, or one per component of a vector; none if unknown."""
         exact = tuple(column for column in self.columns if column.name == name)
         return exact or tuple(column for column in self.columns if base_name(column.name) == name)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states; one per vector."""
+        """Names of the states; a vector counts once."""
         return tuple(dict.fromkeys(base_name(column.name) for column in self.columns))
 
     def vector(self, name: str) -> bool:
@@ -105,12 +106,12 @@ class Names:
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """Record the source location of a vector for its components."""
+        """Give the component columns of a vector the source location of its declaration."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
-        """Declare a name; False, with a finding, if it is taken or not an identifier."""
+        """Declare a name; report a finding and return False if it is taken or not an identifier."""
         first = self.places.get(key.text)
         if first is not None:
             message, advice = f"`{key.text}` is declared twice", "rename one of the two"
@@ -131,11 +132,11 @@ class Context:
 
     Attributes:
         reader: collects findings.
-        names: all declared names.
-        here: compiler of the section's expressions.
-        dt: time step, s.
-        horizon: planning horizon in steps; 0 where it is unknown.
-        discrete: whether `flow` holds next values instead of derivatives.
+        names: all names declared before.
+        here: compiler of the expressions of this section.
+        dt: time step in seconds.
+        horizon: planning horizon in steps; 0 if it is unknown.
+        discrete: whether `flow` gives next values of the states instead of derivatives.
     """
 
     reader: Reader
@@ -147,24 +148,27 @@ class Context:
 
     @staticmethod
     def of(reader: Reader, names: Names) -> Context:
-        """Context of a section whose expressions read all names and draw nothing."""
+        """Context of a section whose expressions may read all names but draw no random numbers."""
         return Context(reader, names, names.expressions(reader))
 
     @property
     def plain(self) -> Context:
-        """The context with the names declared by now, and no others."""
+        """The context reduced to the names that are declared now: without random numbers and local names."""
         return replace(self, here=self.names.expressions(self.reader))
 
     @property
     def timed(self) -> Context:
-        """The context with samplers, and `t` as the time of a deployment."""
+        """The context with random numbers, and with `t` as the time since the start of a deployment."""
         clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
         return self.drawing({} if "t" in self.names.places else {"t": clock})
 
     def drawing(self, entries: MappingType[str, Entry], ready: frozenset[str] | None = None) -> Context:
-        """The context with samplers and more names; `ready`: columns with a value, None for all."""
+        """Return the context with random numbers, and with the additional names `entries`.
+
+        `ready` are the columns that already have a value; None means all.
+        """
         return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
 
     def amounts(self) -> Context:
-        """The context where numbers are increments of columns."""
+        """Return the context in which numbers are increments of columns (in degC: differences)."""
         return replace(self, here=replace(self.here, amounts=True))

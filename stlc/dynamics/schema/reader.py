@@ -20,9 +20,9 @@ _OPENING, _CLOSING = "([{", ")]}"
 
 @dataclass
 class Reader:
-    """Checked access to the values of a system file, and the findings about them.
+    """Checked access to the values of a system file; collects findings about them.
 
-    Every method returns None (or omits a key) where it has reported a finding.
+    Every method that reads a value returns None (or leaves out a key) if it has reported a finding.
     """
 
     source: Source
@@ -41,7 +41,10 @@ class Reader:
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
-        """Record findings, one per source location: an error in a reused anchor is reported once."""
+        """Record findings; only the first at each source location is kept.
+
+        A value used twice through a YAML anchor is thus reported once.
+        """
         for finding in findings:
             tell(self.findings, finding)
 
@@ -54,7 +57,7 @@ class Reader:
     # ------------------------------------------------------------------ collections
 
     def entries(self, node: Node | None, where: str) -> tuple[Entry, ...]:
-        """Read the entries of a mapping with free keys; none for a missing or null node."""
+        """Read the entries of a mapping whose keys are free; empty for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Mapping):
@@ -91,7 +94,7 @@ class Reader:
         )
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
-        """Read the items of a sequence; none for a missing or null node."""
+        """Read the items of a sequence; empty for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Sequence):
@@ -104,7 +107,7 @@ class Reader:
         return node.items
 
     def _whole(self, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Entries without the fragments of expressions that a comma inside `{…}` has split off."""
+        """Report and drop entries that are in fact the rest of an expression, cut at a comma inside `{…}`."""
         kept: list[Entry] = []
         open_value = False
         for entry in entries:
@@ -134,7 +137,7 @@ class Reader:
         self.report("S103", f"{where} must be {wanted}, this is {_kind(node)}", first_line(node.span), *help_)
 
     def text(self, node: Node | None, where: str) -> str | None:
-        """Read a text."""
+        """Read a value as text; it must not be null."""
         found = node.text if isinstance(node, Scalar) and not node.is_null else None
         return self._valid(node, where, "a text", found)
 
@@ -154,7 +157,7 @@ class Reader:
         return False
 
     def _valid(self, node: Node | None, where: str, wanted: str, value: V | None) -> V | None:
-        """The value of a node; reports a node without one."""
+        """Return `value`; if it is None, report that the node must be `wanted`."""
         if node is not None and value is None:
             self.wrong(node, where, wanted)
         return value
@@ -190,7 +193,7 @@ class Reader:
 
 
 def _kind(node: Node) -> str:
-    """Description of a value in messages."""
+    """Describe a value in messages, such as "a list"."""
     match node:
         case Sequence():
             return "a list"
@@ -203,12 +206,12 @@ def _kind(node: Node) -> str:
 
 
 def first_line(span: Span) -> Span:
-    """First line of a span, which carets underline."""
+    """Return the first line of a span, which is what messages underline."""
     length = span.text.find("\n")
     return span if length < 0 else Span(span.source, span.start, span.start + max(length, 1))
 
 
 def _balance(node: Scalar) -> int:
-    """Number of brackets that a plain text opens, less those that it closes; 0 for a quoted text."""
+    """Return how many more brackets an unquoted text opens than it closes; 0 for a quoted text."""
     plain = node.text if node.style == "plain" else ""
     return sum((char in _OPENING) - (char in _CLOSING) for char in plain)

@@ -1,4 +1,4 @@
-"""Records of a system file: one description per key for reader, JSON Schema and documentation.
+"""Records of a system file: one description per key, for the reader, the JSON Schema and the documentation.
 
 A record is a frozen dataclass with fields made by `key`:
 
@@ -6,9 +6,10 @@ A record is a frozen dataclass with fields made by `key`:
     class TrainDecl:
         steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
 
-`read` fills it from a mapping of the file: unknown keys, wrong kinds and values out of range are reported
-with their place, and the field keeps its default. `json_schema` and `reference` print the same description.
-Records that only the reader uses (`…Keys`) are plain dataclasses, which take less time to import.
+`read` fills it from a mapping of the file. Unknown keys, wrong kinds and values out of range are reported
+with their source location, and the field keeps its default. `json_schema` and `reference` print the same
+description. Records that only the reader uses (`…Keys`) are plain dataclasses, which take less time to
+import.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ OF = "`{name}` of {of}"
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of value.
+    """A kind of value, such as an integer or an expression.
 
     Attributes:
-        read: (context, node, label for messages) -> value; None where a finding was reported.
-        schema: JSON Schema of accepted values.
-        record: the record that the value, or each of its items, is read into.
+        read: (context, node, label for messages) -> value; None if a finding was reported.
+        schema: JSON Schema of the accepted values.
+        record: the record that the value, or each of its items, is read into; None for other kinds.
     """
 
     read: _Read
@@ -53,16 +54,16 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of a mapping.
+    """A key that a mapping of a system file may have.
 
     Attributes:
-        attribute: field of the record that takes the value.
-        name: of the key.
-        kind: of the value.
-        about: meaning, for the documentation.
-        label: name of the value in messages; `{of}` is that of the record.
+        attribute: name of the record's field that takes the value.
+        name: name of the key in the file.
+        kind: kind of the value.
+        about: meaning of the value, for the documentation.
+        label: name of the value in messages; `{of}` stands for the name of the mapping.
         required: whether the key is mandatory.
-        spread: whether the kind gives several fields, by name.
+        spread: whether reading gives values for several fields, as a mapping by field name.
     """
 
     attribute: str
@@ -85,9 +86,9 @@ def key(
     spread: bool = False,
     shown: bool = True,
 ) -> Any:
-    """A field of a record that is read from the key `name` (that of the field unless given).
+    """Make a field of a record that is read from the key `name` (by default the name of the field).
 
-    `shown=False` keeps a field that only the reader uses out of comparison and `repr`.
+    With `shown=False` the field is left out of comparison and `repr`, for values that only the reader uses.
     """
     described = Key("", name, kind, about, label, required, spread)
     options: Json = {"default_factory": dict} if isinstance(default, dict) else {"default": default}
@@ -109,9 +110,9 @@ def keys_of(record: type) -> Mapping[str, Key]:
 def values_of(
     record: type, cx: Context, node: Node | None, of: str, label: str = "`{name}`"
 ) -> dict[str, Any]:
-    """Read and check the fields of a mapping.
+    """Read and check the values of a mapping; return those that are valid, by field of the record.
 
-    `of` names the mapping in messages, and `label` its values that have no label of their own.
+    `of` names the mapping in messages; `label` is the label of a value whose key has none.
     """
     keys = keys_of(record)
     found = cx.reader.fields(node, of, tuple(keys), [name for name, each in keys.items() if each.required])
@@ -128,7 +129,7 @@ def values_of(
 
 
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
-    """Read a record from a mapping, with defaults for missing or invalid values."""
+    """Read a mapping into a record; missing or invalid values get their defaults."""
     return record(**values_of(record, cx, node, of, label))
 
 
@@ -153,12 +154,12 @@ FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 
 
 def reads(schema: Mapping[str, Any], record: type | None = None) -> Callable[[_Read], Kind]:
-    """Decorator that makes a kind from a reader."""
+    """Return a decorator that makes a `Kind` from a function that reads a value."""
     return lambda read: Kind(read, schema, record)
 
 
 def integer(low: int = 1, high: int = 10**9) -> Kind:
-    """An integer between `low` and `high`."""
+    """Kind of an integer between `low` and `high`."""
     return Kind(
         lambda cx, node, label: cx.reader.integer(node, label, low=low, high=high),
         {"type": "integer", "minimum": low, "maximum": high},
@@ -166,14 +167,17 @@ def integer(low: int = 1, high: int = 10**9) -> Kind:
 
 
 def number(low: float = 0.0) -> Kind:
-    """A finite number of at least `low`."""
+    """Kind of a finite number of at least `low`."""
     return Kind(
         lambda cx, node, label: cx.reader.number(node, label, low=low), {"type": "number", "minimum": low}
     )
 
 
 def word(options: Iterable[str]) -> Kind:
-    """One of a few words, or of the names of a registry, looked up at each reading."""
+    """Kind of a value that is one of a few words.
+
+    `options` may be the names of a registry, which are looked up at each reading.
+    """
     return Kind(
         lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
     )
@@ -181,7 +185,7 @@ def word(options: Iterable[str]) -> Kind:
 
 @reads(EXPRESSION)
 def fraction(cx: Context, node: Node, label: str) -> float | None:
-    """Read a share: a number between 0 and 1, or a percentage."""
+    """Read a fraction: a number between 0 and 1, or a percentage."""
     share = cx.here.constant(node, label, DIMENSIONLESS)
     if share is not None and not 0.0 <= share <= 1.0:
         cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
@@ -189,12 +193,15 @@ def fraction(cx: Context, node: Node, label: str) -> float | None:
 
 
 def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
-    """The node itself, for values that are read later, when more names are known."""
+    """Kind of a value that is kept as YAML node, to be read later when more names are known."""
     return Kind(lambda _cx, node, _label: node, schema, record)
 
 
 def mapping_of(schema: Mapping[str, Any]) -> Json:
-    """JSON Schema of a mapping with free keys; `~` removes an entry of an extended file."""
+    """JSON Schema of a mapping with free keys.
+
+    A null value (`~`) is allowed too; it removes an entry of an extended file.
+    """
     return {
         "type": ["object", "null"],
         "additionalProperties": {"anyOf": [dict(schema), {"type": "null"}]},
@@ -202,12 +209,12 @@ def mapping_of(schema: Mapping[str, Any]) -> Json:
 
 
 def items_of(schema: Mapping[str, Any]) -> Json:
-    """JSON Schema of a list; null is an empty one."""
+    """JSON Schema of a list; null is accepted as an empty list."""
     return {"type": ["array", "null"], "items": dict(schema)}
 
 
 def list_of(kind: Kind, label: str) -> Kind:
-    """A list, as a tuple of the valid items; `label` names an item in messages."""
+    """Kind of a list, read as a tuple of its valid items; `label` names an item in messages."""
 
     def items(cx: Context, node: Node, where: str) -> tuple[Any, ...]:
         each = [kind.read(cx, item, label) for item in cx.reader.items(node, where)]
@@ -217,12 +224,12 @@ def list_of(kind: Kind, label: str) -> Kind:
 
 
 def part(record: type) -> Kind:
-    """A mapping read as a record."""
+    """Kind of a mapping that is read into a record."""
     return Kind(lambda cx, node, label: read(record, cx, node, label), json_schema(record), record)
 
 
 def section(record: type, *, free: bool = False) -> Kind:
-    """A section of the file, as its node; with `free` a mapping of names to records."""
+    """Kind of a section of the file, kept as YAML node; with `free`, a mapping of free names to records."""
     schema = json_schema(record)
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
 
@@ -230,7 +237,10 @@ def section(record: type, *, free: bool = False) -> Kind:
 def by_name(
     cx: Context, node: Node, label: str, known: Mapping[str, T], read: Callable[[Node, str, T], V | None]
 ) -> dict[str, V]:
-    """Valid values of a mapping whose keys are in `known`; `read` takes the node, the key and its entry."""
+    """Read a mapping whose keys must be in `known`; return its valid values by key.
+
+    `read` takes the node of a value, its key, and the item of `known` at that key.
+    """
     found: dict[str, V] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -256,7 +266,7 @@ def json_schema(record: type) -> Json:
 
 
 def reference(record: type, title: str) -> Iterator[str]:
-    """Lines of Markdown: a table of the keys of a record, then one of each record within."""
+    """Yield lines of Markdown: a table of the keys of a record, then those of the records inside."""
     yield from (f"### {title}", "", "| key | value | default | meaning |", "|---|---|---|---|")
     fields = {each.name: each for each in dataclasses.fields(record)}
     inner: list[tuple[type, str]] = []
@@ -271,7 +281,7 @@ def reference(record: type, title: str) -> Iterator[str]:
 
 
 def _shown(default: Any) -> str:
-    """Default of a record, as shown in a table."""
+    """Return the default of a key as it is printed in a table."""
     if isinstance(default, (bool, int, float, str)) and default != "":
         return f"`{str(default).lower() if isinstance(default, bool) else default}`"
     if isinstance(default, tuple) and default and all(isinstance(each, int) for each in default):
@@ -280,7 +290,7 @@ def _shown(default: Any) -> str:
 
 
 def _values(kind: Kind) -> str:
-    """Accepted values of a kind, in a few words."""
+    """Describe the values that a kind accepts in a few words."""
     schema = kind.schema
     if "enum" in schema:
         return ", ".join(f"`{option}`" for option in schema["enum"])

@@ -1,8 +1,8 @@
 """YAML nodes with source locations, read strictly and safely.
 
-Built on the event stream of PyYAML, so no object is ever constructed from a tag, aliases share one node
-instead of being copied, and depth and size are bounded while reading. Scalars stay text: the reader of a
-field interprets it, by the rules of YAML 1.2 (`1e-3` is a number, `on` and `yes` are words, `012` is twelve,
+Built on the event stream of PyYAML: no object is ever constructed from a tag, aliases share one node instead
+of being copied, and depth and size are bounded while reading. Scalars stay text until the reader of a field
+interprets them, by the rules of YAML 1.2 (`1e-3` is a number, `on` and `yes` are words, `012` is twelve,
 `12:30` is a word).
 """
 
@@ -34,12 +34,12 @@ _STYLES: dict[str, Style] = {"": "plain", "'": "single", '"': "double", "|": "bl
 
 @dataclass(frozen=True, slots=True)
 class Scalar:
-    """Scalar, as text.
+    """A YAML scalar, kept as text.
 
     Attributes:
-        span: of the text in the file, quotes included.
-        text: the value, unquoted and unescaped.
-        style: quoting or block style.
+        span: source location of the text, quotes included.
+        text: the value, without quotes and with escapes resolved.
+        style: quoting or block style in the file.
     """
 
     span: Span
@@ -49,14 +49,14 @@ class Scalar:
 
     @property
     def inside(self) -> Span:
-        """The span of the value's characters, without quotes or block header."""
+        """Source location of the value's characters, without quotes or block header."""
         quote = self.style in ("single", "double")
         head = self.span.text.find("\n") + 1 if self.style == "block" else int(quote)
         return Span(self.span.source, self.span.start + head, self.span.end - quote)
 
     @property
     def escaped(self) -> bool:
-        """True if the value differs from the characters between the quotes."""
+        """True if the value differs from the text between the quotes, as escapes were resolved."""
         inside = self.inside.text
         return "\\" in inside if self.style == "double" else self.style == "single" and "''" in inside
 
@@ -77,20 +77,20 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One `key: value`."""
+    """One `key: value` of a mapping."""
 
     key: Scalar
     value: Node
 
     def place(self, key: str) -> Span:
-        """Source location of the value of `key` in the value of this entry, or of the whole value."""
+        """Source location of the value of `key` in the mapping of this entry, or else of that mapping."""
         node = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.value.span if node is None else node.span
 
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """Keys and values in order, merge keys (`<<`) resolved."""
+    """A YAML mapping: its entries in order, with merge keys (`<<`) resolved."""
 
     span: Span
     entries: tuple[Entry, ...]
@@ -101,11 +101,11 @@ class Mapping:
         return next((entry.value for entry in self.entries if entry.key.text == key), None)
 
     def without(self, key: str) -> Mapping:
-        """The same mapping without an entry."""
+        """Return the mapping without the entry of `key`."""
         return Mapping(self.span, tuple(old for old in self.entries if old.key.text != key), self.size)
 
     def replaced(self, key: Scalar, value: Node) -> Mapping:
-        """The same mapping with `key` set to `value` (appended when it is new)."""
+        """Return the mapping with `key` set to `value`; a new key is appended."""
         entry = Entry(key, value)
         if self.get(key.text) is None:
             entries = (*self.entries, entry)
@@ -126,19 +126,19 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 
 
 def as_bool(node: Scalar) -> bool | None:
-    """Truth value of `true` or `false`; None for other texts."""
+    """Return the truth value of `true` or `false`; None for any other text."""
     if node.style != "plain":
         return None
     return True if node.text in _TRUE else False if node.text in _FALSE else None
 
 
 def as_int(node: Scalar) -> int | None:
-    """Value of a decimal integer; None for other texts."""
+    """Return the value of a decimal integer; None for any other text."""
     return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
 
 
 def as_float(node: Scalar) -> float | None:
-    """Value of a finite decimal number; None for other texts, `.nan` and `.inf` among them."""
+    """Return the value of a finite decimal number; None for any other text, such as `.nan` or `.inf`."""
     value = float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else math.inf
     return value if math.isfinite(value) else None
 
@@ -147,10 +147,10 @@ def as_float(node: Scalar) -> float | None:
 
 
 def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
-    """Read the only document of a text, which must be a mapping.
+    """Read a text that must be a single YAML document and a mapping.
 
-    Duplicate keys are appended to `sink` as S102; the first one counts. Raises SystemFileError (S100) where
-    there is no such document, or it is not safe to read.
+    Duplicate keys are appended to `sink` as S102; the first one is used. Raises SystemFileError (S100) if the
+    text is not such a document, or not safe to read.
     """
     node = load_node(source, sink=sink)
     if isinstance(node, Mapping):
@@ -167,7 +167,7 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
 
 
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
-    """Read the only document of a text, of any kind; None when there is none.
+    """Read a text that must be a single YAML document of any kind; None if the text is empty.
 
     PyYAML's C parser, if available, is ten times faster. Errors are reported by the Python parser, whose
     messages and locations are better.
@@ -196,7 +196,7 @@ def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
 
 
 def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
-    """An error of PyYAML as a diagnostic."""
+    """Return an error of PyYAML as a diagnostic."""
     mark = error.problem_mark or error.context_mark
     offset = min(mark.index if mark else 0, max(len(source.text) - 1, 0))
     labels: tuple[Label, ...] = ()
@@ -213,7 +213,7 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
 
 
 class _Builder:
-    """Builder of the nodes of one document from parser events, with bounded size."""
+    """Builder of the nodes of a YAML document from parser events; limits depth and size."""
 
     def __init__(self, source: Source, sink: list[Diagnostic], loader: Any) -> None:
         self.source = source
@@ -223,7 +223,7 @@ class _Builder:
         self.read = 0
 
     def document(self) -> Node | None:
-        """The node of the only document."""
+        """Build the node of the document; None if there is none. A second document is an error."""
         root: Node | None = None
         documents = 0
         for event in self.events:
@@ -235,17 +235,17 @@ class _Builder:
         return root
 
     def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
-        """S100 error at the location of an event."""
+        """Return an S100 error located at an event."""
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, start: Any, end: Any = None) -> Span:
-        """Span of an event, or from one to another, without trailing blanks."""
+        """Return the source location from event `start` to `end` (or of `start`), less trailing blanks."""
         first, last = start.start_mark.index, (end or start).end_mark.index
         last = first + len(self.source.text[first:last].rstrip())
         return self.source.span(first, max(last, min(first + 1, len(self.source.text))))
 
     def node(self, event: Any, depth: int) -> Node:
-        """The node that starts with `event`."""
+        """Build the node that starts with `event`."""
         self.read += 1
         if depth > MAX_DEPTH:
             raise self.refuse(event, f"nested more than {MAX_DEPTH} levels deep")
@@ -265,7 +265,7 @@ class _Builder:
         return node
 
     def collection(self, event: Any, depth: int) -> Node:
-        """A scalar, a sequence or a mapping."""
+        """Build the scalar, sequence or mapping that starts with `event`."""
         if isinstance(event, yaml.MappingStartEvent):
             return self.mapping(event, depth)
         if isinstance(event, yaml.SequenceStartEvent):
@@ -279,7 +279,7 @@ class _Builder:
         return Scalar(span, self.joined(event), _STYLES[event.style or ""])
 
     def joined(self, event: Any) -> str:
-        """The value of a scalar; surrogate pairs from escapes are joined."""
+        """Return the value of a scalar; surrogate pairs written as escapes are joined to one character."""
         value: str = event.value
         if not _HALF.search(value):
             return value
@@ -290,7 +290,7 @@ class _Builder:
             raise self.refuse(event, message) from None
 
     def alias(self, event: Any) -> Node:
-        """The node that an alias names."""
+        """Return the node that an alias (`*name`) refers to."""
         node = self.anchors.get(event.anchor)
         if node is None:
             inside = event.anchor in self.anchors
@@ -299,7 +299,7 @@ class _Builder:
         return node
 
     def mapping(self, start: Any, depth: int) -> Mapping:
-        """Read a mapping up to its end event; merged entries come after its own."""
+        """Build a mapping up to its end event; its own entries come before merged ones (`<<`)."""
         written: dict[str, Entry] = {}
         merged: dict[str, Entry] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
@@ -320,7 +320,7 @@ class _Builder:
         return Mapping(self.span(start, event), entries, size)
 
     def merge(self, key: Scalar, value: Node) -> tuple[Entry, ...]:
-        """Entries merged by `<<`."""
+        """Return the entries that a merge key (`<<`) adds."""
         if isinstance(value, Mapping):
             return value.entries
         if isinstance(value, Sequence) and all(isinstance(item, Mapping) for item in value.items):
