@@ -34,7 +34,7 @@ class Layout:
     """
 
     def __init__(self, text: str, codec: PositionCodec) -> None:
-        """Find the lines of `text`; `codec` counts columns in the client's encoding."""
+        """Find the lines of `text`; `codec` counts columns in the encoding that the editor uses."""
         breaks = list(_BREAK.finditer(text))
         self.text = text
         self._units = codec.client_num_units

@@ -52,7 +52,7 @@ class Symbol:
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """A place where the name of a symbol is written."""
+    """A place in the text where a symbol is named."""
 
     span: Span
     symbol: Symbol

@@ -1,4 +1,4 @@
-"""Meaning of the words of the language, in one sentence each."""
+"""Descriptions of the words of the language (keywords, functions, types), one sentence each."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def read_constants(node: Node | None, cx: Context) -> None:
 
 
 def read_definitions(node: Node | None, cx: Context) -> None:
-    """Read the section `def`: named sub-expressions, numbers or formulas; unused ones are checked too."""
+    """Read the section `def`: named expressions (numbers or formulas). Unused ones are checked too."""
     parsed: list[ast.Expr] = []
     for entry in cx.reader.entries(node, "`def`"):
         name = entry.key.text

@@ -132,7 +132,7 @@ class SystemDecl:
 
     @property
     def grid(self) -> Grid:
-        """Time grid that formulas are compiled for."""
+        """Time step and horizon of the system, for which formulas are compiled."""
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:
@@ -188,7 +188,7 @@ def _state(column: Column, flow: str | None, rate: str) -> Row:
 
 
 def _values(column: Column) -> str:
-    """Values of a column in words."""
+    """Describe the values that a column can take."""
     if column.kind == "bool":
         return "bool"
     if column.labels:

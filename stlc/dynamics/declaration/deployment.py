@@ -132,7 +132,7 @@ class EventDecl:
 
 @reads(items_of(json_schema(EventDecl)), EventDecl)
 def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
-    """Read events, each with exactly one of `when`, `at` and `every`."""
+    """Read a list of events; each has exactly one of the keys `when`, `at` and `every`."""
     found = []
     for index, item in enumerate(cx.reader.items(node, label)):
         event = read(EventDecl, cx, item, "an event")
@@ -163,7 +163,7 @@ class JudgeRef:
 
     Attributes:
         path: path of the file.
-        written: the path as it stands in the system file; a run stores its copy under this name.
+        written: the path as it stands in the system file; a run folder lists its copy under it.
         span: source location of the path.
     """
 

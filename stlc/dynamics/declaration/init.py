@@ -43,7 +43,7 @@ _DRAWS = raw(mapping_of(VECTOR))
 
 @dataclass(frozen=True, slots=True)
 class GridDecl:
-    """Grid of initial states: name of a column -> its values, in the unit of the column."""
+    """Grid of initial states: name of a column -> its values, in its unit; every combination is a state."""
 
     axes: tuple[tuple[str, tuple[float, ...]], ...]
 

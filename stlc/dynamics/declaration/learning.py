@@ -149,7 +149,7 @@ class Feedback:
 
 
 def _units(columns: Iterable[Column | ControlDecl]) -> dict[str, Unit]:
-    """Units of states or controls, by name."""
+    """Units of states or controls, by column name."""
     return {each.name: each.unit for each in columns}
 
 

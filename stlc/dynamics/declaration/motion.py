@@ -179,7 +179,7 @@ class JumpDecl:
 
 
 def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
-    """Read the section `jump`."""
+    """Read the section `jump`: the jumps, in file order."""
     found: list[JumpDecl] = []
     for index, item in enumerate(cx.reader.items(node, "`jump`")):
         values = values_of(JumpDecl, cx, item, "a jump")
@@ -219,7 +219,7 @@ def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 
 
 def latch_name(jump: str) -> str:
-    """Name of the state that records whether a jump has happened."""
+    """Name of the bool state that records whether a jump with `once` has happened."""
     return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
 
 

@@ -54,7 +54,7 @@ class Rows:
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
-        """Random indices with probabilities proportional to `weights`, (count,)."""
+        """Random indices into `weights`, (count,), with probabilities proportional to these weights."""
         edges = torch.tensor(weights, dtype=torch.float64).cumsum(0)
         edges = (edges / edges[-1])[:-1].to(self.generator.device)
         return torch.bucketize(self.uniforms(), edges, right=True)

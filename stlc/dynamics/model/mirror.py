@@ -1,7 +1,7 @@
-"""Mirror symmetries of a system: maps of states and controls under which dynamics are invariant.
+"""Mirror symmetries of a system: maps of states and controls under which the dynamics are invariant.
 
-A ship on the left of a river mirrors one on the right. A policy that uses this learns on half of the state
-space and covers all of it.
+A ship on the left of a river is the mirror image of one on the right. A policy that uses this symmetry learns
+on half of the state space and covers all of it.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class Mirror:
         self.side = self._names.index(images[0].name)
 
     def states(self, x: Tensor) -> Tensor:
-        """The images of states: (…, n) -> (…, n)."""
+        """Mirror images of states: (…, n) -> (…, n)."""
         return _applied(self._states, x, self._names)
 
     def plans(self, u: Tensor) -> Tensor:
-        """The images of controls: (…, m) -> (…, m). Angles stay within one turn of their range."""
+        """Mirror images of controls: (…, m) -> (…, m). Angles stay in one turn of their range."""
         moved = _applied(self._inputs, u, [control.name for control in self._controls])
         for index, each in enumerate(self._controls):
             if each.squash == "angle":

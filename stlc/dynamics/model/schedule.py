@@ -133,7 +133,10 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
 
 
 def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
-    """Strongly connected components, dependencies first (Tarjan's algorithm, without recursion)."""
+    """Strongly connected components of the graph `reads`, dependencies first.
+
+    This is Tarjan's algorithm without recursion.
+    """
     order: dict[str, int] = {}
     low: dict[str, int] = {}
     stack: list[str] = []

@@ -118,7 +118,7 @@ class System:
 
     @cached_property
     def control_names(self) -> tuple[str, ...]:
-        """Names of the inputs."""
+        """Names of the controls."""
         return tuple(control.name for control in self.decl.controls)
 
     @cached_property
@@ -140,7 +140,7 @@ class System:
 
     @property
     def observed_count(self) -> int:
-        """Number of inputs of the policy."""
+        """Number of inputs of the policy network."""
         return len(self.observed)
 
     # -------------------------------------------------------------------- motion
@@ -354,14 +354,14 @@ class System:
         u: Tensor | None = None,
         switch: Switch = HARD,
     ) -> Tensor:
-        """The weighted performance terms of the objective, mean over time: (B,), differentiable.
+        """The weighted performance terms of the objective, averaged over time: (B,), differentiable.
 
         Args:
             columns: states over time, (T+1, B) each.
-            sat: 1 where the trajectory satisfies the specification, (B,); without gradient.
-            rho: robustness, (B,), for terms that name it; 0 by default.
-            u: controls, (B, T, m), for terms that name one; these are averaged over the T steps.
-            switch: numeric form of `ind(…)` in a term.
+            sat: 1 if the trajectory satisfies the specification, else 0, (B,); without gradient.
+            rho: robustness, (B,), for terms that read it; 0 by default.
+            u: controls, (B, T, m), for terms that read a control; such terms are averaged over the T steps.
+            switch: whether `ind(…)` in a term is an exact or a smooth indicator.
         """
         like = next(iter(columns.values()))
         sat = sat.detach().to(like.dtype)

@@ -88,7 +88,10 @@ def _refused(
 @final
 @dataclass(frozen=True, slots=True)
 class PythonFunction:
-    """Loaded function: vectors are arrays (…, size), numbers arrays (…), and so is the result."""
+    """Loaded Python function of a system.
+
+    A vector argument is an array (…, size), a number an array (…); the same holds for the result.
+    """
 
     decl: FunctionDecl
     call: Callable[..., Array]

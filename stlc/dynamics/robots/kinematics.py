@@ -1,7 +1,7 @@
-"""Robot descriptions (URDF), and their forward kinematics as numbers of the IR.
+"""Robot descriptions (URDF), and their forward kinematics as IR expressions.
 
-A chain of joints is unrolled. Constants are folded, so a seven-joint arm needs the sines and cosines of its
-joints and some thirty products and sums: the torch graph and the C kernel compute the same few operations.
+A chain of joints is unrolled and constants are folded. A seven-joint arm then needs the sines and cosines of
+its joints and some thirty products and sums; the torch graph and the C kernel compute the same operations.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class Names:
     rewrite: Callable[[ast.Expr], ast.Expr] | None = None
 
     def expressions(self, reader: Reader) -> Expressions:
-        """Compiler of expressions that knows all declared names."""
+        """Return a compiler of expressions that knows all names declared before."""
         scope = Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
         return Expressions(reader, scope, rewrite=self.rewrite)
 

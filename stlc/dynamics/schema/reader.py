@@ -83,7 +83,7 @@ class Reader:
         return found
 
     def unknown(self, key: Scalar, where: str, known: Collection[str], code: str = "S101") -> None:
-        """Report an unknown key."""
+        """Report a key that is not in `known`, with the most similar known key as advice."""
         near = closest(key.text, known)
         guess = f"did you mean `{near}`?  " if near else ""
         self.report(

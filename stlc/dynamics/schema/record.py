@@ -97,7 +97,7 @@ def key(
 
 @cache
 def keys_of(record: type) -> Mapping[str, Key]:
-    """The keys of a record by name, in order."""
+    """Keys of the mapping that a record is read from, by name, in the order of the record's fields."""
     found = {}
     for each in dataclasses.fields(record):
         if _KEY in each.metadata:
@@ -255,7 +255,7 @@ def by_name(
 
 
 def json_schema(record: type) -> Json:
-    """JSON Schema (draft 2020-12) of the mappings that a record is read from."""
+    """JSON Schema (draft 2020-12) of the mapping that a record is read from."""
     properties = {
         name: {**each.kind.schema, "description": each.about.replace("`", "")}
         for name, each in keys_of(record).items()
