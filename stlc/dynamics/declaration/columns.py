@@ -132,7 +132,7 @@ def read_time(node: Node | None, cx: Context) -> Clockwork:
 
 
 def read_constants(node: Node | None, cx: Context) -> None:
-    """Read the section `const`: numbers and vectors with units; later ones may use earlier ones."""
+    """Read the section `const`: numbers and vectors with units; each may use those before it."""
     names = cx.names
     for entry in cx.reader.entries(node, "`const`"):
         name = entry.key.text

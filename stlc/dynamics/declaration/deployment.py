@@ -187,7 +187,7 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
 
 @reads({"type": ["string", "null"]})
 def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
-    """Read the path of a specification, relative to the file that names it."""
+    """Read the path of the specification that judges closed-loop runs, relative to the file that names it."""
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
     if text is None:
         return None

@@ -111,7 +111,7 @@ def _at_start(number: Number) -> Number:
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveDecl:
-    """The section `objective`: training loss (Eq. 8-10 of the paper).
+    """The section `objective`: training loss (Meng and Fan 2023, Eq. 8-10).
 
     The loss is a hinge on the robustness plus weighted performance terms.
     """

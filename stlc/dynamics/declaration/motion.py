@@ -167,7 +167,7 @@ def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 class JumpDecl:
     """A jump: a guard and resets.
 
-    If the guard holds at the start of a step, the resets replace the flow in that step (Eq. 6 of the paper).
+    If the guard holds at the start of a step, the resets replace the flow in that step.
     """
 
     name: str = key(NAME, "for messages", "", label=OF)

@@ -1,4 +1,4 @@
-"""One step of a hybrid system (the paper's Eq. 6) as a list of assignments in the IR."""
+"""One step of a hybrid system (Meng and Fan 2023, Eq. 6) as a list of assignments in the IR."""
 
 from __future__ import annotations
 

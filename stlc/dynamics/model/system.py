@@ -38,7 +38,7 @@ PROBED = 1000
 
 
 class System:
-    """A controlled hybrid system in discrete time (the paper's Eq. 1 and 6).
+    """A controlled hybrid system in discrete time (Meng and Fan 2023, Eq. 1 and 6).
 
     Tensors are float32 or float64 on any device; dtype and device follow the input. `B` is the batch, `T` the
     number of steps, `n` the number of states, `m` the number of controls.

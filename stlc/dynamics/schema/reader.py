@@ -41,9 +41,9 @@ class Reader:
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
-        """Record findings; only the first at each source location is kept.
+        """Record findings, each once: one with equal code, source location and message is dropped.
 
-        A value used twice through a YAML anchor is thus reported once.
+        An error in a value that is used twice through a YAML anchor is thus reported once.
         """
         for finding in findings:
             tell(self.findings, finding)
