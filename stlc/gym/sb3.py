@@ -1,4 +1,4 @@
-"""Environments of a task for Stable-Baselines3, whose learners take its own kind of vector environment.
+"""Environments of a task for Stable-Baselines3, which has its own class of vector environments.
 
 Needs the extra `stlc[rl]`.
 """
@@ -26,15 +26,15 @@ Indices: TypeAlias = Iterable[int] | int | None
 
 
 class SB3VecEnv(VecEnv):  # type: ignore[misc]
-    """A `SpecVectorEnv` as Stable-Baselines3's `VecEnv`.
+    """Adapter from `SpecVectorEnv` to the class `VecEnv` of Stable-Baselines3.
 
     At the end of an episode the info of an environment holds `terminal_observation`, the return and length of
     the episode (`episode`, which the logs of learners show), `rho`, `satisfied`, and `state`.
 
     Args:
-        env: environments that begin anew in the same step (`AutoresetMode.SAME_STEP`).
+        env: environments that are reset in the step that ends an episode (`AutoresetMode.SAME_STEP`).
 
-    Raises UsageError (U101) for another mode.
+    Raises UsageError (U101) if the environments have another autoreset mode.
     """
 
     def __init__(self, env: SpecVectorEnv) -> None:
@@ -46,7 +46,10 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         self._earned = np.zeros(env.num_envs)
 
     def reset(self) -> Floats:
-        """Begin all episodes, with the seed that `seed` gave last; return the observations, (N, k)."""
+        """Begin all episodes and return the observations, (N, k).
+
+        The seed is the one that the method `seed` of `VecEnv` received last.
+        """
         seen, info = self.env.reset(seed=self._seeds[0], options=self._options[0])
         self.reset_infos = [{"state": state} for state in info["state"]]
         self._reset_seeds()
@@ -55,11 +58,16 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         return seen
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Take the actions of the next step, (N, m)."""
+        """Store the actions (N, m) that `step_wait` applies."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Floats, Floats, NDArray[np.bool_], list[dict[str, Any]]]:
-        """Observations (N, k), rewards (N,), ends of episodes (N,) and infos after a step."""
+        """Advance all environments by one step under the stored actions.
+
+        Returns:
+            Observations (N, k), rewards (N,), whether episodes ended (N,), and one info dictionary per
+            environment.
+        """
         seen, reward, done, _, info = self.env.step(self._actions)
         self._earned += reward
         told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -69,7 +77,7 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         return seen, reward.astype(np.float32), done, told
 
     def _told(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        """Infos of the environments at the end of their episodes."""
+        """Info dictionaries of the environments at the end of their episodes, one per environment."""
         end = info["final_info"]
         rows = zip(info["final_obs"], self._earned, end["rho"], end["satisfied"], end["state"], strict=True)
         return [
@@ -90,20 +98,20 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Attribute of the environments, the same for each."""
+        """Value of an attribute, repeated for every environment, since all share it."""
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of all environments. Raises UsageError (U101) for a part of them."""
+        """Set an attribute of all environments. Raises UsageError (U101) if `indices` omits some."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise usage("all environments share their attributes", "leave `indices` out")
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Indices = None, **options: Any) -> list[Any]:
-        """Result of a method of the environments, called once."""
+        """Call a method once for all environments; return its result, repeated for every environment."""
         found = getattr(self.env, method_name)(*args, **options)
         return [found for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> Sequence[bool]:  # noqa: ARG002
-        """False for each environment."""
+        """False for each environment, since none is wrapped."""
         return [False for _ in self._get_indices(indices)]

@@ -1,4 +1,4 @@
-"""One environment: an episode on the model of a system, or in its world."""
+"""Environment with one agent, on the model of a system or in its world (the closed-loop simulation)."""
 
 from __future__ import annotations
 
@@ -30,28 +30,33 @@ AHEAD = 64
 
 
 class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
-    """Environment of one agent on the model of a system, or in its world, rewarded by a specification.
+    """Environment of one agent, rewarded by a specification.
 
-    An observation is the policy's observation, (k,) float32, followed by the elapsed share of the episode if
+    The agent moves on the model of a system, or in its world (the closed-loop simulation, with disturbances
+    and further agents if the system file declares them).
+
+    An observation, (k,) float32, is what the policy observes, followed by the elapsed share of the episode if
     the episode terminates at its end (the remaining return depends on it). Observations are clipped to finite
-    bounds: those of the states' nominal ranges and of random plans, widened by half. An action is the
-    actuator command, (m,) float32, in physical units, clipped to their range. `info` holds `state`, (n,)
-    float64; after the last step, and with the reward `dense` after each, also `robustness` by requirement,
-    `rho` of the whole, and `satisfied`. Robustness is that of the last horizon, of as much of it as there is
-    (`end = "truncate"`), clipped to ±10.
+    bounds: the nominal ranges of the states and the ranges that random plans reach, widened by half. An
+    action is the actuator command, (m,) float32, in physical units, clipped to the actuator's range. `info`
+    holds `state`, (n,) float64. After the last step, and with the reward `dense` after each step, it also
+    holds `robustness` per requirement, `rho` of the whole specification, and `satisfied`. Robustness is that
+    of the last horizon of the episode, or of the whole episode while it is shorter (windows are cut, `end =
+    "truncate"`), clipped to ±10.
 
     Args:
         task: specification and system.
-        steps: of an episode; by default the horizon of a plan, after which the episode is *terminated*. A
-            longer one continues in the world of the system and is *truncated*.
-        reward: `robustness` or `accuracy` of the episode (0 or 100), with the last step; `task`, the reward
-            of each step that the system file declares; or `dense`, the increase of the robustness in each
-            step.
-        normalised: observations and actions are from -1 to 1, which most learners expect.
+        steps: number of steps of an episode; by default the horizon of a plan, after which the episode is
+            *terminated*. A longer episode continues in the world of the system and is *truncated*.
+        reward: `robustness` or `accuracy` of the episode (0 or 100), given with the last step; `task`, the
+            reward of each step that the system file declares; or `dense`, the increase of the robustness in
+            each step.
+        normalised: whether observations and actions are scaled to [-1, 1], which most learners expect.
         time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
-        world: whether the agent is in the world of the system; None: only in longer episodes.
+        world: whether the agent moves in the world of the system; None: only in longer episodes.
 
-    Raises UsageError (U101) where there is no such reward, or a long episode is to be without a world.
+    Raises UsageError (U101) if there is no such reward, or if `world` is False for an episode longer than a
+    plan.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -90,11 +95,11 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode. The same seed gives the same episodes from here on.
+        """Begin an episode. The same seed gives the same sequence of episodes from this one on.
 
         Args:
-            seed: of all random numbers from here on.
-            options: `state`, (n,), an initial state in place of a random one.
+            seed: seed of all random numbers from this episode on.
+            options: `state`, (n,): an initial state instead of a random one.
         """
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
@@ -108,7 +113,11 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self._seen(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Advance by one step under `action`, (m,)."""
+        """Advance by one step under the action `action`, (m,).
+
+        Returns:
+            Observation, reward, whether the episode terminated, whether it was truncated, and `info`.
+        """
         if not 0 < len(self._driven) <= self.steps:
             raise usage("the episode is over", "call `reset` first")
         held = self._actuators.physical(action, unit=self.normalised)
@@ -121,7 +130,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self._seen(), self._earned(x, plan, info), over and whole, over and not whole, info
 
     def _earned(self, before: Tensor, plan: Tensor, info: Mapping[str, Any]) -> float:
-        """Reward of the last step, from the state `before` it, (1, n), under `plan`, (1, m)."""
+        """Reward of the last step, from the state `before`, (1, n), under the controls `plan`, (1, m)."""
         if self.reward == "dense":
             earned, self._rho = info["rho"] - self._rho, info["rho"]
             return float(earned)
@@ -139,7 +148,10 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self._bounds.shown(values.astype(np.float32), unit=self.normalised)
 
     def _told(self, *, judged: bool) -> dict[str, Any]:
-        """The state, and if `judged` the robustness of the last horizon of the episode, or of less."""
+        """Info after a step: the state and, if `judged`, the robustness of the last horizon of the episode.
+
+        While the episode is shorter than a horizon, its windows are cut.
+        """
         state = {"state": self._driven[-1][0].numpy(force=True).copy()}
         if not judged:
             return state
@@ -157,23 +169,23 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
 
 class _Motion(Protocol):
-    """What moves the agent; states are (1, n) float64."""
+    """Dynamics that move the agent: the model or the world of a system. States are (1, n) float64."""
 
     def seed(self, seed: int) -> None:
-        """Seed all random numbers from the next episode on."""
+        """Set the seed of all random numbers; it takes effect with the next episode."""
 
     def begin(self, state: Tensor | None) -> Tensor:
-        """Initial state of an episode: `state`, or a random one."""
+        """Begin an episode at `state`, or at a random state if None; return the initial state."""
 
     def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:
-        """State after step number `step` under `plan`, (1, m)."""
+        """State after step number `step` under the controls `plan`, (1, m)."""
 
     def seen(self, x: Tensor, step: int) -> Tensor:
-        """State as the agent sees it."""
+        """State `x` as the agent measures it at `step`, with sensor noise if there is any."""
 
 
 class _OnModel:
-    """Episodes on the model."""
+    """Dynamics of the model of the system."""
 
     def __init__(self, task: Task) -> None:
         self._episodes = Environments(task, 1, generator=torch.Generator(), ahead=AHEAD)
@@ -191,7 +203,7 @@ class _OnModel:
 
 
 class _InWorld:
-    """Episodes in the world of the system, each with a world of its own."""
+    """Dynamics of the world of the system (closed-loop simulation); each episode has a new world."""
 
     def __init__(self, task: Task, steps: int) -> None:
         self._task, self._steps, self._type = task, steps, world_type(task.system.decl)
@@ -223,13 +235,14 @@ def make(
     time: bool | None = None,
     world: bool | None = None,
 ) -> SpecEnv:
-    """Make the environment of a specification file and a system file (default: the one the former names).
+    """Make the environment of a specification file and a system file.
 
-    The other arguments are those of `SpecEnv`.
+    By default the system is the one that the specification names. For the other arguments see `SpecEnv`.
 
     Raises:
         UsageError: there is no such file, no system is named, or an argument is wrong.
-        SpecError, SystemFileError: a file is invalid, or they do not fit.
+        SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
+            together.
     """
     task = task_of(spec, system)
     return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time, world=world)

@@ -43,19 +43,22 @@ class Bounds:
         return cls(ends[:, 0].copy(), ends[:, 1].copy())
 
     def space(self, *, unit: bool) -> Any:
-        """The space between the bounds, (k,); with `unit` from -1 to 1."""
+        """Gymnasium space of vectors (k,) within the bounds; from -1 to 1 if `unit`."""
         if unit:
             return Box(-1.0, 1.0, self.low.shape, dtype=np.float32)
         return Box(self.low, self.high, dtype=np.float32)
 
     def physical(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
-        """Values (…, k) in physical units, clipped to the bounds; with `unit` they are given normalised."""
+        """Convert values (…, k) to physical units and clip them to the bounds.
+
+        `unit`: whether the given values are normalised to [-1, 1].
+        """
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         value = np.asarray(given, dtype=np.float64)
         return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)
 
     def shown(self, value: NDArray[np.float32], *, unit: bool) -> Floats:
-        """Physical values (…, k) clipped to the bounds; with `unit` normalised."""
+        """Clip physical values (…, k) to the bounds; if `unit`, normalise them to [-1, 1]."""
         if not unit:
             return np.clip(value, self.low, self.high)
         factor = 2.0 / (self.high - self.low)
@@ -65,14 +68,15 @@ class Bounds:
 
 
 def of_actuators(task: Task) -> Bounds:
-    """Ranges of the actuators."""
+    """Bounds of the actuators."""
     return Bounds.of(task.system.actuators)
 
 
 def of_observation(task: Task, *, time: bool) -> Bounds:
-    """Bounds of the policy's inputs: nominal ranges and those of random plans, widened by a quarter each way.
+    """Bounds of the observed values.
 
-    With `time` the elapsed share of the episode, from 0 to 1, is the last of them.
+    They cover the nominal ranges and the values that random plans reach, widened by a quarter at each end. If
+    `time`, the elapsed share of the episode, from 0 to 1, is the last observed value.
     """
     system = task.system
     generator = torch.Generator().manual_seed(0)
@@ -98,9 +102,10 @@ def of_observation(task: Task, *, time: bool) -> Bounds:
 
 
 def initial_state(task: Task, given: object, count: int) -> Tensor:
-    """Initial states of the option `state`: (n,) for all environments, or (count, n); float64.
+    """Initial states from the option `state` of `reset`, (count, n) float64.
 
-    Raises UsageError (U101) where the shape or a value is wrong.
+    The option is one state (n,) for all environments, or one per environment, (count, n). Raises UsageError
+    (U101) if its shape or a value is wrong.
     """
     width = len(task.system.names)
     x = torch.as_tensor(np.array(given, dtype=np.float64))
@@ -113,11 +118,12 @@ def initial_state(task: Task, given: object, count: int) -> Tensor:
 
 
 def task_of(spec: Path | str, system: Path | str | None) -> Task:
-    """The task of a specification file and a system file (default: the one the former names).
+    """Task of a specification file and a system file (by default the one that the specification names).
 
     Raises:
         UsageError: there is no such file, or no system is named.
-        SpecError, SystemFileError: a file is invalid, or they do not fit.
+        SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
+            together.
     """
     path = find_spec(spec)
     parsed = parse(read_source(path))

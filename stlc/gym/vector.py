@@ -26,26 +26,27 @@ Flags = NDArray[np.bool_]
 
 
 class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
-    """Episodes of one task on the model of its system, side by side in one batch.
+    """Environments of one task on the model of its system, simulated as one batch.
 
-    All episodes begin together, last one horizon and *terminate* together. Observations, (N, k), and actions,
-    (N, m), are those of `SpecEnv`. `info` holds `state`, (N, n) float64, and at the end of the episodes
-    `robustness` by requirement, `rho` of the whole, and `satisfied`, (N,) each; as in gymnasium's own vector
-    environments a key `_name` marks the environments that have `name`.
+    All episodes begin together, are as long as a plan, and *terminate* together. Observations, (N, k), and
+    actions, (N, m), are those of `SpecEnv`. `info` holds `state`, (N, n) float64, and at the end of the
+    episodes `robustness` per requirement, `rho` of the whole specification, and `satisfied`, (N,) each; as in
+    gymnasium's own vector environments a boolean array under `_NAME` marks the environments for which the key
+    `NAME` has a value.
 
     Args:
         task: specification and system.
         num_envs: number of environments, N.
-        reward: `robustness` or `accuracy` of the episode (0 or 100), with the last step, or `task`, the
+        reward: `robustness` or `accuracy` of the episode (0 or 100), given with the last step, or `task`, the
             reward of each step that the system file declares.
-        normalised: observations and actions are from -1 to 1, which most learners expect.
+        normalised: whether observations and actions are scaled to [-1, 1], which most learners expect.
         time: whether the elapsed share of the episode is observed.
-        autoreset: where episodes end. By default (`SAME_STEP`) the last step returns the observations of the
-            next initial states, `info["final_obs"]` and `info["final_info"]` hold those of the end. With
-            `NEXT_STEP` it returns the final observations, and the step after it begins the next episodes
-            without regard to actions, with reward 0.
+        autoreset: when the next episodes begin. By default (`SAME_STEP`) the last step of an episode returns
+            the observations of the next initial states, and `info["final_obs"]` and `info["final_info"]` hold
+            observations and info of the end. With `NEXT_STEP` the last step returns the final observations;
+            the following step ignores its actions, begins the next episodes and gives the reward 0.
 
-    Raises UsageError (U101) where there is no such reward, or an argument is wrong.
+    Raises UsageError (U101) if there is no such reward, or another argument is wrong.
     """
 
     def __init__(
@@ -81,17 +82,18 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     @property
     def steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self._episodes.steps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, Info]:
-        """Begin all episodes. The same seed gives the same episodes from here on.
+        """Begin all episodes. The same seed gives the same sequence of episodes from these on.
 
         Args:
-            seed: of all random numbers from here on, one for all environments.
-            options: `state`, (n,) or (N, n), initial states in place of random ones.
+            seed: seed of all random numbers from these episodes on, one number for all environments.
+            options: `state`, (n,) or (N, n): initial states instead of random ones.
 
-        Raises UsageError (U101) for a list of seeds, a part of the environments, or a wrong state.
+        Raises UsageError (U101) for a list of seeds, if only some environments are to be reset, or for a
+        wrong state.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise usage("all environments share one stream of random numbers", "give one seed, not several")
@@ -108,7 +110,12 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._shown(self._episodes.reset(start)), self._told(self._episodes.states)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Floats, NDArray[np.float64], Flags, Flags, Info]:
-        """Advance all environments by one step under `actions`, (N, m)."""
+        """Advance all environments by one step under `actions`, (N, m).
+
+        Returns:
+            Observations (N, k), rewards, whether episodes terminated, whether they were truncated (never),
+            (N,) each, and `info`.
+        """
         if not self._begun:
             raise usage("no episode has begun", "call `reset` first")
         none: Flags = np.zeros(self.num_envs, dtype=np.bool_)
@@ -128,14 +135,14 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._shown(moved.observation), reward, done, none, info
 
     def _plans(self, actions: NDArray[np.float32]) -> Tensor:
-        """Controls of the model, (N, m), for which actuators get `actions`."""
+        """Controls of the model, (N, m), under which the actuators receive `actions`."""
         if np.shape(actions) != self.action_space.shape:
             raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
         held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))
         return self.task.system.planned(self._episodes.states, held)
 
     def _shown(self, seen: Tensor) -> Floats:
-        """Observations (N, k) of the space from those of the episodes, whose last value is the time."""
+        """Observations of the environments, (N, k), from those of the episodes, which end with the time."""
         values = seen.numpy() if self.time else seen[:, :-1].numpy()
         return self._bounds.shown(values, unit=self.normalised)
 
@@ -143,7 +150,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._marked({"state": states.numpy(force=True)})
 
     def _at_end(self, moved: Transition, verdicts: PlanVerdicts) -> Info:
-        """Info of the last step of all episodes."""
+        """Info of all environments at the end of their episodes."""
         each = verdicts.requirements.clamp(-MOST, MOST).numpy(force=True)
         names = (rule.name for rule in self.task.rules)
         robustness = {name: each[:, i] for i, name in enumerate(names)}
@@ -157,12 +164,12 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._marked(end)
 
     def _marked(self, values: Info) -> Info:
-        """Info with the masks that gymnasium puts beside every key."""
+        """Info with the boolean arrays `_NAME` that gymnasium adds for every key `NAME`."""
         return values | {f"_{name}": self._all for name in values}
 
 
 def _objects(rows: Floats) -> NDArray[np.object_]:
-    """Array of the rows as objects, (N,), the form of `final_obs`."""
+    """Array of objects, (N,), whose entries are the rows of an array; `final_obs` has this form."""
     found = np.empty(len(rows), dtype=object)
     for i, row in enumerate(rows):
         found[i] = row
@@ -179,13 +186,15 @@ def make_vec(
     time: bool = True,
     autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
 ) -> SpecVectorEnv:
-    """Make many environments of a specification file and a system file (default: the one the former names).
+    """Make many environments of a specification file and a system file.
 
-    The other arguments are those of `SpecVectorEnv`.
+    By default the system is the one that the specification names. For the other arguments see
+    `SpecVectorEnv`.
 
     Raises:
         UsageError: there is no such file, no system is named, or an argument is wrong.
-        SpecError, SystemFileError: a file is invalid, or they do not fit.
+        SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
+            together.
     """
     task = task_of(spec, system)
     return SpecVectorEnv(task, num_envs, reward=reward, normalised=normalised, time=time, autoreset=autoreset)

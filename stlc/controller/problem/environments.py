@@ -135,14 +135,14 @@ class Environments:
 
     @torch.no_grad()
     def reset(self, states: Tensor | None = None) -> Tensor:
-        """Begin all episodes at new initial states, or at `states` (N, n), and return observations (N, k)."""
+        """Begin all episodes at random initial states, or at `states` (N, n); return observations (N, k)."""
         self._begin(self._starts() if states is None else states.double())
         if self._native is not None:
             return self._native.look(self.states, 0.0)
         return self.observe(self.states, 0).float()
 
     def seed(self, seed: int) -> None:
-        """Set the seed of the initial states from the next reset on; states drawn ahead are discarded."""
+        """Seed the random initial states; it takes effect at the next `reset`."""
         self._generator.manual_seed(seed)
         self._drawn = self._drawn[:0]
 
@@ -166,7 +166,12 @@ class Environments:
         return Transition(self.reset(), reward, done, final, verdicts.rho.float(), verdicts, states)
 
     def _moved(self, held: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States after a step, their observations, and declared rewards (0 unless the reward is `task`)."""
+        """Make one step under the clipped actions `held`, (N, m), without restarting episodes.
+
+        Returns:
+            States after the step (N, n), their observations (N, k), and rewards (N,): those that the system
+            declares if the reward is `task`, else 0.
+        """
         share = self._step / self.steps
         if self._native is not None:
             after, seen, reward = self._native.advance(self.states, held, share)
@@ -184,11 +189,11 @@ class Environments:
         self._actions = self._blank()
 
     def _blank(self) -> Tensor:
-        """Array of zeros for the actions of an episode, (N, T, m)."""
+        """Array of zeros in which the actions of an episode are stored, (N, T, m)."""
         return torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
 
     def _starts(self) -> Tensor:
-        """Initial states, (N, n) float64."""
+        """Draw random initial states, (N, n) float64."""
         if len(self._drawn) < self.count:
             drawn = max(self.count, self._ahead)
             self._drawn = self.task.sample(drawn, generator=self._generator, dtype=torch.float64)

@@ -1,7 +1,7 @@
 """C code of one step of a system, with its observation and reward, for many states at once.
 
-Switching is exact, numbers are double, and `LANES` states are computed at a time; observations are float32,
-the input of learners.
+Switching is exact, numbers are double, and `LANES` state vectors are computed at a time; observations are
+float32, the input of learners.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from stlc.compile.ir import nodes as ir
 def emit_advance(
     motion: Motion, *, observed: Sequence[ir.Num], reward: ir.Num | None, commands: Mapping[str, ir.Num]
 ) -> str:
-    """Return the C source of `advance` (a step) and `look` (an observation).
+    """Return the C source of the functions `advance` (one step) and `look` (one observation).
 
     Their signatures are described in `stlc.native.Advance`.
 
     Args:
         motion: one step of the system.
         observed: expressions of the states that the policy reads.
-        reward: reward of a step, an expression of the states after the step and the commands in it; None: no
-            reward.
+        reward: reward of a step, an expression of the states after the step and of the actuator commands of
+            the step; None: no reward.
         commands: control -> actuator command, an expression of the states before the step and the controls;
             for a control that is not listed, the actuator gets the control itself.
 
@@ -57,7 +57,7 @@ def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
 
 
 def _writer(motion: Motion) -> NumberWriter:
-    """Writer of expressions of the states `x` and the controls `u`, for one state vector, number `j`."""
+    """Writer of C expressions of states `x` and controls `u`, each for the state vector with index `j`."""
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
@@ -71,7 +71,7 @@ def _writer(motion: Motion) -> NumberWriter:
 
 
 def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
-    """C statements of a step: next states `y` and commands `c` from states `x` and controls `u`."""
+    """C statements of a step, which compute next states `y` and actuator commands `c` from `x` and `u`."""
     index, writer = state_index(motion), _writer(motion)
     given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
     for name, num in motion.lets:
@@ -82,7 +82,7 @@ def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
 
 
 def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
-    """C statements that write expressions of states `x` and commands `u` to `y`."""
+    """C statements that store the values of expressions of states `x` and commands `u` in `y`."""
     writer = _writer(motion)
     values = [writer.number(num) for num in numbers]
     return [*writer.lines, *(f"y[{i}][j] = {value};" for i, value in enumerate(values))]

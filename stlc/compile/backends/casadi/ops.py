@@ -190,7 +190,7 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask` is true, else -inf; `GREAT` instead of infinity if the mask depends on data."""
+        """+inf where `mask` is true, else -inf; if the mask is symbolic, `GREAT` instead of infinity."""
         rows = []
         for each in mask.rows():
             size = math.inf if each.entries.is_constant() else GREAT
@@ -252,7 +252,7 @@ class CasadiOps:
         return self.cat(rows)
 
     def extrema(self, x: SymbolicColumn, pick: Pick, window: Sliding) -> None:
-        """Return None: there is no special method for windows."""
+        """Return None: there is no special method for extrema over sliding windows."""
 
     def until(self, left: SymbolicColumn, right: SymbolicColumn, pick: Pick, window: Sliding) -> None:
         """Return None: there is no special method for `until`."""
@@ -260,7 +260,7 @@ class CasadiOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None: constants are floats for all arrays."""
+        """Return None: constants are floats, whatever the array."""
         return None
 
     def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002
@@ -292,7 +292,7 @@ class CasadiOps:
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: SymbolicColumn, value: float) -> SymbolicColumn:
-        """Copy of `x` with `value` in the rows where `keep` is False."""
+        """Copy of `x` in which the samples where `keep` is False have the value `value`."""
         blank = casadi.SX(value)
         return SymbolicColumn(casadi.vertcat(*(x[k].entries if keep[k] else blank for k in range(len(x)))))
 
@@ -314,7 +314,7 @@ def _rounded(a: Any, b: Any, sign: float) -> Any:
 
 
 def _is(x: SymbolicColumn, value: float) -> bool:
-    """True if `x` is the constant `value`."""
+    """True if `x` is a constant that equals `value`."""
     return bool(x.entries.is_constant()) and float(x.entries) == value
 
 

@@ -1,10 +1,10 @@
 """Multiple shooting: planning as a nonlinear program, made from dynamics and formulas of the IR.
 
-All states that controls affect are variables, tied by the dynamics as equality constraints (Bock & Plitt
-1984). A clamped state is bounded to its range, and a penalized correction in the dynamics replaces the part
-that the clamp cuts off. Every condition that a formula requires at a sample is a constraint
-`value + shortfall >= margin`; minima and maxima within a condition are log-sum-exp (Pant et al. 2017). States
-that no control affects are data.
+All states that controls affect are variables of the program; the dynamics are equality constraints (Bock &
+Plitt 1984). A clamped state is bounded to its range; the part that the clamp cuts off is a further variable
+in the dynamics, which the cost penalises. Every condition that a formula requires at a sample is a constraint
+`value + shortfall >= margin`, with one shortfall to be minimised; minima and maxima within a condition are
+log-sum-exp (Pant et al. 2017). States that no control affects are parameters of the program.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class NotSmoothError(Exception):
 @final
 @dataclass(frozen=True, slots=True)
 class Eased:
-    """Smooth indicators of conditions (Eq. 6 of the paper), whose slope is limited to `sharpness`."""
+    """Smooth indicators of conditions (Eq. 6 of Meng and Fan 2023), whose slope is limited to `sharpness`."""
 
     exact: ClassVar[bool] = False
     sharpness: float
@@ -84,7 +84,7 @@ class Motion:
     horizon: int
 
     def reached(self) -> frozenset[str]:
-        """Names of the states and intermediate variables that controls affect, and of the controls."""
+        """Names of the controls, and of the states and intermediate variables that controls affect."""
         found, before = set(self.bounds), -1
         while len(found) > before:
             before = len(found)
@@ -92,7 +92,7 @@ class Motion:
         return frozenset(found)
 
     def needed(self, columns: Iterable[str]) -> frozenset[str]:
-        """Names of the signals and intermediate variables that `columns` depend on, `columns` included."""
+        """Names of `columns`, and of the signals and intermediate variables on which they depend."""
         table: dict[str, set[str]] = {}
         for name, num in (*self.lets, *self.step.items()):
             table.setdefault(name, set()).update(_names(num))
@@ -195,7 +195,7 @@ class Shooting:
         self._demands = int(values.shape[0])
 
     def _moved(self, env: Mapping[str, SymbolicColumn]) -> Mapping[str, SymbolicColumn]:
-        """States one step later: name -> series (steps, 1), from series (steps, 1) of states and controls."""
+        """States after each step, name -> series (steps, 1), from the series of states and controls."""
         steps = self._motion.horizon
         known = {**env, ir.ELAPSED: CASADI.counted(0, steps, None)}
         for name, num in self._lets:
@@ -224,7 +224,7 @@ class Shooting:
     def limits(self, *, maximise: bool) -> dict[str, Vector]:
         """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), as CasADi expects them.
 
-        With `maximise`, the shortfall may become negative, so that robustness beyond the margin is rewarded.
+        If `maximise`, the shortfall may become negative, so that robustness beyond the margin is rewarded.
         """
         motion, steps = self._motion, self._motion.horizon
         free = (-math.inf, math.inf)
@@ -248,7 +248,8 @@ class Shooting:
         """Data of the program for one initial state.
 
         Args:
-            columns: signal name -> values (T + 1,); those of the data must not depend on the plan.
+            columns: signal name -> values (T + 1,); the first values of the states are read, and all values
+                of the signals in `given`.
             margin: robustness that every condition should reach.
         """
         first = [columns[name][0] for name in self.states]
@@ -287,7 +288,7 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals that an expression reads at the first sample, whatever the instant."""
+    """Names of the signals of which an expression reads the value at the first sample, at every instant."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 
@@ -308,7 +309,7 @@ def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
 
 
 def _holds(row: SymbolicColumn) -> bool:
-    """True if `row` is a constant that is not negative, so that a condition always holds."""
+    """True if `row` is a nonnegative constant, so that the condition with this robustness always holds."""
     return bool(row.entries.is_constant()) and float(row.entries) >= 0.0
 
 

@@ -1,1 +1,1 @@
-"""Mixed-integer linear back end: plans of piecewise linear systems as a feasibility problem."""
+"""Mixed-integer linear back end: encodes the search for a plan of a piecewise linear system."""

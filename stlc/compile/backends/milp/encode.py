@@ -1,9 +1,11 @@
-"""Encoding of dynamics and formulas of the IR from one initial state, as a mixed-integer linear model.
+"""Encoding of dynamics and formulas of the IR as a mixed-integer linear model, for one initial state.
 
-Columns that no control reaches are numbers and fold away. A tight encoding keeps the conditions of the
-dynamics by `MARGIN`, so that its solutions are plans; a relaxed one contains every satisfying plan, so that
-its infeasibility is a proof. Both are exact up to `MARGIN` but for norms, whose circles are polygons with
-`SIDES` sides: inscribed in the tight encoding, circumscribed in the relaxed one.
+Signals that no control affects are constants, and expressions of constants are evaluated at once. The
+encoding is tight or relaxed. In a tight encoding the conditions in the dynamics hold or fail with a margin of
+at least `MARGIN`, so that every solution is a plan. A relaxed encoding has every satisfying plan among its
+solutions, so that its infeasibility proves that there is none. Both are exact up to `MARGIN` except for
+norms, whose circles are replaced by polygons with `SIDES` sides, such that a condition becomes stronger in
+the tight encoding and weaker in the relaxed one.
 """
 
 from __future__ import annotations
@@ -37,19 +39,19 @@ SIDES = 16
 
 @dataclass(frozen=True, slots=True)
 class Greatest:
-    """The greatest of some values; the least is minus the greatest of minus them."""
+    """Maximum of some values. A minimum is expressed as minus the maximum of the negated values."""
 
     items: tuple[Expression, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Conditional:
-    """One value where a condition holds, else another.
+    """Conditional value: one value if a condition holds, else another.
 
     Attributes:
-        yes, no: the values.
+        yes, no: the value if the condition holds, and the value if it fails.
         holds: the condition as a tree.
-        fails: its negation as a tree.
+        fails: negation of the condition as a tree.
     """
 
     yes: Expression
@@ -77,7 +79,9 @@ Atom: TypeAlias = "Greatest | Conditional | Norm | Square"
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """An affine form plus atoms with coefficients, which become variables only where they must.
+    """Affine form plus a linear combination of atoms (maxima, conditional values, norms, squares).
+
+    An atom is replaced by variables of the program only where that is necessary.
 
     Attributes:
         form: the affine part.
@@ -100,22 +104,23 @@ class Expression:
 
     @property
     def known(self) -> float | None:
-        """The value of a constant; None otherwise."""
+        """The number if the value is a constant; None otherwise."""
         return None if self.atoms or self.form.terms else self.form.const
 
 
 def number(value: float) -> Expression:
-    """A constant."""
+    """A constant as an expression."""
     return Expression(constant(value))
 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """A formula to hold at the first sample.
+    """Formula that must hold at the first sample.
 
     Attributes:
-        formula: of the IR.
-        margin: least value of its predicates, affine; time tests have none.
+        formula: formula of the IR.
+        margin: affine form that the robustness of its predicates must reach; predicates on time have no
+            margin.
     """
 
     formula: ir.Formula
@@ -127,11 +132,14 @@ Row: TypeAlias = dict[str, Expression]
 
 
 class Encoding:
-    """The model of plans from one initial state.
+    """Mixed-integer linear model whose solutions are plans from one initial state.
+
+    `tight` selects the tight encoding, in which every solution is a plan; otherwise it is relaxed, so that
+    every satisfying plan is a solution.
 
     Attributes:
-        model: variables and rows.
-        rows: columns at each sample, T + 1 of them.
+        model: variables and constraints of the program.
+        rows: values of the signals at each of the T + 1 samples, by name.
         controls: variables of the plan, (T, m).
     """
 
@@ -159,19 +167,20 @@ class Encoding:
     ) -> list[Tree]:
         """Encode the dynamics over a horizon, and requirements at the first sample.
 
-        What a requirement demands of every state bounds the states before the next step is encoded, which
-        decides many of its conditions.
+        A requirement that must hold in every state, such as `always`, bounds the state variables before the
+        next step is encoded. These bounds decide many of the conditions in that step.
 
         Args:
-            x0: initial state, column -> value.
+            x0: initial state, name -> value.
             bounds: control -> its range.
             lets: intermediate results of a step, in order.
-            step: moving state -> its value one step later.
+            step: name of a state that changes -> expression of its value one step later.
             horizon: number of steps.
-            requirements: formulas with the margin of their predicates.
+            requirements: formulas that must hold at the first sample, with the margin of their predicates.
 
         Returns:
-            The conditions that the requirements hold, not yet required.
+            For each requirement the condition that it holds; the conditions are not yet constraints of the
+            model.
 
         Raises:
             UnencodableError: an expression has no mixed-integer linear form.
@@ -201,7 +210,7 @@ class Encoding:
         return [self._tree(each.formula, 0, each) for each in requirements]
 
     def _invariants(self, requirements: Sequence[Demand], row: Row, k: int) -> None:
-        """Bound the states of sample `k` by what requirements demand of it, whatever the plan."""
+        """Bound the states of sample `k` by the conditions that every satisfying plan meets there."""
         self.rows.append(row)
         for each in requirements:
             for body in self._demanded(each.formula, k, each):
@@ -213,7 +222,7 @@ class Encoding:
         self.rows.pop()
 
     def _demanded(self, formula: ir.Formula, k: int, what: Demand) -> Iterator[ir.Formula]:
-        """State formulas that hold at sample `k` wherever `formula` holds at the first."""
+        """Subformulas on the states alone that hold at sample `k` in any trace that satisfies `formula`."""
         match formula:
             case ir.Predicate() if k == 0:
                 yield formula
@@ -233,7 +242,7 @@ class Encoding:
     # ------------------------------------------------------------------- formulas
 
     def _tree(self, formula: ir.Formula, k: int, what: Demand) -> Tree:
-        """The condition that a part of a requirement holds at sample `k`."""
+        """Condition that the subformula `formula` of the requirement `what` holds at sample `k`."""
         key = id(what), id(formula), k
         if key not in self._trees:
             self._trees[key] = self._formula(formula, k, what)
@@ -270,7 +279,17 @@ class Encoding:
     def _until(
         self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Demand
     ) -> Tree:
-        """`until`, or its dual `release`: min and max exchanged."""
+        """Condition of `until` at sample `k` or, if `strong` is False, of its dual `release`.
+
+        Args:
+            strong: True for `until`; False for `release`, in which conjunctions and disjunctions are
+                exchanged.
+            k: sample at which the formula is evaluated.
+            samples: samples of the window at which `right` may hold.
+            left: left operand.
+            right: right operand.
+            margin: requirement that the formula belongs to.
+        """
         inner, outer = ("and", "or") if strong else ("or", "and")
         found = []
         for j in samples:
@@ -293,7 +312,7 @@ class Encoding:
         return self._condition(value, ZERO if node.guard else margin, node.num)
 
     def _decided(self, cond: ir.Formula, k: int, *, holds: bool) -> Tree:
-        """The condition that a state formula holds, or does not, at sample `k`."""
+        """Condition that the formula `cond` of states holds, or does not hold, at sample `k`."""
         match cond:
             case ir.Truth(truth):
                 return truth == holds
@@ -308,7 +327,10 @@ class Encoding:
         raise UnencodableError("a condition over time")
 
     def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` as a tree of affine conditions: extrema and choices are split."""
+        """`value >= margin` as a tree of affine conditions, with a case distinction for maxima and conditionals.
+
+        `num` is the expression that is shown if there is no mixed-integer linear form.
+        """
         for index, (factor, atom) in enumerate(value.atoms):
             rest = Expression(value.form, value.atoms[:index] + value.atoms[index + 1 :])
             match atom:
@@ -324,7 +346,7 @@ class Encoding:
         return self._polynomial(value, margin, num)
 
     def _polynomial(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` for a value without extrema and choices, quadratic at most."""
+        """`value >= margin` for a value that is at most quadratic, without maxima and conditional values."""
         squares: dict[int, float] = {}
         for factor, atom in value.atoms:
             if not isinstance(atom, Square):
@@ -351,7 +373,7 @@ class Encoding:
         return False if high < 0.0 else Leaf(form, margin)
 
     def _quadratic(self, variable: int, a: float, form: Affine) -> Tree:
-        """`a x^2 + b x + c >= 0`, split at its roots."""
+        """`a x^2 + form >= 0`, with x the given variable and `form` affine in x, split at the roots."""
         b, c = form.terms.get(variable, 0.0), form.const
         inside = b * b - 4.0 * a * c
         if inside <= 0.0:
@@ -376,7 +398,10 @@ class Encoding:
         return self._circle(constant(-sign * math.sqrt(-rest)), sign, tuple(parts), ZERO)
 
     def _circle(self, form: Affine, factor: float, parts: Sequence[Affine], margin: Affine) -> Tree:
-        """`form + factor * norm(parts) >= margin` by a polygon: a sound or a complete one."""
+        """`form + factor * norm(parts) >= margin`, with a polygon instead of the circle.
+
+        The condition becomes stronger in a tight encoding and weaker in a relaxed one.
+        """
         if len(parts) == 1:
             both = (form.plus(parts[0], factor), form.plus(parts[0], -factor))
             return junction("or" if factor > 0.0 else "and", [self._leaf(each, margin) for each in both])
@@ -397,7 +422,7 @@ class Encoding:
     # -------------------------------------------------------------------- numbers
 
     def _number(self, num: ir.Num, k: int) -> Expression:
-        """The value of a number at sample `k`."""
+        """Value of the expression `num` at sample `k`."""
         key = id(num), k
         if key not in self._numbers:
             self._numbers[key] = self._value(num, k)
@@ -458,7 +483,7 @@ class Encoding:
         return self._greatest([above.times(-1.0), args[2].times(-1.0)]).times(-1.0)
 
     def _greatest(self, items: Sequence[Expression]) -> Expression:
-        """The greatest value, without those that the bounds exclude."""
+        """Maximum of values; values that cannot be the greatest, by their bounds, are left out."""
         ends = [(-math.inf, math.inf) if v.atoms else self.model.bounds(v.form) for v in items]
         least = max(low for low, _ in ends)
         left = [i for i, (_, high) in enumerate(ends) if high > least]
@@ -469,10 +494,10 @@ class Encoding:
         return Expression(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
 
     def _held(self, args: Sequence[Expression]) -> Expression | None:
-        """`clip(v + c u, low, high)` without saturation; None if that excludes a value of it.
+        """`clip(v + c u, low, high)` as a variable within [low, high]; None if that would exclude solutions.
 
-        A control that is read nowhere else can reach each bound exactly instead of beyond it, wherever v lies
-        within the bounds.
+        A control u that no other expression reads can be chosen such that the sum reaches a bound exactly
+        instead of exceeding it, provided that v itself lies within the bounds.
         """
         form, low, high = args[0].form, args[1].known, args[2].known
         free = self._free & form.terms.keys()
@@ -505,7 +530,7 @@ class Encoding:
         raise UnencodableError(show_number(num))
 
     def _remainder(self, form: Affine, divisor: float) -> Expression:
-        """`form` modulo a constant, through a whole number."""
+        """`form` modulo the constant `divisor`, encoded with an integer variable for the quotient."""
         low, high = self.model.bounds(form.times(1.0 / divisor))
         if math.floor(low) == math.floor(high):
             return Expression(form.plus(constant(-divisor * math.floor(low))))
@@ -515,7 +540,7 @@ class Encoding:
         return Expression(rest)
 
     def _linear(self, value: Expression, num: ir.Num) -> Affine:
-        """The value as one variable: extrema and choices get binary variables."""
+        """Value as a variable; maxima and conditional values are encoded with binary variables."""
         form = value.form
         for factor, atom in value.atoms:
             match atom:
@@ -529,7 +554,7 @@ class Encoding:
         return self.model.named(form)
 
     def _extremum(self, forms: Sequence[Affine]) -> Affine:
-        """A variable that equals the greatest of some forms."""
+        """New variable that equals the maximum of affine forms."""
         model = self.model
         ends = [model.bounds(form) for form in forms]
         found = model.variable(max(low for low, _ in ends), max(high for _, high in ends))
@@ -544,7 +569,10 @@ class Encoding:
         return found
 
     def _switched(self, yes: Affine, no: Affine, holds: Tree, fails: Tree) -> Affine:
-        """A variable that equals one of two forms by a condition."""
+        """Affine form that equals `yes` if a condition holds and `no` if it fails.
+
+        `holds` is the condition as a tree, `fails` its negation.
+        """
         model, binary = self.model, self.model.binary()
         model.imply(constant(1.0).plus(binary, -1.0), holds)
         model.imply(binary, fails)
@@ -568,20 +596,20 @@ _FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {
 
 
 def _read_once(names: set[str], nums: Sequence[ir.Num]) -> set[str]:
-    """Which of the columns are read exactly once by some numbers."""
+    """Those of the signals `names` that the expressions `nums` read exactly once in total."""
     reads = [leaf.name for num in nums for leaf in leaves(num) if isinstance(leaf, ir.Signal)]
     return {name for name in names if reads.count(name) == 1}
 
 
 def _of_state(formula: ir.Formula) -> bool:
-    """True for a formula about one sample."""
+    """True if the formula is about the signals at a single sample, without temporal operators."""
     return all(isinstance(node, ir.Truth | ir.Predicate | ir.BoolOp) for node in nodes(formula)) and not any(
         isinstance(leaf, ir.ShiftedSignal) for num in numbers(formula) for leaf in leaves(num)
     )
 
 
 def _conjuncts(tree: Tree) -> Iterator[Tree]:
-    """The conditions whose conjunction a tree is."""
+    """Conditions whose conjunction equals the tree."""
     if isinstance(tree, Junction) and tree.op == "and":
         for item in tree.items:
             yield from _conjuncts(item)
@@ -590,7 +618,7 @@ def _conjuncts(tree: Tree) -> Iterator[Tree]:
 
 
 def _scaled(one: Expression, other: Expression) -> Expression | None:
-    """The product of a choice between two constants and another value; None if `one` is no such choice."""
+    """Product of two values, if `one` is a choice between two constants; None otherwise."""
     match one.atoms:
         case ((factor, Conditional(yes, no, holds, fails)),) if not one.form.terms:
             if yes.known is None or no.known is None:

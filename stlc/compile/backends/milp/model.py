@@ -1,7 +1,8 @@
 """Mixed-integer linear models: variables with bounds, affine forms, rows, and trees of conditions.
 
-A tree of conditions is required through implications only: a binary variable that is 1 implies its condition.
-Each big-M is the least one that the bounds of its row allow.
+A tree of conditions is a conjunction or disjunction of affine conditions. Each condition is tied to a binary
+variable in one direction only: if the variable is 1, the condition holds. Each big-M is the least one that
+the bounds of the variables in its row allow.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 
 class UnencodableError(Exception):
-    """An expression without an exact or a bounded mixed-integer linear form."""
+    """Error: an expression has no mixed-integer linear form, or none with bounded variables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class Affine:
     const: float
 
     def plus(self, other: Affine, factor: float = 1.0) -> Affine:
-        """This form plus `factor` times another."""
+        """This affine form plus `factor` times another."""
         if not other.terms:
             return Affine(self.terms, self.const + factor * other.const)
         terms = dict(self.terms)
@@ -45,7 +46,7 @@ class Affine:
         return Affine(terms, self.const + factor * other.const)
 
     def times(self, factor: float) -> Affine:
-        """This form times a constant."""
+        """This affine form times a constant."""
         if factor == 1.0:
             return self
         if not factor:
@@ -63,12 +64,13 @@ def constant(value: float) -> Affine:
 
 @dataclass(eq=False, slots=True)
 class Leaf:
-    """The condition `form >= margin`; a time test has no margin.
+    """The condition `form >= margin`.
 
     Attributes:
-        form: affine.
-        margin: affine, such as the robustness that is maximised.
-        literal: binary variable that implies it; None before one was needed.
+        form: affine form.
+        margin: affine form, such as the variable of the robustness that is maximised; 0 for predicates on
+            time.
+        literal: index of the binary variable that implies the condition; None until one is needed.
     """
 
     form: Affine
@@ -89,7 +91,7 @@ Tree: TypeAlias = "Leaf | Junction | bool"
 
 
 def junction(op: Literal["and", "or"], items: Iterable[Tree]) -> Tree:
-    """The conjunction or disjunction of some conditions, constants folded."""
+    """Conjunction or disjunction of conditions, simplified where conditions are constants."""
     found: list[Tree] = []
     for item in items:
         if isinstance(item, bool):
@@ -106,15 +108,15 @@ def junction(op: Literal["and", "or"], items: Iterable[Tree]) -> Tree:
 
 @dataclass(frozen=True, slots=True)
 class Arrays:
-    """A model as arrays, for a solver.
+    """A model as arrays, with the matrix of its rows in compressed row format, for a solver.
 
     Attributes:
         lower, upper: bounds of the variables, (n,).
         integer: whether a variable is an integer, (n,).
-        starts: first entry of each row, (rows + 1,).
-        indices, values: variables and coefficients of the rows' entries.
+        starts: index of the first entry of each row, (rows + 1,).
+        indices, values: index of the variable, and coefficient, of each entry.
         row_lower, row_upper: bounds of the rows, (rows,).
-        cost: to be minimised, (n,).
+        cost: coefficients of the cost that is minimised, (n,).
     """
 
     lower: NDArray[np.float64]
@@ -133,7 +135,8 @@ class Model:
     """A mixed-integer linear model under construction.
 
     Attributes:
-        feasible: False once a row without variables was violated.
+        feasible: False if a constraint without variables is violated, or the bounds of a variable are
+            contradictory.
     """
 
     feasible: bool = True
@@ -158,7 +161,7 @@ class Model:
         return self._integer[index] and self._lower[index] == 0.0 and self._upper[index] == 1.0
 
     def bounds(self, form: Affine) -> tuple[float, float]:
-        """Least and greatest value of a form within the variables' bounds."""
+        """Least and greatest value of an affine form within the bounds of the variables."""
         low = high = form.const
         for index, value in form.terms.items():
             ends = value * self._lower[index], value * self._upper[index]
@@ -166,7 +169,10 @@ class Model:
         return low, high
 
     def most(self, tree: Tree) -> float:
-        """The greatest value of the forms that a condition compares, by the bounds; +inf where it is true."""
+        """Upper bound on the margin by which a condition can hold, from the bounds of the variables.
+
+        It is inf for a condition that is True and -inf for one that is False.
+        """
         if isinstance(tree, bool):
             return math.inf if tree else -math.inf
         if isinstance(tree, Leaf):
@@ -174,7 +180,10 @@ class Model:
         return (min if tree.op == "and" else max)(map(self.most, tree.items))
 
     def tighten(self, form: Affine, lower: float) -> None:
-        """Require a form of one variable to be at least `lower`, by the variable's bounds; skip others."""
+        """Require `form >= lower` by tightening the bound of its variable.
+
+        A form with more than one variable, or none, is ignored.
+        """
         if len(form.terms) != 1:
             return
         ((index, factor),) = form.terms.items()
@@ -191,14 +200,14 @@ class Model:
         self._upper[index] = max(self._lower[index], min(self._upper[index], upper))
 
     def require(self, form: Affine, lower: float = 0.0, upper: float = math.inf) -> None:
-        """Add the row `lower <= form <= upper`."""
+        """Add the constraint `lower <= form <= upper`."""
         if not form.terms:
             self.feasible &= lower <= form.const <= upper
             return
         self._rows.append((form.terms, lower - form.const, upper - form.const))
 
     def named(self, form: Affine) -> Affine:
-        """A variable that equals a form; the form itself if it has at most one term."""
+        """Variable that equals an affine form; the form itself if it has at most one term."""
         if len(form.terms) <= 1:
             return form
         low, high = self.bounds(form)
@@ -207,7 +216,7 @@ class Model:
         return found
 
     def product(self, binary: Affine, form: Affine) -> Affine:
-        """A variable that equals a binary variable times a form (McCormick; exact)."""
+        """Variable that equals a binary variable times an affine form (McCormick envelope, exact here)."""
         low, high = self.bounds(form)
         found = self.variable(min(low, 0.0), max(high, 0.0))
         self.require(found.plus(binary, -low))
@@ -217,7 +226,7 @@ class Model:
         return found
 
     def imply(self, off: Affine, tree: Tree) -> None:
-        """Require a condition wherever `off`, which is a whole number from 0 on, is 0."""
+        """Require a condition whenever the affine form `off`, a nonnegative integer, is 0."""
         if isinstance(tree, bool):
             if not tree:
                 self.require(off, 1.0)
@@ -236,7 +245,7 @@ class Model:
             self.require(total, 1.0)
 
     def literal(self, tree: Leaf | Junction | bool) -> Affine:
-        """A binary variable that implies a condition; one per condition."""
+        """Binary variable that implies a condition; the same one if the condition is given again."""
         if isinstance(tree, bool):
             return constant(float(tree))
         if tree.literal is None:
@@ -246,7 +255,7 @@ class Model:
         return Affine({tree.literal: 1.0}, 0.0)
 
     def arrays(self, cost: Affine = ZERO) -> Arrays:
-        """The model with a cost to minimise, as arrays."""
+        """The model as arrays, with an affine form to minimise."""
         lengths = [len(terms) for terms, _, _ in self._rows]
         costs = np.zeros(len(self._lower))
         for index, value in cost.terms.items():
