@@ -1,1 +1,1 @@
-"""The other commands, a file each."""
+"""The commands of the program, one file each."""

@@ -120,7 +120,10 @@ def check(
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
-    """Print remarks, unsatisfied results in full, and a table if there are several files."""
+    """Print a single result in full; of several, those that are not satisfied, and a table.
+
+    Remarks and warnings are printed first.
+    """
     from stlc.cli.check.many import summary
 
     shown = set()
@@ -139,7 +142,7 @@ def _print(outcomes: Sequence[Outcome]) -> None:
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
-    """The specification, if the first file is one, and the traces."""
+    """Split the arguments into the specification (the option, or the first file if it is one) and traces."""
     specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
     traces = [name for name in files if name not in specs]
     if len(specs) > 1 or (specs and spec is not None):

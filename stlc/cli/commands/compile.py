@@ -89,7 +89,7 @@ def _trees(
 
 
 def _files(spec: Path, system: str | None) -> list[str]:
-    """The files to watch: the specification, and the system file if it is found."""
+    """Files to watch: the specification, and the system file if there is one."""
     from stlc.diagnostics import StlcError
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
@@ -108,7 +108,7 @@ def _compiled(
     set_: list[str] | None,
     show: Literal["all", "steps", "states", "ir"],
 ) -> Answer[documents.CompiledSpec]:
-    """Read both files and run the compiler; torch is not needed.
+    """Read the specification and the system file and compile the specification, without torch.
 
     A specification that judges closed-loop runs of its system is compiled for recorded traces.
     """
@@ -191,7 +191,10 @@ def _requirement(rule: CompiledRequirement, dt: float) -> documents.RequirementI
 
 
 def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[documents.WrittenInterval]:
-    """The windows of a compiled formula; an upper end of None is the end of the trace."""
+    """Intervals of the temporal operators in a compiled formula, in seconds and in steps.
+
+    An upper end of None is the end of the trace.
+    """
     from stlc.compile.ir import nodes as ir
     from stlc.compile.ir.traverse import nodes
 

@@ -40,7 +40,10 @@ def doctor(
 
 
 def _finding(name: str, state: Literal["ok", "missing", "off"], detail: str) -> InstallationFinding:
-    """A checked item; its state "off" means that it is missing, but only some commands need it."""
+    """One line of the report on the installation.
+
+    The state "off" means that the item is missing, but only some commands need it.
+    """
     return {"name": name, "state": state, "detail": detail}
 
 
@@ -63,7 +66,7 @@ def _packages() -> Iterator[InstallationFinding]:
 
 
 def _optional() -> dict[str, str]:
-    """Package -> the extra that installs it, from the metadata of stlc."""
+    """Optional packages: name -> name of the extra that installs it, read from the metadata of stlc."""
     from importlib.metadata import PackageNotFoundError, requires
 
     try:
@@ -115,7 +118,7 @@ def _tools() -> Iterator[InstallationFinding]:
 
 
 def _cache() -> InstallationFinding:
-    """The cache folder of kernels and parser tables."""
+    """Finding on the folder in which compiled kernels and parser tables are cached."""
     from stlc.cache import Unusable, opened, why_not
 
     try:
@@ -131,7 +134,7 @@ def _cache() -> InstallationFinding:
 
 
 def _compiler() -> InstallationFinding:
-    """Finding on how plans are evaluated (C kernels or torch), and on remembered failures of the compiler."""
+    """Finding on how plans are evaluated (in C or in torch), and on compiler failures that were recorded."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()
@@ -148,7 +151,7 @@ def _compiler() -> InstallationFinding:
 
 
 def _completion() -> str:
-    """The file that completes commands in the user's shell; "" if there is none."""
+    """Path of the file that completes commands in the user's shell; "" if there is none."""
     try:
         home = Path.home()
     except (RuntimeError, OSError):

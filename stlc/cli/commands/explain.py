@@ -100,7 +100,7 @@ def _page(name: str) -> Answer[documents.ManualPage]:
 
 
 def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
-    """Every requirement of a specification in English."""
+    """Translate every requirement of a specification into English."""
     from stlc.files import find_spec, read_source
     from stlc.grammar import ast
     from stlc.grammar.parse.parser import parse
@@ -147,7 +147,7 @@ _FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A block of a page.
+    """Fenced block of a manual page.
 
     Attributes:
         language: `stl`, `yaml`, `csv` or `console`.
@@ -162,26 +162,26 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page: its headline and its Markdown."""
+    """Manual page of a code (such as E101): its headline and its text in Markdown."""
 
     title: str
     text: str
 
     @property
     def examples(self) -> tuple[Example, ...]:
-        """The example blocks, in order."""
+        """Example blocks of the page, in order."""
         return tuple(
             Example(match["language"], tuple(match["notes"].split()), match["body"])
             for match in _FENCE.finditer(self.text)
         )
 
     def having(self, note: str) -> tuple[Example, ...]:
-        """The example blocks with this note."""
+        """Example blocks whose notes include `note`."""
         return tuple(example for example in self.examples if note in example.notes)
 
 
 def read_page(name: str) -> Page | None:
-    """The page of a code, or `precedence`; None if there is none."""
+    """Manual page of a code, or of operator precedence (`precedence`); None if there is none."""
     path = FOLDER / f"{name}.md"
     if not path.is_file():
         return None
@@ -190,7 +190,7 @@ def read_page(name: str) -> Page | None:
 
 
 def _plain_lines(text: str) -> Iterator[str]:
-    """The lines of a page as plain text: blocks indented, mark-up removed."""
+    """Lines of a manual page as plain text: blocks are indented, and mark-up is removed."""
     inside = False
     for line in text.splitlines():
         if line.startswith("```"):
@@ -216,7 +216,10 @@ ASSUMED = (
 
 
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
-    """Probabilities for the grid of a run's system, and their assumptions."""
+    """Probability that the grid search of a run's backup policy finds a plan that works.
+
+    The record also states the assumptions.
+    """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances
     from stlc.controller.training.run import load_task

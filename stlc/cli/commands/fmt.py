@@ -20,7 +20,7 @@ DIFFERS, INVALID = 1, 3
 
 @dataclass(frozen=True, slots=True)
 class _Formatted:
-    """A file with its text before and after formatting."""
+    """Text of a file before and after formatting."""
 
     name: str
     before: str
@@ -76,7 +76,7 @@ def fmt(
 
 
 def _tell(record: FormattedFiles, alike: int) -> None:
-    """Print the difference, the changed files, and the number of the others."""
+    """Print the differences or the changed files, and `alike`, the number of unchanged files."""
     if record.get("diff"):
         emit(record["diff"].rstrip("\n"))
     for name in record["changed"]:
@@ -87,7 +87,7 @@ def _tell(record: FormattedFiles, alike: int) -> None:
 
 
 def _diff(result: _Formatted) -> str:
-    """The changes as a unified diff."""
+    """Changes of a file as a unified diff."""
     before, after = (text.splitlines(keepends=True) for text in (result.before, result.after))
     lines = unified_diff(before, after, f"{result.name}", f"{result.name} (formatted)")
     return "".join(

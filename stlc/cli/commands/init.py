@@ -37,7 +37,10 @@ _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 
 
 def examples(incomplete: str = "") -> list[str]:
-    """Names of examples with a prefix: installed systems that a specification refers to."""
+    """Names of examples that begin with a text.
+
+    Examples are the installed systems that a specification refers to.
+    """
     found = {system.removesuffix(".yaml") for _, system in _pairs()}
     return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
 
@@ -114,7 +117,10 @@ def _require_new(paths: Iterable[Path], *, force: bool) -> None:
 
 
 def _project(example: str) -> dict[str, str]:
-    """Path within the project -> text. Raises UsageError (U101) if there is no such example."""
+    """Files of a new project: path within the project -> text.
+
+    Raises UsageError (U101) if there is no such example.
+    """
     if example == EMPTY:
         return dict(_SETTINGS)
     if example == FIRST:
@@ -124,7 +130,7 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """The next command: training for the first specification that does not judge closed-loop runs."""
+    """Command to run next: training for the first specification that does not judge closed-loop runs."""
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}
     for path in files:
@@ -134,7 +140,7 @@ def _following(files: Mapping[Path, str]) -> str:
 
 
 def _example_files(name: str) -> dict[str, str]:
-    """An installed system, its dependencies and its specifications: path within the project -> text."""
+    """Files of an installed system, its dependencies and its specifications: path in the project -> text."""
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
         advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
@@ -172,7 +178,11 @@ def _template(name: str) -> str:
 
 
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
-    """`NAME.stl` with a signal line for each state of a system, and the next command."""
+    """New file `NAME.stl` with a declaration of a signal for each state of a system.
+
+    Returns:
+        Path -> text, and the command to run next.
+    """
     from stlc.grammar.format.format import format_text
     from stlc.source import Source
 
@@ -188,14 +198,14 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
 
 
 def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
-    """`NAME.yaml`, and the next command."""
+    """New file `NAME.yaml` that declares a system: path -> text, and the command to run next."""
     path = _path(folder, name, "systems", ".yaml")
     text = _template("system.yaml").format(name=path.stem)
     return {path: text}, shell(("stlc", "system", "show", operand(str(path))))
 
 
 def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
-    """The path as given, or in the folder of its kind.
+    """Path of a new file: `name` itself if it is a path, else in the folder for its kind if that exists.
 
     Raises:
         UsageError: U101, it is not a valid name of the language.
@@ -211,11 +221,11 @@ def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
 
 
 def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
-    """The text of a new specification.
+    """Text of a new specification.
 
     Args:
         name: name of the specification.
-        system: system whose states become the signals.
+        system: system whose states are declared as signals; None for an example signal.
         reference: path by which the specification refers to that system.
     """
     if system is None:

@@ -101,7 +101,7 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """Load the system to check against; None without one."""
+    """Load the system to check a specification against; None if no system is given."""
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
@@ -137,7 +137,7 @@ def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], 
 
 
 def _summary(result: LintedFiles, findings: Sequence[Diagnostic]) -> str:
-    """The last line: numbers of findings and files, and the next step."""
+    """Last line of the output: the numbers of findings and of files, and what to do next."""
     count = Counter(finding.severity for finding in findings)
     files = _several(len(result["files"]), "file")
     fixed = f"fixed {_several(result['fixed'], 'finding')}; " if result["fixed"] else ""
@@ -159,7 +159,7 @@ _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 
 
 def github(findings: Iterable[Diagnostic]) -> str:
-    """One `::error …` or `::warning …` line for each finding."""
+    """Findings as commands of GitHub Actions: one line `::error …` or `::warning …` each."""
     return "\n".join(map(_command, findings))
 
 
@@ -179,7 +179,7 @@ def _command(finding: Diagnostic) -> str:
 
 
 def sarif(findings: Sequence[Diagnostic]) -> dict[str, Any]:
-    """The findings as a SARIF log with one run."""
+    """Findings as a log in the format SARIF, with one run."""
     codes = sorted({finding.code for finding in findings})
     driver = {
         "name": "stlc",

@@ -125,7 +125,7 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path)
 
 
 def _lines(plans: Plans) -> list[str]:
-    """The result as text."""
+    """Result as lines of text."""
     from stlc.controller.evaluation.held_out import wilson
     from stlc.view.words import interval, number
     from stlc.view.words import seconds as duration

@@ -112,7 +112,7 @@ def _target(output: Path | None, trace: Path) -> Path:
 
 
 def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
-    """The trace with the declared units of the specification where the file has none."""
+    """The trace, with units from the specification for signals that have none in the file."""
     from stlc.grammar import ast
     from stlc.signature import Signature
     from stlc.units import parse_unit
@@ -127,7 +127,7 @@ def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
-    """The trace reduced to the one with number `wanted`; unchanged if None."""
+    """The trace file's trace with number `wanted`; all traces if None."""
     if wanted is None:
         return trace
     _require_trace(trace.traces, wanted)
@@ -137,7 +137,10 @@ def _one(trace: Trace, wanted: int | None) -> Trace:
 
 
 def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
-    """Paths over the regions of the requirements. Raises UsageError (U101) if they name none."""
+    """Picture of the paths over the regions of the requirements, such as `dock` in `[x, y] in dock`.
+
+    Raises UsageError (U101) if the requirements name no region.
+    """
     from stlc.view.region_map import draw_map, map_of
 
     chart = map_of(monitor.spec, monitor.check(trace, require=wanted), trace)

@@ -149,7 +149,7 @@ def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:
 
 
 def _accuracy(record: Mapping[str, Any]) -> float | None:
-    """Share of held-out starts whose plan satisfies the specification."""
+    """Share of validation states (never used in training) whose plan satisfies the specification."""
     result = record.get("result")
     value = result.get("accuracy") if isinstance(result, Mapping) else None
     return float(value) if isinstance(value, int | float) else None
@@ -188,6 +188,6 @@ _VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
 
 
 def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """(key, value, other value) where two flat records differ; timestamps are left out."""
+    """Differences of two flattened records as (key, value, other value), without timestamps."""
     keys = [key for key in {**one, **other} if key not in _VOLATILE]
     return [(key, one.get(key, ""), other.get(key, "")) for key in keys if one.get(key) != other.get(key)]

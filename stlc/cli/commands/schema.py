@@ -33,14 +33,14 @@ def schema(
 
 
 def names() -> list[str]:
-    """All schemas, such as `check/1`; `system-file/1` is that of system files."""
+    """Names of all schemas, such as `check/1`; `system-file/1` is the schema of system files."""
     from stlc.cli.framework.documents import LINES, RESULTS
 
     return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
-    """The schema of a whole document: the common frame, and the result of one command.
+    """Schema of a complete JSON document: the frame that all commands share, and one command's result.
 
     Raises:
         UsageError: U101, there is no such schema.

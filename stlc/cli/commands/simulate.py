@@ -180,7 +180,7 @@ def simulate(
 def _planned(
     spec: str, system: str | None, choice: PlannerChoice, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """Create a run without training that plans by a planner; return its folder."""
+    """Create a run that plans instead of using a trained policy; return the path of its folder."""
     from stlc.controller.problem.load import load_task
     from stlc.controller.training.launch import Launch, open_planner
 
@@ -190,7 +190,7 @@ def _planned(
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
-    """Warning W604 if a mission without end is simulated for longer than the policy was validated."""
+    """Warning W604 if a mission without an end is simulated for longer than the policy was validated for."""
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
     seconds = steps * run.task.system.dt
@@ -218,10 +218,12 @@ class _Order:
 
 
 def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
-    """Simulate the policy without and with its guard under the scenario `name` (None: no scenario).
+    """Simulate the policy without and with its guard, and return the record of both deployments.
 
-    `writes`: whether robustness margins are written to the file of `--robustness`. Returns the record of
-    both.
+    Args:
+        order: options of the simulation.
+        name: scenario that is simulated; None for the system without a scenario.
+        writes: whether robustness margins are written to the file of `--robustness`.
     """
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
@@ -248,7 +250,10 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
-    """Function that prints text: to the standard output, unless robustness margins are written there."""
+    """Function that prints text to the standard output, or elsewhere if `--robustness -` uses that.
+
+    Raises UsageError (U101) if `--json` and `--robustness -` are combined.
+    """
     from stlc.cli.simulate.watch import STANDARD_OUTPUT
 
     if margins != STANDARD_OUTPUT:
@@ -260,7 +265,10 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
 
 
 def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
-    """The scenarios to simulate besides the nominal deployment; none if a single one is named."""
+    """Scenarios to simulate in addition to the simulation without a scenario, by name.
+
+    The mapping is empty if `scenario` names a single one or is None.
+    """
     from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
 
     decl = run.task.system.decl
@@ -273,14 +281,14 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _satisfied(document: Simulation, guard: Mode) -> float:
-    """The share of closed-loop runs that satisfy everything; the least one over all scenarios."""
+    """Share of closed-loop runs that satisfy all requirements; the least share of all scenarios."""
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
-    """Simulate without and with each scenario; the trace stored is that without scenario."""
+    """Simulate without a scenario and with each given one; only the trace without a scenario is stored."""
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():
         each = _deployed(order, name, writes=False)
@@ -310,7 +318,10 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate under one guard with live output; after a failure or Ctrl-C, results are saved, too."""
+    """Simulate with one kind of guard and show progress live.
+
+    If the simulation fails or Ctrl-C ends it, the results up to then are saved.
+    """
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
 
@@ -325,7 +336,7 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
-    """Write trace, scene and record into the run's folder; return the record."""
+    """Write traces, scene (data of the animation) and record to the run's folder; return the record."""
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
@@ -362,7 +373,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
 
 
 def _pictures(run: Run) -> dict[str, str]:
-    """Draw the animation and the report if matplotlib is installed; return kind -> file."""
+    """Draw the animation and the report if matplotlib is installed; return kind of picture -> file."""
     from stlc.view import available
 
     if not available():

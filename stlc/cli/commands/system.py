@@ -110,7 +110,10 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 
 
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
-    """Roll out random controls from drawn states. Raises SystemFileError on failures."""
+    """Simulate random initial states under random controls; return the warnings.
+
+    Raises SystemFileError if the initial set or the dynamics fail.
+    """
     import torch
 
     from stlc.dynamics.model.system import System
@@ -126,7 +129,7 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Compare the forward kinematics with those of another library, and raise an error if they differ."""
+    """Compare the forward kinematics with those of pytorch-kinematics; raise an error if they differ."""
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:
         return []
@@ -136,7 +139,7 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
 
 
 def _facts(decl: SystemDecl) -> documents.SystemFacts:
-    """The record of a system's declarations."""
+    """Record of the declarations of a system, as the commands print it."""
     flow = {assign.name: assign.text for assign in decl.flow}
     return {
         "name": decl.name,

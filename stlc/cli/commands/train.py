@@ -182,7 +182,10 @@ def train(
 
 
 def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object]) -> None:
-    """Reject options that exclude each other, or do not apply to one run, to several, or to a cluster."""
+    """Raise an error for options that exclude each other or do not apply.
+
+    Some do not apply to a single run, some not to several runs, and some not to a cluster.
+    """
     for one, other in (("--budget", "--steps"), ("--seed", "--seeds")):
         if given[one] is not None and given[other] is not None:
             raise usage(f"`{one}` and `{other}` contradict each other")
@@ -211,7 +214,7 @@ def _logger(name: str | None) -> Opener | None:
 
 
 def _method(name: str) -> str:
-    """Check the name of a method. Raises UsageError (U101) if there is none."""
+    """Return the name of a training method. Raises UsageError (U101) if there is no such method."""
     if name not in METHODS:
         raise usage(f"there is no method `{name}`", METHODS.suggest(name))
     return name
@@ -264,7 +267,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
 
 def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | None) -> Session:
-    """Train a new run."""
+    """Train in a new run folder."""
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
@@ -282,7 +285,11 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
 def _resume(
     folder: RunDir, steps: int | None, more: float | None, device: str, logger: Opener | None
 ) -> Session:
-    """Resume a run from its last checkpoint: to a total of `steps`, for `more` seconds, or to its end."""
+    """Resume a run from its last checkpoint.
+
+    It ends at a total number of `steps`, after `more` seconds, or, if both are None, where it was planned to
+    end.
+    """
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.loop import resume
@@ -295,7 +302,7 @@ def _resume(
 
 
 def _refuse_on_resume(given: Mapping[str, object]) -> None:
-    """Reject options on resume: only the length and `--device` of a run may change."""
+    """Raise an error for options that a resumed run cannot change: all but its length and `--device`."""
     named = [option for option, value in given.items() if value is not None]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
@@ -310,9 +317,10 @@ LOST = "R403"
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Context in which only the first process that `torchrun` started prints; others report only own errors.
+    """Context in which only the first of the processes that `torchrun` started prints.
 
-    Every process finds the errors of a specification; a missing package may concern one machine only.
+    Of the other processes, the first one on each machine prints its errors, and every one reports a missing
+    package.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

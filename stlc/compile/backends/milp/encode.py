@@ -327,7 +327,7 @@ class Encoding:
         raise UnencodableError("a condition over time")
 
     def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` as a tree of affine conditions, with a case distinction for maxima and conditionals.
+        """`value >= margin` as a tree of affine conditions, by cases of maxima and conditionals.
 
         `num` is the expression that is shown if there is no mixed-integer linear form.
         """
