@@ -97,7 +97,7 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 
 
 def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
-    """Return the state after one jump; `state` is that after the flow and the jumps before."""
+    """Apply one jump to `state`, the result of the flow and of earlier jumps; `soft`: as a blend."""
     changed = dict(state)
     for assign in jump.resets:
         flowed = changed[assign.name]
@@ -109,7 +109,7 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
 
 
 def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
-    """Return `I yes + (1 - I) no` with the smooth indicator I_w of Eq. 6; a choice where I is 0 or 1."""
+    """Return `I yes + (1 - I) no` with the smooth indicator I_w of Eq. 6 (exact where I is 0 or 1)."""
     weight = ir.Indicator(cond, sharpness)
     kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
     return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)

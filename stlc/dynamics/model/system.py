@@ -45,7 +45,7 @@ class System:
 
     Attributes:
         decl: declaration from the system file.
-        timers: clocks and the like that a specification adds to the state; they are its last columns.
+        timers: states, such as clocks, that a specification adds; they are the last columns.
         parameters: random constants of a trajectory that a specification adds; their columns precede the
             timers.
         added: columns of `parameters` and `timers`.
@@ -146,7 +146,10 @@ class System:
     # -------------------------------------------------------------------- motion
 
     def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """Make one step from states (B, n) under planned controls (B, m); return the next states (B, n)."""
+        """Make one step from states (B, n) under planned controls (B, m); return the next states (B, n).
+
+        `switch` selects exact jumps or their smooth blends.
+        """
         before = self._named(x)
         moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
         return torch.stack([moved[name] for name in self.names], 1)

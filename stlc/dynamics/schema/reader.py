@@ -37,7 +37,7 @@ class Reader:
         label: str = "",
         labels: tuple[Label, ...] = (),
     ) -> None:
-        """Record a finding."""
+        """Record a finding: an error or a warning at `span`, with lines of advice `help_`."""
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
