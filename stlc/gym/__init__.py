@@ -1,8 +1,9 @@
 """A specification and a system as `gymnasium` environments, for training by other libraries.
 
-`make` gives one environment, `make_vec` many side by side, stepped as one batch in C. Importing this package
-registers the six benchmarks with gymnasium: `gymnasium.make("stlc/traffic-v0")` and `gymnasium.make_vec(…)`.
-A policy that maximises the robustness of episodes satisfies the specification. Needs the extra `stlc[gym]`.
+`make` returns one environment; `make_vec` returns many, which are simulated as one batch in C. Importing this
+package registers the six benchmarks with gymnasium: `gymnasium.make("stlc/traffic-v0")` and
+`gymnasium.make_vec(…)`. A policy that maximises the robustness of episodes satisfies the specification. Needs
+the extra `stlc[gym]`.
 """
 
 from __future__ import annotations

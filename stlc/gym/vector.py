@@ -1,4 +1,4 @@
-"""Many environments of one task, stepped as one batch."""
+"""Many environments of one task, simulated as one batch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`stlc doctor`: installed and missing packages, and their consequences."""
+"""`stlc doctor`: installed and missing packages, and the commands that need a missing one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`stlc explain`: a code, the precedence of operators, a specification in English, a trace's violations."""
+"""`stlc explain`: an error code, the precedence of operators, a specification, or a trace's violations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`stlc runs`: the runs in a folder, one of them, two compared, one removed."""
+"""`stlc runs`: list the runs in a folder, show one, compare two, remove some."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _text(path: Path) -> str:
 
 
 def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:
-    """Content of `run.json` and the status of a run; empty and "damaged" if it cannot be read."""
+    """Content of `run.json` and the status of a run; an empty mapping and "damaged" if it cannot be read."""
     try:
         record = run.record()
     except StlcError:

@@ -1,4 +1,4 @@
-"""`stlc schema`: JSON Schemas of the commands' documents."""
+"""`stlc schema`: JSON Schemas of the documents that the commands print with --json."""
 
 from __future__ import annotations
 

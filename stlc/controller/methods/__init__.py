@@ -56,7 +56,7 @@ class Method(ABC):
         device: torch.device,  # noqa: ARG002
         ranks: Ranks,  # noqa: ARG002
     ) -> Learner | None:
-        """The learner before the first training step; None for a planner, which has nothing to learn."""
+        """Make the learner, in its state before the first step; None for a planner, which learns nothing."""
         return None
 
     @abstractmethod

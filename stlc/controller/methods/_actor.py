@@ -53,7 +53,7 @@ class ActorPolicy(Policy):
 
     @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
-        """One plan per state: (B, n) -> (B, 1, T, m) float64; steps are compiled to C where possible."""
+        """One plan per state, (B, n) -> (B, 1, T, m) float64; the closed loop runs in C where possible."""
         system, x, actions = self.task.system, x0.double(), []
         low, high = system.control_low.to(x), system.control_high.to(x)
         native = self._native(system) if x0.device.type == "cpu" else None

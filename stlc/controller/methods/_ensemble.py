@@ -143,9 +143,9 @@ class Ensemble(nn.Module):
         return len(self.body.weights[0])
 
     def normalise(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set mean and scale for normalisation from inputs (N, inputs) and targets (N, outputs).
+        """Set the mean and scale of normalisation from inputs (N, inputs) and targets (N, outputs).
 
-        The first components of the inputs are the states that the targets change.
+        Component i of a target is the change of component i of the input.
         """
         spread = inputs.std(0)
         scale = targets.std(0)

@@ -179,7 +179,7 @@ def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[
 
 
 def random_controls(task: Task, count: int, generator: torch.Generator) -> Tensor:
-    """Random plans whose controls are constant over `PIECE` steps, (count, T, m)."""
+    """Draw `count` random plans, (count, T, m), with controls that are constant over `PIECE` steps."""
     system = task.system
     pieces = -(-system.horizon // PIECE)
     drawn = torch.rand(count, pieces, len(system.control_names), generator=generator)

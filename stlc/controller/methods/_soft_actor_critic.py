@@ -124,7 +124,7 @@ class SoftActorCritic(nn.Module):
 
     @torch.no_grad()
     def explore(self, seen: Tensor, generator: torch.Generator) -> Tensor:
-        """Random actions, -1 to 1: (B, k) -> (B, m)."""
+        """Actions drawn from the policy, from -1 to 1: (B, k) -> (B, m)."""
         return self._sampled(self._normalised(seen), generator)[0]
 
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:

@@ -1,7 +1,7 @@
 """MBPO: model-based policy optimisation (Janner, Fu, Zhang and Levine, NeurIPS 2019).
 
 An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
-and soft actor-critic learns from their transitions, mixed with a few observed ones. The reward of imagined
+and soft actor-critic learns from their transitions, together with a few observed ones. The reward of imagined
 steps is that of the task. If an imagined episode reaches its end, its robustness is computed on the observed
 steps before its beginning and the imagined steps after it.
 
@@ -97,7 +97,7 @@ class Acting(nn.Module):
 
 
 class MbpoLearner(ModelLearner):
-    """Training of an ensemble, and of actor and critics on short imagined episodes."""
+    """Training by MBPO: of an ensemble on observed episodes, of actor and critics on short imagined ones."""
 
     config: MbpoConfig
 
@@ -122,7 +122,7 @@ class MbpoLearner(ModelLearner):
         return max(1, round(config.shortest + share * (config.longest - config.shortest)))
 
     def advance(self) -> float:
-        """Play one episode in every environment; then train the ensemble, the actor and the critics."""
+        """Play one episode in every environment; then train ensemble, actor and critics, in this order."""
         before = self.environment_steps
 
         def act(states: Tensor, step: int) -> Tensor:

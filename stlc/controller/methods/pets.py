@@ -201,7 +201,7 @@ class PetsLearner(ModelLearner):
         return PetsPolicy(self.task, self.model, self.config)
 
     def advance(self) -> float:
-        """Plan and play one episode in every environment, and learn from it."""
+        """Plan and play one episode in every environment, and train the ensemble on these episodes."""
         plans: list[Tensor] = []
         planner = self.policy
 

@@ -254,7 +254,7 @@ def plan(
         budget: limits of the search; by default `SECONDS` of processor time per initial state.
         seed: seed of the planner's random numbers.
         start: initial guesses of plans, (B, T, m).
-        progress: called with the search after each round.
+        progress: function that is called with the search after each round.
         options: options of the planner.
 
     Returns:
@@ -277,7 +277,7 @@ def plan(
 
 
 class PlannerPolicy(Policy):
-    """Policy that calls a planner for each state, within the planner's budget."""
+    """Policy that searches for a plan from each state with a planner, within the budget per state."""
 
     def __init__(self, task: Task, planner: Planner, budget: PlanBudget, *, seed: int = 0) -> None:
         super().__init__(task)
@@ -292,7 +292,7 @@ class PlannerPolicy(Policy):
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a short local search, whichever the planner is: (B, n) -> (B, T, m)."""
+        """Plans by a short local search, whatever the planner: (B, n) -> (B, T, m)."""
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]

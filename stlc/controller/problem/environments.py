@@ -54,7 +54,8 @@ class Transition:
     """Result of one step of all environments.
 
     Attributes:
-        observation: observation after the step, (N, k); if an episode ended, that of the next initial state.
+        observation: observation after the step, (N, k); if an episode ended, the observation of the next
+            initial state.
         reward: reward of the step, (N,).
         done: whether the episode ended, (N,) bool.
         final: observation after the step, before any reset, (N, k).

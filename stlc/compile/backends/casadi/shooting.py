@@ -207,7 +207,7 @@ class Shooting:
         return {name: _tall(column, steps) for name, column in moved.items()}
 
     def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
-        """Robustness of all conditions that the formulas require, (conditions, 1)."""
+        """Robustness of the required conditions, (conditions, 1), except those that always hold."""
         found = []
         for each in demands:
             for formula, first, last in _conditions(each.formula, 0, 0, self._motion.horizon):

@@ -139,7 +139,7 @@ class Encoding:
 
     Attributes:
         model: variables and constraints of the program.
-        rows: values of the signals at each of the T + 1 samples, by name.
+        rows: for each of the T + 1 samples a mapping from the name of a signal to its value.
         controls: variables of the plan, (T, m).
     """
 

@@ -26,16 +26,16 @@ SAME = 1e-5
 
 
 class _Space(Protocol):
-    """Space of the vectors that the method samples; each vector stands for a plan."""
+    """Space of the vectors that the cross-entropy method samples; each vector represents one plan."""
 
     def centre(self, start: Tensor) -> Tensor:
-        """Mean of the first population, from initial guesses of plans: (k, T, m) -> (k, d)."""
+        """Mean of the first population for initial guesses of plans: (k, T, m) -> (k, d)."""
 
     def deviation(self, x0: Tensor) -> Tensor:
         """Standard deviation of the first population: (d,)."""
 
     def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
-        """Plans that the sampled vectors stand for: states (k, n), vectors (k, p, d) -> (k, p, T, m)."""
+        """Plans that the vectors represent: states (k, n), p vectors per state (k, p, d) -> (k, p, T, m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Cem:
         population: number of samples per round.
         elites: number of samples, the most robust ones, to which the Gaussian is fitted.
         deviation: standard deviation of the first population, in half-widths of the control ranges.
-        physical: whether `deviation` is in physical units instead.
+        physical: whether `deviation` is in the physical units of the controls instead.
         floor: least standard deviation, in the units of `deviation`.
         rounds: maximum number of rounds, after which the search from an initial state begins anew.
         over: `plan` samples plans, `policy` the weights of a network with `hidden` ReLU units.
