@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from stlc.compile.backends.milp.encode import Demand, Encoding
+from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, MissingError, UsageError
 
 if TYPE_CHECKING:
@@ -71,15 +72,20 @@ class Milp:
 
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
         """Find a plan for the initial state with index `row`, or prove that there is none."""
-        task, state, target = search.task, search.states[row], search.budget.target
-        found, plan = self._solved(task, state, target, search.budget.seconds, highs, tight=True)
-        search.evaluations[row] += 1
-        if plan is not None:
-            search.offer(torch.tensor([row]), plan[None], evaluations=0)
-        elif found == IMPOSSIBLE and self.prove:
-            proof, _ = self._solved(task, state, 0.0, search.budget.seconds, highs, tight=False)
-            search.infeasible[row] = proof == IMPOSSIBLE
+        task, state, budget = search.task, search.states[row], search.budget
         search.ended[row] = True
+        for beyond in (MARGIN, 0.0):  # away from the boundary; then on it, where timers end exactly
+            found, plan = self._solved(task, state, budget.target + beyond, budget.seconds, highs, tight=True)
+            search.evaluations[row] += 1
+            if plan is not None:
+                rho = search.offer(torch.tensor([row]), plan[None], evaluations=0)
+                if float(rho) >= min(budget.target, 0.0) - TOLERANCE:
+                    return
+            elif found == IMPOSSIBLE and beyond and self.prove:
+                proof, _ = self._solved(task, state, 0.0, budget.seconds, highs, tight=False)
+                search.infeasible[row] = proof == IMPOSSIBLE
+                if proof == IMPOSSIBLE:
+                    return
 
     def _solved(
         self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
