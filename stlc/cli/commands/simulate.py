@@ -250,7 +250,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
-    """Function that prints text to the standard output, or elsewhere if `--robustness -` uses that.
+    """Function that prints text to the standard output, or to standard error if `--robustness -` uses that.
 
     Raises UsageError (U101) if `--json` and `--robustness -` are combined.
     """

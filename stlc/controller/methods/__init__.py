@@ -126,7 +126,7 @@ class Learner(ABC):
         step: number of completed steps.
         next_validation: step of the next validation.
         generator: source of all random numbers of this rank (process).
-        margin: gamma of the objective.
+        margin: gamma of the objective, the robustness that training aims at.
         loss: loss of the last step; NaN before the first.
         searches: whether plans of failing states are repaired by a search concurrently with the steps.
         searching: whether such a search is running.
@@ -177,7 +177,7 @@ class Learner(ABC):
         return {"generator": self.generator.get_state()}
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars that are stored together with `tensors`."""
+        """Numbers that are stored in a checkpoint together with `tensors`."""
         last = {"loss": self.loss} if math.isfinite(self.loss) else {}
         facts = {"step": self.step, "steps": self.steps, "margin": self.margin}
         return last | facts | {"next_look": self.next_validation}

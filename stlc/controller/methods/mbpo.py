@@ -185,7 +185,7 @@ class MbpoLearner(ModelLearner):
 
     @torch.no_grad()
     def _imagined(self, count: int) -> Batch:
-        """Imagine at least `count` episodes from random observed states and return their transitions."""
+        """Imagine at least `count` episodes from random observed states; return their transitions."""
         model, horizon, length = self.model, self.task.horizon, self.length
         members = model.predictor.elites
         count = -(-count // members) * members
@@ -239,7 +239,7 @@ class MbpoLearner(ModelLearner):
 
 
 class Mbpo(Method):
-    """Soft actor-critic on short imagined episodes of a learnt ensemble."""
+    """Soft actor-critic that learns from short episodes imagined by a learnt ensemble."""
 
     options = MbpoConfig
 

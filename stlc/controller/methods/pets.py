@@ -128,7 +128,7 @@ class PetsPolicy(Policy):
     def _optimised(
         self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None = None
     ) -> Tensor:
-        """Controls of the next steps from states (B, n) by the cross-entropy method: (B, steps, m)."""
+        """Controls (B, steps, m) of the next steps from states (B, n), found by the cross-entropy method."""
         size = max(1, ROWS // (self._config.population * math.prod(self._shape)))
         guesses = [None] * len(x0) if guess is None else torch.split(guess, size)
         parts = zip(torch.split(x0, size), guesses, strict=False)
