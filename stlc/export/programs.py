@@ -156,8 +156,8 @@ class Guarding(nn.Module):
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
         """All plans for one prefix length T0, with verdicts.
 
-        The first T0 steps are a prefix from the grid (in the first plan: those of the policy's own plan), the
-        others come from the policy.
+        The first T0 controls of a plan are a prefix from the backup policy's grid; in the first plan they are
+        those of the policy's own plan. The later controls come from the policy.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)

@@ -150,7 +150,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def _told(self, *, judged: bool) -> dict[str, Any]:
         """Info after a step: the state and, if `judged`, the robustness of the last horizon of the episode.
 
-        While the episode is shorter than a horizon, its windows are cut.
+        Robustness is that of the last T steps (one plan horizon). While the episode has fewer, windows of the
+        formula end at its last sample.
         """
         state = {"state": self._driven[-1][0].numpy(force=True).copy()}
         if not judged:

@@ -48,8 +48,8 @@ class HeldOut:
         rho: robustness over all requirements, (starts,).
         each: robustness per requirement, (starts, requirements).
         known: True for starts from which a satisfying plan is known, (starts,); None if not recorded.
-        searched: True for starts that the policy solves or from which a plan was searched, (starts,); None:
-            all.
+        searched: True for starts that the policy solves, and for those for which a satisfying plan was
+            searched for, (starts,); None: all.
     """
 
     names: tuple[str, ...]

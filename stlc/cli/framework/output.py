@@ -39,7 +39,7 @@ def emit(text: str, *, styled: bool = False) -> None:
     """Write `text` and a line break to the standard output.
 
     Control characters other than line breaks and tabs are replaced on a terminal. A `styled` text may contain
-    colour codes; its author makes names in it `visible`.
+    colour codes; the caller has made names from files in it harmless with `stlc.escape.visible`.
     """
     _write(sys.stdout, screen(text, styled=styled))
 

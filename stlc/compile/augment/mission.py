@@ -111,7 +111,7 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Return the value of an open status one step later, decided by the current sample."""
+    """Return the status one step later of a formula that is not yet decided, by the current sample."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:

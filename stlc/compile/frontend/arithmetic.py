@@ -263,7 +263,7 @@ def _sense(args: Sequence[Number]) -> Sense:
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
-    """True if the result is a difference: a plain number times a difference, or a root of squares."""
+    """True if the result is a difference of temperatures: a multiple of one, or a root in `unit` kelvin."""
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
     if function.rule not in ("mul", "div"):

@@ -68,7 +68,7 @@ class Hard:
 class Tanh:
     """Smooth switching by `(1 + tanh(w rho)) / 2 = sigmoid(2 w rho)` (Meng and Fan 2023, Eq. 6).
 
-    A choice is the mean of both branches, weighted with the indicator.
+    `if cond then a else b` becomes I a + (1 - I) b, where I is the indicator above.
     """
 
     exact: ClassVar[bool] = False

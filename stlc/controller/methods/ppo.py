@@ -209,7 +209,8 @@ class Episodes:
     Attributes:
         seen: observations, (T, N, k).
         raw: controls before squashing, (T, N, w).
-        noise: exploration noise of the step before each step, in standard deviations, (T, N, w).
+        noise: exploration noise of the preceding step, drawn for the first one, in standard deviations,
+            (T, N, w).
         density: logarithm of the probability density of the controls, (T, N).
         rewards: (T, N).
     """

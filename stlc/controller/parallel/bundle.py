@@ -165,7 +165,7 @@ def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> Bund
 def _ran(
     arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
 ) -> BundleResult:
-    """Train in a subprocess; on cancellation, or when the probe is gone, it may save and exit."""
+    """Train in a subprocess; after Ctrl-C, or once the file `probe` is deleted, it saves and ends."""
     process = start(arguments, share, folder)
     try:
         out, said = _awaited(process, probe)

@@ -76,7 +76,7 @@ class _CutTracker(ABC):
     """Base of evaluators for requirements whose windows may be clipped at the end of the trace.
 
     With clipped windows, the value at a settled instant (one that no later sample affects) is computed on the
-    clipped formula, and bounds at other instants on the formula with unknown samples.
+    clipped formula. Bounds at other instants are computed on the whole formula, with later samples unknown.
     """
 
     __slots__ = ()

@@ -167,7 +167,10 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Largest number c >= 1 with c (c + width) <= `most`; for infinite width, with c * samples <= `most`."""
+    """Number of instants to evaluate at once: c of them need c (c + width) values, `most` at most.
+
+    A window of infinite width needs c * samples values. At least one instant is evaluated.
+    """
     if math.isinf(width):
         return max(most // samples, 1)
     return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)
