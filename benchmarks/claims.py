@@ -19,7 +19,7 @@ LEADS = {"ship_track": 0.20, "navigation": 0.45, "manipulation": 0.08}
 """Benchmark -> lead of the paper's policy over the best baseline."""
 SIMPLE = ("traffic", "reach_n_avoid", "ship_safe")
 BEHIND = 0.03
-"""How far the paper's policy is behind the best baseline on the simple benchmarks at most."""
+"""Largest gap of the paper's policy to the best baseline on the simple benchmarks."""
 SLOWER = (10.0, 100.0)
 """Factors by which MPC and MILP are slower."""
 STL_M, NEAR = 0.83, 0.02
@@ -29,7 +29,7 @@ HOLDS, FAILS, OPEN = "holds", "does not hold", "not measured"
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What is known of a contender on a benchmark.
+    """Measured results of a contender on a benchmark.
 
     Attributes:
         benchmark: name of the specification.

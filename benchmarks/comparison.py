@@ -120,7 +120,7 @@ def _command(contender: Contender, missing: Sequence[str], options: str) -> str:
 def _spared(
     rows: Mapping[tuple[str, float | None, str], PlanRow], method: str, limit: float | None, name: str
 ) -> bool:
-    """Whether a long budget is not measured because ten times the time found no more plans before."""
+    """True if a long budget is not measured because ten times the time found no more plans before."""
     if limit is None or limit < LONG or (method, limit, name) in rows:
         return False
     few, many = rows.get((method, SECONDS[1], name)), rows.get((method, SECONDS[2], name))
@@ -149,7 +149,7 @@ def _interval(value: float, interval: tuple[float, float]) -> str:
 
 
 def refusals(plans: Iterable[PlanRow]) -> list[str]:
-    """Why planners refuse tasks, as bullets."""
+    """Reasons for which planners refuse tasks, as bullets."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in plans:
         if row.refused:

@@ -194,7 +194,7 @@ def _half(metric: Mapping[str, Any]) -> float | None:
 
 
 def is_outdated(result: Result) -> bool:
-    """Whether the specification, the system or a version has changed since a measurement."""
+    """True if the specification, the system or a version has changed since a measurement."""
     key = result["key"]
     now = {**inputs_of(load(key["benchmark"])), "planner_version": PLANNING_VERSION}
     return any(key.get(name) != value for name, value in {**now, "guard_version": GUARD_VERSION}.items())

@@ -220,7 +220,7 @@ def _blank(result: Result) -> Result:
 
 
 def _facts(entry: Mapping[str, Any]) -> Result:
-    """What a stored result holds of search and proof."""
+    """The entries of a stored result on search and proof."""
     names = ("passes", "tries", "found", "infeasible", "asked", "proof_seconds")
     return {name: entry[name] for name in names if name in entry}
 

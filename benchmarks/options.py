@@ -191,7 +191,7 @@ class Comparing:
         self.seconds, self.seconds_of_decision, self.worlds  # noqa: B018
 
     def asks(self, part: str) -> bool:
-        """Whether a part is to be measured. Raises UsageError (U101) for an unknown part."""
+        """True if a part is to be measured. Raises UsageError (U101) for an unknown part."""
         return part in chosen(self.parts, PARTS, "part") and not self.show
 
 

@@ -160,7 +160,7 @@ def _lines(lines: Sequence[Line]) -> list[str]:
 
 
 def _search_first(plans: Sequence[PlanRow]) -> list[str]:
-    """Where search beats the policy, before anything else."""
+    """Benchmarks on which search beats the policy, which the page shows first."""
     found = upsets(plans)
     if not found:
         return []

@@ -151,7 +151,7 @@ def _planned(task: Task, solver: Solver, states: Tensor, budget: PlanBudget) -> 
 
 
 def reason(error: StlcError) -> str:
-    """What an error says, in one line."""
+    """The message of an error, in one line."""
     return "; ".join(each.message for each in error.diagnostics)
 
 
@@ -211,7 +211,7 @@ class PlanRow:
 
 
 def is_outdated(result: Result) -> bool:
-    """Whether the specification, the system or the version of planning has changed since a measurement."""
+    """True if the specification, the system or the version of planning has changed since a measurement."""
     key = result["key"]
     now = {**inputs_of(load(key["benchmark"])), "planner_version": PLANNING_VERSION}
     return any(key.get(name) != value for name, value in now.items())
@@ -219,7 +219,7 @@ def is_outdated(result: Result) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Ceiling:
-    """What all plans together show about the starts of a benchmark.
+    """Shares of feasible and infeasible starts of a benchmark that all plans together show.
 
     Attributes:
         benchmark: name of the specification.
@@ -256,7 +256,7 @@ def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
 
 
 def improves(cell: PlanCell, store: ResultStore) -> bool:
-    """Whether a cell is worth its time: a long one only if ten times the time has found more plans before."""
+    """True if a cell is worth its time: a long one only if ten times the time has found more plans before."""
     if cell.seconds < LONG or math.isinf(cell.seconds):
         return True
     shorter = [

@@ -132,7 +132,7 @@ class ModelWorld:
         return self._happen(moved)
 
     def progress(self) -> Mapping[str, float]:
-        """How often each event that has a condition fired, over all agents."""
+        """Number of times that each event with a condition fired, over all agents."""
         return dict(self._counts)
 
     def units(self) -> Mapping[str, str]:

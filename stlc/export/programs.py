@@ -41,7 +41,7 @@ class Deciding(nn.Module):
         self._task = task
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the policy's plan and its verdict, as `BestOfKPolicy.plan_judged`."""
+        """Return the policy's plan and its verdict, as `Policy.plan_judged`."""
         plans = self.network(x).to(x.dtype)
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])

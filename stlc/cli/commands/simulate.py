@@ -112,7 +112,9 @@ def simulate(
     ] = False,
     method: PlannerOption = None,
     option: PlannerOptionsOption = None,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Processor time of a planner's plan.")] = "20ms",
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Processor time of a planner's plan; 20ms.")
+    ] = None,
     system: SystemOption = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
@@ -122,11 +124,12 @@ def simulate(
 ) -> Answer[Simulation]:
     """Deploy a trained policy in the world of its system.
 
-    The newest run by default. With --backup the paper's backup policy guards it, and the same seeds are
-    simulated without it for comparison. Trace, scene and figures are written to the run's folder. Drives
-    (closed-loop runs, one agent over one seed each) are judged by the specification that the system names
-    (test: judge). Means over seeds have 95 % intervals (Student's t). Every system has the scenarios
-    mismatch, disturb and noise, also with a percentage (mismatch-20); --scenario disturbed runs them all.
+    The newest run by default; with --method, a planner for the specification RUN, without training. With
+    --backup the paper's backup policy guards it, and the same seeds are simulated without it for comparison.
+    Trace, scene and figures are written to the run's folder. Drives (closed-loop runs, one agent over one
+    seed each) are judged by the specification that the system names (test: judge). Means over seeds have
+    95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and noise, also with a
+    percentage (mismatch-20); --scenario disturbed runs them all.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
@@ -141,8 +144,7 @@ def simulate(
         check_writable(record)
     require_writable(margins)
     overrides = parse_overrides(set_)
-    if method is not None:
-        run = _planned(run, system, planner_choice(method, option, budget), overrides, runs)
+    run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
     decl = opened.task.system.decl
     test = decl.test
@@ -177,14 +179,28 @@ def simulate(
     return Answer(result, show, int(missed))
 
 
-def _planned(
-    spec: str, system: str | None, choice: PlannerChoice, overrides: Mapping[str, str], runs: Path
+def _planner(
+    method: str | None, option: list[str] | None, budget: str | None, system: str | None
+) -> PlannerChoice | None:
+    """The planner of `--method`; None without it, and then its options are refused."""
+    if method is not None:
+        return planner_choice(method, option, budget or "20ms")
+    for name, value in {"--option": option, "--budget": budget, "--system": system}.items():
+        if value is not None:
+            raise usage(f"`{name}` is for a planner", "stlc simulate SPEC --method search")
+    return None
+
+
+def _run_of(
+    run: str, choice: PlannerChoice | None, system: str | None, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """Create a run that plans instead of using a trained policy; return the path of its folder."""
+    """The run to simulate: as given, or for a planner the folder of a new run of the specification."""
+    if choice is None:
+        return run
     from stlc.controller.problem.load import load_task
     from stlc.controller.training.launch import Launch, open_planner
 
-    task = load_task(spec, system, overrides)
+    task = load_task(run, system, overrides)
     launch = Launch(root=runs, overrides=overrides, command=sys.argv[1:])
     return str(open_planner(task, choice, seed=0, launch=launch).path)
 

@@ -251,7 +251,7 @@ def engine_text(engine: Mapping[str, Any]) -> str:
 
 
 def native_text(by_torch: Mapping[str, str]) -> str:
-    """Which parts of the training run as generated C, and why others run in torch."""
+    """Parts of the training that run as generated C, and the reasons for torch in the others."""
     native = [part for part, reason in by_torch.items() if not reason]
     reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
     lines = [f"{', '.join(native)}: C"] if native else []

@@ -100,7 +100,7 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 
 
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Whether one requirement holds, (starts, rows)."""
+    """Verdicts on one requirement, (starts, rows) booleans."""
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
         return _margin(rule, columns, 1) >= -TOLERANCE

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from stlc.controller.methods import Method
-from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, planner_named
+from stlc.controller.planning.planner import PlanBudget, Planner, PlannerPolicy, planner_named
 from stlc.controller.training.config import ResolvedConfig, base_config
+from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
@@ -22,13 +26,13 @@ class PlanConfig(ResolvedConfig):
 
     Attributes:
         planner: name of the planner.
-        options: options of the planner, as `NAME=VALUE,NAME=VALUE`.
+        options: options of the planner, name -> text, as JSON.
         seconds: processor time per plan.
         evaluations: maximum number of plans judged in search of one; 0 for no limit.
     """
 
     planner: str = PLANNERS.default
-    options: str = ""
+    options: str = "{}"
     seconds: float = 0.02
     evaluations: int = 0
 
@@ -45,12 +49,11 @@ class PlanMethod(Method):
         asked = config.planner
         if asked is None:
             return found
-        options = ",".join(f"{name}={value}" for name, value in asked.options.items())
-        planner_named(asked.name, **asked.options)
+        planner_of(asked.name, asked.options)
         return replace(
             found,
             planner=asked.name,
-            options=options,
+            options=json.dumps(dict(asked.options)),
             seconds=asked.seconds,
             evaluations=asked.evaluations or 0,
         )
@@ -60,12 +63,26 @@ class PlanMethod(Method):
 
         Raises:
             UsageError: U101, the planner cannot plan for the task.
+            RunError: R101, the stored options are damaged.
         """
         assert isinstance(config, PlanConfig)
-        given = dict(each.split("=", 1) for each in config.options.split(",") if each)
-        planner = planner_named(config.planner, **given)
+        try:
+            given = {str(name): str(value) for name, value in json.loads(config.options).items()}
+        except (ValueError, AttributeError, RecursionError) as error:
+            message = f"the options of the planner of `{run.shown}` are damaged"
+            raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+        planner = planner_of(config.planner, given)
         budget = PlanBudget(config.seconds, config.evaluations or None)
         return PlannerPolicy(task, planner, budget, seed=config.seed)
+
+
+def planner_of(name: str, options: Mapping[str, str]) -> Planner:
+    """The planner of a closed loop. Raises UsageError (U101) for `policy`, which would be a run of a run."""
+    if name == "policy":
+        raise usage(
+            "planner `policy` takes the plans of a trained run", "simulate that run: stlc simulate RUN"
+        )
+    return planner_named(name, **options)
 
 
 METHOD = PlanMethod()

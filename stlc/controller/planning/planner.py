@@ -126,8 +126,12 @@ class PlanSearch:
         """Indices of the initial states below the target that are within the budget and not ended, (k,)."""
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
-        target = min(self.budget.target - TOLERANCE, torch.inf)
-        going = (self.rho < target) & ~self.infeasible & ~self.ended & (self.seconds < self.budget.seconds)
+        going = (
+            (self.rho < self.budget.target - TOLERANCE)
+            & ~self.infeasible
+            & ~self.ended
+            & (self.seconds < self.budget.seconds)
+        )
         if self.budget.evaluations is not None:
             going &= self.evaluations < self.budget.evaluations
         return going.nonzero()[:, 0]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
+from stlc.controller.methods.plan import planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
@@ -55,6 +56,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         UsageError: U101, `name` cannot name a folder.
     """
     decl, launch = task.system.decl, launch or Launch()
+    resolved = resolve_config(task, config)  # before the folder: a refused option leaves no run behind
     folder = RunDir.create(launch.root, task.compiled.name, launch.name)
     folder.update(
         {
@@ -67,10 +69,10 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "system": task.system.decl.name,
             "system_path": str(decl.path),
             "overrides": dict(launch.overrides),
-            "seed": resolve_config(task, config).seed,
+            "seed": resolved.seed,
             "budget": config.budget,
             "device": config.device,
-            "threads": resolve_config(task, config).threads,
+            "threads": resolved.threads,
             "options": asdict(replace(config, steps=None)) | {"steps": config.steps and str(config.steps)},
             "engine_version": ENGINE_VERSION,
             "versions": versions(),
@@ -119,9 +121,10 @@ def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch
 
     Raises:
         MissingError: R201, the folder cannot be written.
-        UsageError: U101, there is no such planner or option.
+        UsageError: U101, there is no such planner or option, or the planner cannot plan for the task.
     """
     config = TrainConfig(method="plan", planner=choice, seed=seed)
+    planner_of(choice.name, choice.options).prepare(task)  # a refusal leaves no run behind
     folder = open_folder(task, config, launch)
     save_config(folder, resolve_config(task, config))
     folder.finish("finished", None)

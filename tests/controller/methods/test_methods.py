@@ -18,7 +18,8 @@ from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import TrainConfig, resolve_config
+from stlc.controller.training.config import PlannerChoice, TrainConfig, resolve_config
+from stlc.controller.training.launch import Launch, open_folder, open_planner
 from stlc.diagnostics import RunError, SystemFileError, UsageError
 from stlc.registry import METHODS
 
@@ -198,3 +199,35 @@ def test_an_actor_plans_along_the_model(car_task: Task) -> None:
 def test_names_are_known_without_torch() -> None:
     code = "import sys; from stlc.registry import METHODS; METHODS.names; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("serach", {}), ("cem", {"population": "many"}), ("policy", {"run": "latest"})]
+)
+def test_a_refused_planner_leaves_no_run_behind(
+    car_task: Task, tmp_path: Path, name: str, options: dict[str, str]
+) -> None:
+    with pytest.raises(UsageError):
+        open_planner(
+            car_task, PlannerChoice(name, options, 0.01), seed=0, launch=Launch(root=tmp_path / "runs")
+        )
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_refused_option_leaves_no_run_behind(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(steps=1, options={"reward": "task"})
+    with pytest.raises(UsageError):
+        open_folder(car_task, config, Launch(root=tmp_path / "runs"))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_options_of_a_planner_are_kept_and_damaged_ones_are_a_finding(car_task: Task, tmp_path: Path) -> None:
+    choice = PlannerChoice("search", {"tries": "64"}, 0.01)
+    folder = open_planner(car_task, choice, seed=0, launch=Launch(root=tmp_path / "runs"))
+    assert Run.open(folder.path).policy.plan(car_task.sample(2, seed=0)).shape == (2, 25, 1)
+    path = folder.path / "config.resolved.yaml"
+    for damaged in ("x", "[1]", "3"):
+        values = json.loads(path.read_text()) | {"options": damaged}
+        path.write_text(json.dumps(values))
+        with pytest.raises(RunError, match="damaged"):
+            Run.open(folder.path)
