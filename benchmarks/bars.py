@@ -100,7 +100,10 @@ def _draw_bars(axes: Axes, facet: Facet, names: Sequence[str]) -> None:
             xerr=[[max(0.0, below)], [max(0.0, above)]],
             error_kw={"lw": 0.8},
         )
+    for name in places.keys() - {bar.label for bar in facet.bars}:  # an empty row would read as accuracy 0
+        axes.text(0.02, places[name], "no result", color=MUTED, size="small", va="center")
     axes.set_yticks([*places.values()], [*places])
+    axes.set_ylim(0.4, len(names) + 0.6)
     axes.set_xlim(0.0, 1.02)
     _feasible(facet, axes.axvline)
 

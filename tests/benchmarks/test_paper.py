@@ -257,6 +257,10 @@ def test_both_figures_are_drawn(tmp_path: Path) -> None:
     bars = Bar("guided", 0.9, (0.85, 0.95), plans=False), Bar("plan:search", 0.95, (0.9, 1.0), plans=True)
     points = Point("guided", 0.1, 0.9), Point("plan:search", 1.0, 0.9), Point("plan:search", 10.0, 0.95)
     facets = [Facet("traffic", bars, points, 0.97), Facet("empty", (), ())]
+    refusing = Facet("refusing", bars[:1], points[:1])
+    assert [each.get_text() for each in draw([facets[0], refusing], tmp_path)[0].figure.axes[1].texts] == [
+        "no result"
+    ]
     pictures = draw(facets, tmp_path)
     assert [each.alt for each in pictures] == ["Plan accuracy of all methods; the best: traffic 0.950."] * 2
     assert all(
