@@ -14,10 +14,11 @@ _DEVIATIONS = 3.0
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
-    """Return the range that contains nearly all draws of a sampler such as `uniform`; None if unknown.
+    """Return the range that contains nearly all values of a number drawn at random; None if unknown.
 
-    The sampler's arguments must be constant; a constant may be added to it or multiplied by it, as unit
-    conversions do.
+    The number is a constant or a sampler such as `uniform` with constant arguments; a constant may be added
+    to the sampler or multiplied by it, as unit conversions do. For `normal` the range is the mean plus or
+    minus three standard deviations.
     """
     match num:
         case ir.Const(value):

@@ -32,7 +32,7 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """Bounds that predicates impose on a quantity, and the predicates that impose the tightest."""
+    """Greatest lower and least upper bound that predicates impose on a linear form, and these predicates."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -118,7 +118,7 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
 
     Args:
         formula: resolved formula.
-        ranges: declared or enforced ranges, each in the unit in which its signal is stored.
+        ranges: ranges of signals, declared or never left, each in the unit in which its signal is stored.
     """
     for node in nodes(formula):
         if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
@@ -150,8 +150,8 @@ _DECIDED = 1e-6
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
     """Yield W503 for each implication in a formula whose left side is never true.
 
-    Without any, yield W503 if the formula is never false. Only ranges that signals never leave (`facts`) are
-    used: a nominal range does not constrain a signal.
+    If no left side is such, yield W503 if the formula itself is never false. Only ranges that signals never
+    leave (`facts`) are used, since a signal may leave its nominal range.
     """
     found = False
     for left in _antecedents(formula):
@@ -168,7 +168,7 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) ->
 
 
 def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
-    """Return the truth of a formula within the enforced ranges, or None if it varies.
+    """Return the truth of a formula if the ranges in `facts` determine it, else None.
 
     The result holds at all instants of all traces whose signals stay in these ranges.
     """
@@ -197,7 +197,10 @@ def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """Yield the left sides of the implications that must always hold, those under a negation left out."""
+    """Yield the left side of each implication that must hold whenever the formula holds.
+
+    Implications below a negation, an `or` or an `eventually` are not visited.
+    """
     match formula:
         case typed.Logic(_, "->", (left, right)):
             yield left
@@ -212,7 +215,10 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
-    """Return `: x is in [0, 5]`, the enforced ranges of the signals in a formula; "" without any."""
+    """Return a text such as ": `x` is in [0, 5]", the ranges in `facts` of the signals in a formula.
+
+    The text is empty if `facts` contains none of the signals.
+    """
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
     for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):

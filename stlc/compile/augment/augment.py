@@ -36,10 +36,10 @@ class Augmented:
 
     Attributes:
         formula: formula that every plan must satisfy.
-        alive: state formula that holds while the requirement can still be satisfied, given the mission
-            before.
-        goal: absolute formulas of the requirement (`always@[a, b]` and its like, whose intervals count from
-            the start of the mission), joined by `and` and `or`; None without any.
+        alive: formula over the current state that becomes false once the mission up to now has falsified the
+            requirement.
+        goal: absolute formulas of the requirement (`always@[a, b] p` and its like, whose intervals count from
+            the start of the mission), joined by `and` and `or`; None if there are none.
     """
 
     formula: typed.Formula
@@ -54,8 +54,9 @@ def augment(
 
     Absolute operators (`always@[a, b]` and its like) have an interval that counts from the start of the
     mission. Findings are appended to `sink`: E307 for an absolute operator that cannot be moved out of the
-    operators around it, E309 for a past operator that no timer represents, E310 for an absolute operator over
-    too much of the future, E312 for one without a deadline, E311 for a missing horizon.
+    operators around it, E309 for a past operator that no timer represents, E310 for an absolute operator
+    whose operands look too far into the future, E311 for an unknown horizon, E312 for `eventually@` or
+    `until@` without a deadline.
     """
     formula = requirement.formula
     always = typed.Truth(formula.span, True)
@@ -80,7 +81,10 @@ def augment(
 @final
 @dataclass(frozen=True, slots=True)
 class _Goals:
-    """Builder of the goals of one requirement: its absolute formulas (`always@[a, b] p`) and their states."""
+    """Builder of a requirement's goal: its absolute formulas (`always@[a, b] p`), joined by `and` and `or`.
+
+    For each absolute formula, a status and the mission clock are added to `table`.
+    """
 
     grid: Grid
     table: TimerTable
@@ -88,10 +92,11 @@ class _Goals:
     name: str
 
     def of(self, node: typed.Formula) -> Goal:
-        """Return the goals of a formula that is evaluated at the start of the mission.
+        """Return the goal of a formula that is evaluated at the start of the mission.
 
         The formula has no past operators. Relative operators become absolute ones: at the first sample,
-        relative time and mission time are equal.
+        relative time and mission time are equal. E310 or E312 is appended to `sink` for a formula that is not
+        supported.
         """
         if is_state(node, augmented=True):
             return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
@@ -138,9 +143,9 @@ _LATCHED: Mapping[AbsoluteOp, str] = {
 
 
 def _about(formula: Absolute) -> str:
-    """Return the description of a status, an added state that is open, true or false.
+    """Return the text that describes the status of an absolute formula: open (undecided), true or false.
 
-    The description says which condition decides the status for the rest of the mission.
+    The text says which condition decides the status for the rest of the mission.
     """
     left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
     window = formula.window

@@ -23,7 +23,7 @@ _ZERO = ir.Const(0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Guidance:
-    """Guidance towards a goal.
+    """Violation of a goal, to be added to the guidance cost, and the time left for the goal.
 
     Attributes:
         gap: violation of the goal, `max(-margin, 0)`.
@@ -65,7 +65,8 @@ def _guidance(goal: Goal) -> _Guidance | None:
 def _leaf(leaf: GoalLeaf) -> _Guidance | None:
     """Return the guidance of an absolute formula, or None if it needs none.
 
-    Guided are `eventually` and `until` while open, `always` before its window begins, and recurring goals.
+    The formulas that need guidance are `eventually` and `until` while they are open (undecided), `always`
+    before its window begins, and recurring goals (`always@[a, end] once[0, c] p`).
     """
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
@@ -87,9 +88,9 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the guidance of a recurring goal, `always@[a, end] once[0, c] p`, or None for another.
+    """Return the guidance of a recurring goal, `always@[a, end] once[0, c] p`; None for any other goal.
 
-    Its deadline is c after the last sample at which p held.
+    The deadline of a recurring goal is c after the last sample at which p held.
     """
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
@@ -100,8 +101,8 @@ def _recurring(leaf: GoalLeaf) -> _Guidance | None:
 def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
     """Return the guidance of one part of a recurring goal, or None if the part has another form.
 
-    `once[0, c] p` has become `p or c - since >= 0`, where the timer `since` counts the steps since p last
-    held.
+    The past operator in the goal was rewritten before: `once[0, c] p` is now `p or c - since >= 0`, where the
+    timer `since` counts the steps since p last held.
     """
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
@@ -119,7 +120,10 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
-    """Return the guidance of a conjunction: the sum of the violations that have the earliest deadline."""
+    """Return the guidance of a conjunction of goals.
+
+    The violation is the sum of the violations of the goals with the earliest deadline.
+    """
     if len(costs) == 1:
         return costs[0]
     first = reduce(lambda a, b: ir.Op("min", (a, b)), [cost.left for cost in costs])
@@ -128,10 +132,9 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
-    """Return the guidance of a disjunction of two goals.
+    """Return the guidance of a disjunction of two goals: that of the less violated goal.
 
-    It is that of the less violated goal among those that can still be met; a goal already met has no
-    violation.
+    A goal that can no longer be met is left out; a goal that is already met has no violation.
     """
     first = ir.BoolOp(
         "or",
@@ -152,7 +155,10 @@ def _not_lost(left: ir.Num) -> ir.Formula:
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:
-    """Return the robustness of a state formula as a number; None if it consists of tests of time alone."""
+    """Return the robustness of a state formula as a number, without its tests of the clock and of timers.
+
+    The result is None if the formula consists of such tests alone.
+    """
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():
             return None

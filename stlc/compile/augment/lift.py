@@ -71,7 +71,10 @@ def _constant(formula: typed.Formula) -> bool:
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Report E307 for the first absolute operator (`always@[a, b]`) below `outer`; return `true`."""
+    """Report E307 for the first absolute operator (`always@[a, b]`) below `outer`.
+
+    The result is the formula `true`, a placeholder.
+    """
     inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
     finding = Diagnostic(
         "E307",

@@ -80,12 +80,12 @@ Goal: TypeAlias = GoalLeaf | GoalBranch
 
 
 def last_step(formula: Absolute) -> int:
-    """Return the last finite step of the mission to which the window of the formula refers."""
+    """Return the last step of the mission that bounds the window: its end, or its start if it has no end."""
     return formula.window.lo if formula.window.hi is None else formula.window.hi
 
 
 def mission_steps(goal: Goal) -> int:
-    """Return the last finite step of the mission to which any formula of the goal refers."""
+    """Return the last step of the mission that bounds the window of any formula of the goal."""
     if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
     return max(map(mission_steps, goal.items))
@@ -102,16 +102,16 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """Return a function from the signal of a status (open, true or false) to its value one step later.
+    """Return the update of a status: the function from its signal to its value one step later.
 
-    A status that is true or false stays so.
+    An open status is decided by the current sample; a status that is true or false stays so.
     """
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Return the status one step later of a formula that is not yet decided, by the current sample."""
+    """Return the next status (open, true or false) of an open formula, as the current sample decides it."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -147,7 +147,10 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def progress(goal: Goal, horizon: int) -> typed.Formula:
-    """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal."""
+    """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal.
+
+    The formula is evaluated over the `horizon` steps of the plan; the statuses stand for the time before.
+    """
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
@@ -196,7 +199,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Return a test of time that holds if the current step of the mission is within `window`."""
+    """Return a formula over the mission clock that holds if the current step is within `window`."""
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started
@@ -205,7 +208,7 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
-    """Return a test of time that holds if the window of a formula ends beyond the end of the plan."""
+    """Return a formula over the mission clock that holds if the window ends beyond the end of the plan."""
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)

@@ -62,15 +62,15 @@ def _forwards(node: typed.Formula) -> bool:
 def in_past_form(
     formula: typed.Formula, grid: Grid, table: TimerTable, sink: list[Diagnostic]
 ) -> typed.Formula:
-    """Rewrite a formula in negation normal form so that its absolute operators have past formulas.
+    """Rewrite a formula so that the operands of its absolute operators contain only past operators.
 
     Args:
-        formula: absolute operators (`always@[a, b]`), and relative ones at the start of the mission, joined
-            by `and` and `or`.
+        formula: formula in negation normal form: absolute operators (`always@[a, b]`), and relative ones at
+            the start of the mission, joined by `and` and `or`.
         grid: time step and horizon.
         table: table of added states, to which the mission clock (steps since the start of the mission) is
             added if deadlines need it.
-        sink: list to which findings about bounds are appended.
+        sink: list to which findings about interval bounds are appended.
 
     Raises:
         TooFarError: an operand has unbounded lookahead, or an unsupported operator.
@@ -180,16 +180,20 @@ class _Writer:
 
     Args:
         table: table of added states, which provides the mission clock (steps since the start of the mission).
-        span: place of the absolute operator.
-        soon: whether to detect a violation at once rather than at the deadline, by the left side of an
-            `until`.
+        span: source location of the absolute operator.
+        soon: whether the rewritten formula becomes false as soon as a violation is certain, by the left side
+            of an `until@`, rather than only at the deadline.
     """
 
     def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
         self._table, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
-        """Return a past formula: at some sample of the mission in `window`, `what` and all of `when` hold."""
+        """Return `eventually@[window] (when and what)` with only past operators below the absolute operator.
+
+        The window of the result is that of the samples at which `what` is decided. `when` are past formulas,
+        all of which must hold at the sample at which `what` holds.
+        """
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))
         match what:
@@ -213,7 +217,10 @@ class _Writer:
                 raise TooFarError(what.span, "not something that the past can tell")
 
     def until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """Return `left until@[window] right`, stated at the instant at which both operands are decided."""
+        """Return `left until@[window] right` with only past operators below the absolute operator.
+
+        Both operands and the window are shifted to the sample at which both operands are decided.
+        """
         late = max(_ahead(left), _ahead(right))
         known = self._or(self._until_step(late - 1), self.delayed(left, late))
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
@@ -292,7 +299,7 @@ class _Writer:
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
         """Return a past formula with the truth that `formula` had `steps` samples ago.
 
-        Its lookahead is at most `steps`, so that this truth is decided by now.
+        The lookahead of `formula` is at most `steps`, so that this truth is decided by now.
         """
         if not looks_ahead(formula):
             return self._ago(formula, steps)
@@ -312,7 +319,13 @@ class _Writer:
     def _written_out(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
     ) -> typed.Formula:
-        """Return the truth of an `until` or `release` `steps` samples ago, expanded sample by sample."""
+        """Return a past formula with the truth that an `until` or `release` had `steps` samples ago.
+
+        The operator is expanded sample by sample.
+
+        Raises:
+            TooFarError: its window is longer than `_LONGEST` samples.
+        """
         window, end, strong = _window(node), _end(node), node.op == "until"
         if end > _LONGEST:
             raise TooFarError(

@@ -44,13 +44,13 @@ _Op: TypeAlias = Literal["and", "or"]
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """Test `left >= right` between a timer (added state) and a number.
+    """Test `left >= right` between a timer (an added state) and a constant.
 
     Attributes:
-        left: left side.
-        right: right side.
-        span: place of the past operator.
-        later: increment of the timer per step while it is not reset; 0 for one that does not count.
+        left: the timer or the constant.
+        right: the constant or the timer.
+        span: source location of the past operator.
+        later: increment of the timer per step while it is not reset: 1 for a count, 0 for a truth value.
     """
 
     left: ir.Num
@@ -72,7 +72,7 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides of the test at a later sample of a plan, given the timer at the first sample."""
+        """Both sides of the test at a later sample of a plan, from the timer's value at the first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -147,7 +147,10 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Return the test of a timer: `body` held at some of the previous `most` samples (None: of all)."""
+        """Add a timer, and return the test that `body` held at some of the previous `most` samples.
+
+        If `most` is None, all earlier samples count.
+        """
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
@@ -159,7 +162,10 @@ class Past:
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Return the test of a timer: `body` held at each of the previous `most` samples (None: all)."""
+        """Add a timer, and return the test that `body` held at each of the previous `most` samples.
+
+        If `most` is None, all earlier samples count.
+        """
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
@@ -175,8 +181,8 @@ class Past:
     def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
         """Rewrite `p since[0, c] q`, or its negation if not `positive`, with a timer.
 
-        It holds if p holds now, and q holds now, or held at most c ago with p at every sample since then.
-        Windows that end before now are rewritten by `_since_before` and `_lasting`.
+        The operator holds if q holds now or held at most c ago, and p has held at every sample from then to
+        now. Windows that end before now are rewritten by `_since_before` and `_lasting`.
         """
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
@@ -206,9 +212,10 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """Return the test that q held at an earlier sample, and p from then to the previous sample.
+        """Add a timer; return the test that q held earlier and p from then to the previous sample.
 
-        If not `positive`, it is the negation, and `left` and `right` are the negations of p and q.
+        The sample of q is at most `most` samples ago (None: any earlier sample). If not `positive`, return
+        the test of the negation, for which `left` and `right` are the negations of p and q.
         """
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
@@ -275,9 +282,9 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[a, b] q`, or its negation if not `positive`, with windows that end now.
+        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, by operators that end now.
 
-        It is `historically[0, a] p` and the truth that `p since[0, b - a] q` had a ago.
+        The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q` held a ago.
         """
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
@@ -289,9 +296,9 @@ class Past:
     def _lasting(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
-        """Rewrite `p since[a, end] q`, or its negation if not `positive`, with a timer.
+        """Rewrite `p since[a, end] q` with a > 0, or its negation if not `positive`, with a timer.
 
-        The timer counts the steps since the first q after which p has held ever since.
+        The timer counts the steps since the first sample at which q held and from which on p has always held.
         """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
@@ -338,7 +345,7 @@ class Past:
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """Return the operand of a past operator with its own past operators rewritten.
 
-        The result is None, with E309 in `sink`, if it is no state formula.
+        The result is None, with E309 in `sink`, if the operand looks into the future.
         """
         rewritten = self.rewrite(body)
         if is_state(rewritten, augmented=True):
@@ -373,7 +380,7 @@ def _short(formula: typed.Formula) -> str:
 
 
 def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
-    """Return a window as an interval in steps, counted from `clock`."""
+    """Return a window as an interval in steps from now or from the start of the mission (`clock`)."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
     return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, clock=clock, span=span)
 

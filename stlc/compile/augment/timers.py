@@ -1,9 +1,9 @@
 """States that the compiler adds to carry the history before a plan: initial values and updates.
 
 `clock`: number of steps since the start of the mission. `status`: whether an absolute formula (`always@[a, b]
-p`, whose interval counts from the start of the mission) is open, true or false. `latch`: whether a formula
-held at the previous sample, or ever. `timer`: for how many steps a formula has held, or has not held. All are
-integers, updated from the state at the start of a step.
+p`, whose interval counts from the start of the mission) is open (undecided), true or false. `latch`: whether
+a formula held at the previous sample, or ever. `timer`: for how many steps a formula has held, or has not
+held. All are integers, updated from the state at the start of a step.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Timer:
     """State that the compiler adds to those of the system; called a timer whatever its kind.
 
     Attributes:
-        name: name of its column.
+        name: name of the state.
         kind: clock, status, latch or timer.
         initial: value at the start of a mission.
         update: value one step later, as a function of the state at the start of the step.
@@ -53,7 +53,7 @@ class Timer:
 
     @property
     def column(self) -> Column:
-        """Column of the timer in the state signature."""
+        """Column (name, type and range) of this state in the state signature."""
         return Column(self.name, kind="int", role="timer", low=self.low, high=self.high, fact=True)
 
 
@@ -87,9 +87,10 @@ class TimerTable:
         return ir.Signal(self._clock)
 
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
-        """Return the signal of an added state like `draft`, adding it unless there is an equal one.
+        """Add the state described by `draft`, unless the table has an equal one; return the signal of the
+        state.
 
-        `update` maps its own signal to its value one step later.
+        `update` is the function from the signal of the state to its value one step later.
         """
         key = (draft.kind, draft.initial, draft.high, update(ir.Signal("")))
         if key not in self._known:
@@ -116,19 +117,19 @@ def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
 
 
 def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
-    """Return the test of time `left >= right`, with robustness +inf or -inf.
+    """Return the predicate `left >= right` between added states (clock, timer, status) and constants.
 
-    So it decides truth but is never the margin of an enclosing formula.
+    Its robustness is +inf or -inf, so it decides truth but is never the margin of an enclosing formula.
     """
     return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """Return the test `left >= right` of the samples before a plan.
+    """Return a formula that holds if `left >= right`, with finite robustness where a timer is too small.
 
-    Where it fails, its robustness is `-MISSING` per missing step. That is less than the robustness of any
-    predicate, so that instants that the plan can influence are preferred; it is finite, so that plans that
-    all fail can still be ranked.
+    The robustness is +inf where the formula holds, and `-MISSING` per missing step where it fails. The latter
+    is less than the robustness of any predicate, so that instants that the plan can influence are preferred;
+    it is finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
