@@ -87,8 +87,7 @@ class TimerTable:
         return ir.Signal(self._clock)
 
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
-        """Add the state described by `draft`, unless the table has an equal one; return the signal of the
-        state.
+        """Return the signal of the state described by `draft`, after adding it unless there is an equal one.
 
         `update` is the function from the signal of the state to its value one step later.
         """

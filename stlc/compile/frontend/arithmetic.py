@@ -1,8 +1,9 @@
 """Arithmetic on numbers and vectors: unit checks, constant folding, broadcasting.
 
-A value in a unit with an offset (20 degC) is a point of a scale, as opposed to a difference. Points can be
-compared and selected; the difference of two is in kelvin; a point plus kelvin is a point. `abs` and other
-magnitudes reject points, all other functions take them in kelvin.
+A number in a unit with an offset, such as 20 degC, is a temperature, as opposed to a temperature difference.
+Temperatures can be compared and selected; the difference of two is in kelvin; a temperature plus kelvin is a
+temperature. `abs` and other magnitudes reject temperatures in degC, all other functions convert them to
+kelvin.
 """
 
 from __future__ import annotations
@@ -72,15 +73,20 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
-    """Convert numbers without a unit to the unit of the others; return all numbers, and a template.
-
-    The template is a number of that unit, whose other fields the caller replaces.
+    """Convert numbers to a common unit, which a number without a unit takes from the others.
 
     Args:
         args: numbers that must have one unit, those without a unit (`Number.bare`) excepted.
         what: verb for the message: "compare", "add", or the name of a function.
         span: source location for the finding.
         scope: receives findings.
+
+    Returns:
+        The converted numbers, and a template: a number of the common unit, whose other fields the caller
+            replaces.
+
+    Raises:
+        Failed: the units do not agree (E203).
     """
     rigid = [arg for arg in args if not arg.flexible]
     for other in rigid[1:]:
@@ -100,7 +106,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
 
 
 def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
-    """Return `left - right` of two temperatures (points of a scale) or of two other numbers.
+    """Return `left - right`, which is in kelvin if both are temperatures in degC.
 
     Raises:
         Failed: the units do not agree (E203).
@@ -113,7 +119,7 @@ def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
 
 
 def rebased(number: Number, unit: Unit) -> Number:
-    """Return the same quantity as a number of `unit`, counted from the offset of `unit`."""
+    """Return the same quantity in `unit`, whose zero point may differ: 20 degC becomes 293.15 K."""
     shift = number.unit.offset - unit.offset
     if not shift:
         return replace(number, unit=unit)
@@ -139,10 +145,10 @@ def absolute(number: Number) -> Number:
 
 
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
-    """Return the same quantity as a number of `unit`, which has equal dimensions.
+    """Return the same quantity in `unit`, a unit of the same dimensions.
 
     Raises:
-        Failed: a temperature difference where `unit` needs a temperature (E203).
+        Failed: `number` is a temperature difference, and `unit` is that of a temperature such as degC (E203).
     """
     if unit.offset and number.sense == "difference":
         scope.fail(difference_for_point(number, unit, place))
@@ -150,7 +156,7 @@ def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Nu
 
 
 def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
-    """Return E203 for a temperature difference where a temperature is needed."""
+    """Return the error E203 for a temperature difference where a temperature in `unit` is needed."""
     message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
     help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
     return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
@@ -196,10 +202,10 @@ def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> N
 def _units(
     function: Function, args: Sequence[Number], span: Span, scope: Scope
 ) -> tuple[tuple[Number, ...], Number]:
-    """Convert the arguments as the unit rule of the function requires.
+    """Convert the arguments as the unit rule of the function (`Function.rule`) requires.
 
-    The result is the arguments and a template: a number with the unit of the function's result, whose other
-    fields the caller replaces.
+    The result is the converted arguments, and a template: a number with the unit of the function's result,
+    whose other fields the caller replaces.
     """
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
@@ -263,7 +269,10 @@ def _sense(args: Sequence[Number]) -> Sense:
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
-    """True if the result is a difference of temperatures: a multiple of one, or a root in `unit` kelvin."""
+    """True if the result is a temperature difference: a multiple of a difference, or a root in kelvin.
+
+    `unit` is the unit of the result.
+    """
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
     if function.rule not in ("mul", "div"):
@@ -275,7 +284,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """True for a plain number times a temperature in degC, as in a mean or a conversion between scales."""
+    """True for a temperature in degC times or divided by a plain number, as in a mean."""
     points = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in points]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
@@ -286,7 +295,8 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
     """Convert numbers, some of them temperatures in degC, to a common unit.
 
-    It is the unit of a temperature that varies, if there is one.
+    The common unit is kelvin if one of the numbers is a temperature difference; otherwise the unit of a
+    temperature that varies is preferred.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -334,7 +344,7 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
     """Apply the unit rule of `left - right` where `right` is a temperature in degC.
 
-    The result is a difference. Where `right` may be a difference itself (its `sense` is `open`), the result
+    The result is a difference. If `right` may itself be a difference (`Number.sense` is `open`), the result
     may be a temperature too.
     """
     if right.sense == "open" and not left.bare and left.sense != "difference":
@@ -372,7 +382,7 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
 def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
     """Return the argument of `abs` or another magnitude, which must not be a temperature in degC.
 
-    A number that may be a difference (`Number.sense` is `open`) counts as one.
+    A number that may be a temperature or a difference (`Number.sense` is `open`) counts as a difference.
 
     Raises:
         Failed: the argument is a temperature in degC (E203).
@@ -624,14 +634,18 @@ def negated(number: Number, span: Span) -> Number:
 
 
 def half(span: Span) -> Number:
-    """Return the number 1/2, the margin of a truth value."""
+    """Return 1/2, halfway between neighbouring integers and between the values 0 and 1 of a bool."""
     return literal(Fraction(1, 2), span)
 
 
 def broadcast(
     name: str, args: Sequence[Number | VectorValue], span: Span, scope: Scope
 ) -> Number | VectorValue:
-    """Apply the function `name` component by component; a number counts for every component of a vector."""
+    """Apply the function `name` component by component; a number is repeated for each component of a vector.
+
+    Raises:
+        Failed: vectors have different lengths (E205), or the function cannot be applied (see `apply`).
+    """
     lengths = {len(arg.items) for arg in args if isinstance(arg, VectorValue)}
     if not lengths:
         return apply(name, [arg for arg in args if isinstance(arg, Number)], span, scope)
@@ -659,7 +673,7 @@ def minus(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Ve
     """Return the difference of two vectors of equal length.
 
     Raises:
-        Failed: the units do not agree (E203), or the lengths (E205).
+        Failed: the units (E203) or the lengths (E205) do not agree.
     """
     check_lengths({len(left.items), len(right.items)}, span, scope)
     pairs = zip(left.items, right.items, strict=True)

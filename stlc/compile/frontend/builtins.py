@@ -237,7 +237,7 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Return one component shifted in time by `delay`, and with it the formula of a choice between bools."""
+    """Return one component of a vector shifted in time by `delay`, and with it `Number.formula`."""
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
 
@@ -255,7 +255,9 @@ def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
 
 
 def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
-    """Return a delay: a number of samples (`3`, `-1`, `3 steps`), or a time (`0.1 s`) not yet on the grid.
+    """Return a delay: a number of samples (`3`, `-1`, `3 steps`), or a time (`0.1 s`).
+
+    A time is converted to samples later, when the time step is known.
 
     Raises:
         Failed: the expression is neither (E205).
@@ -316,7 +318,7 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
     """Return the value of a call of a built-in function.
 
     Raises:
-        Failed: among other errors, E101 for an unknown function.
+        Failed: the function is unknown (E101), its arguments are invalid, or it is not allowed in this place.
     """
     if name in REGIONS:
         return region(name, call, values, scope)
@@ -374,7 +376,8 @@ def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of a function in `FUNCTIONS`.
 
-    It is applied component by component or, if it takes any number of arguments, to all components together.
+    A function of any number of arguments is applied to all components together, any other function component
+    by component.
     """
     items: list[Number | VectorValue] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
@@ -416,7 +419,7 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
 
 
 def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """Return `deg(angle)`, an angle as a number of degrees, or `rad(angle)`, degrees as an angle."""
+    """Return `deg(angle)`, an angle as a plain number of degrees, or the inverse conversion `rad(number)`."""
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)
     (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)

@@ -20,12 +20,12 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Expected type of a value at its place in an expression, for messages.
+    """Type that a value must have at its place in an expression, as texts for error messages.
 
     Attributes:
         who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".
         which: role of the value: "the right side", "argument 2", "this".
-        span: place of the operator, for a second label in the message.
+        span: source location of the operator, for a second label in the message.
     """
 
     who: str
@@ -37,7 +37,7 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value as a real, an integer or an enum member's number.
 
     Raises:
-        Failed: it is a formula or a bool (E202), or no number (E205).
+        Failed: the value is a formula or a bool (E202), or anything else that is no number (E205).
     """
     match value:
         case Number(kind="bool"):
@@ -58,10 +58,10 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """Return a value as a number, in which a bool counts as 0 or 1; for values stored or compared.
+    """Return a value as a number; unlike in `as_number`, a bool is allowed and counts as 0 or 1.
 
     Raises:
-        Failed: as for `as_number`.
+        Failed: the value is a formula (E202), or anything else that is no number (E205).
     """
     match value:
         case Number():
@@ -76,7 +76,7 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
     """Return a value as a formula; a bool signal holds where it is at least 1/2.
 
     Raises:
-        Failed: it is neither a formula nor a bool (E201).
+        Failed: the value is neither a formula nor a bool (E201).
     """
     match value:
         case Number(formula=formula) if formula is not None:
@@ -94,7 +94,7 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
     """Return a value as a state formula, whose truth depends on one instant, in negation normal form.
 
     Raises:
-        Failed: it is no formula (E201), or depends on other instants (E202).
+        Failed: the value is no formula (E201), or its truth depends on several instants (E202).
     """
     formula = as_formula(value, expr, need, scope)
     if not is_state(formula):
@@ -108,7 +108,7 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value that must be a vector of numbers.
 
     Raises:
-        Failed: it is no vector (E205).
+        Failed: the value is no vector (E205).
     """
     if isinstance(value, VectorValue):
         return value
@@ -117,10 +117,10 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def member_number(member: Member, span: Span, scope: Scope) -> Number:
-    """Return the number of an enum member.
+    """Return the number that stands for an enum member.
 
     Raises:
-        Failed: enums that contain the member give it different numbers (E101).
+        Failed: the member belongs to several enums, which give it different numbers (E101).
     """
     values = {dict(labels)[member.name] for labels in member.options}
     if len(values) > 1:

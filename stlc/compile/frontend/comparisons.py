@@ -121,9 +121,9 @@ def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> Non
 
 
 def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
-    """Return `left == right` for integers, bools or enums, with margin 1/2 - |a - b|.
+    """Return `left == right` for integers, bools or enums, with margin 1/2 - |left - right|.
 
-    For formulas it is `<->`, for which their own margins count.
+    Between formulas `==` means `<->`, with the margins of these formulas.
 
     Raises:
         Failed: a side is real (E204) or has another type (E205).
@@ -178,7 +178,7 @@ def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
     """Check that an enum is compared with the same enum, or with the number of one of its members.
 
     Raises:
-        Failed: it is not (E205).
+        Failed: the enums differ, or no member has this number (E205).
     """
     if a.labels and b.labels:
         if a.labels != b.labels:
@@ -203,7 +203,7 @@ def in_set(item: Operand, members: Sequence[Operand], span: Span, scope: Scope) 
 
 
 def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """Return `item in [lo, hi]`: both comparisons or, under `@product`, (x - lo) (hi - x) >= 0."""
+    """Return `x in [lo, hi]`: `lo <= x and x <= hi` or, under `@product`, `(x - lo) (hi - x) >= 0`."""
     need = "`in [lo, hi]` compares numbers"
     x = as_number(item.value, item.expr, Expectation(need, "the left side"), scope)
     low, high = (as_number(value, expr, Expectation(need, "a bound"), scope) for expr, value in ends)
@@ -227,7 +227,8 @@ def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -
 def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: Scope) -> typed.Formula:
     """Return `sweep(p) in R`: the whole segment from p to its next sample is in the region.
 
-    `sweep(p) not in R` says that no point of the segment is in the region, which is not its negation.
+    `sweep(p) not in R` requires that no point of the segment is in the region; this is stronger than the
+    negation of `sweep(p) in R`.
     """
     if isinstance(expr.region, ast.SetLiteral):
         help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)

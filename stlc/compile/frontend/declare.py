@@ -49,7 +49,10 @@ def check_names(entry: Definition, scope: Scope) -> None:
 
 
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
-    """Yield (name, whether it is called) of each name that an expression does not bind itself."""
+    """Yield (name, whether it is called) of each free name in an expression.
+
+    Names in `bound`, and those that a quantifier or a `freeze` in the expression binds, are left out.
+    """
     if isinstance(node, ast.Name):
         if node.name not in bound:
             yield node, False
@@ -141,10 +144,12 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """Return the unit that a declaration has in brackets.
+    """Return the unit that a declaration has in brackets; dimensionless without one.
+
+    W107 is reported for a name such as `temp` in coulombs (`[C]`).
 
     Raises:
-        Failed: it is unknown (E203).
+        Failed: the unit is unknown (E203).
     """
     if not text:
         return DIMENSIONLESS
@@ -164,7 +169,7 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
     """Check the type in a declaration.
 
     Raises:
-        Failed: it is not declared (E101), or its vector size is invalid (E005).
+        Failed: the type is not declared (E101), or its vector size is invalid (E005).
     """
     if type_ is None:
         return
@@ -180,12 +185,14 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
 def columns_of(
     decl: ast.Signal | ast.Param, enums: Mapping[str, Labels], interface: Interface | None, scope: Scope
 ) -> tuple[Column, ...]:
-    """Return the columns (name, unit, kind) of a signal or parameter, one per component, without ranges.
+    """Return the columns (name, unit, type, role) of a signal or parameter, one per component.
 
-    If there is a system, they are matched with its columns.
+    If there is a system, unit and range are those of its column of the same name. The range in the
+    declaration is not read (`ranged`).
 
     Raises:
-        Failed: E101 unknown type, E103 signal that the system lacks, E104 or E203 signal that differs there.
+        Failed: the type is unknown (E101), or the system lacks the signal (E103) or declares it with another
+            type (E104) or unit (E203).
     """
     check_type(decl.type, enums, scope)
     name = decl.column or decl.name if isinstance(decl, ast.Signal) else decl.name
@@ -202,10 +209,10 @@ def columns_of(
 
 
 def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface, scope: Scope) -> Column:
-    """Return a declared column with the unit and range of the same column of the system.
+    """Return a declared column with the unit and range of the system's column of the same name.
 
     Raises:
-        Failed: the system lacks it (E103), or it has another unit (E203) or type (E104) there.
+        Failed: the system lacks the column (E103), or declares it with another unit (E203) or type (E104).
     """
     if column.name not in interface.signature:
         if isinstance(decl, ast.Param):
@@ -269,7 +276,8 @@ def ranged(
 ) -> tuple[Column, ...]:
     """Return the columns with their declared ranges, each in the unit of its column.
 
-    The ranges of `env` signals are enforced: analyses may rely on them. Those of others are nominal.
+    The ranges of `env` signals are enforced: analyses may rely on them. The ranges of other signals are
+    nominal: a signal may leave its range.
 
     Raises:
         Failed: a bound that is not constant (E205) or has another unit (E203), or an empty range (E205).
@@ -291,9 +299,9 @@ def ranged(
 def _ends(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, column: Column, unit: Unit, scope: Scope
 ) -> tuple[float | None, float | None] | None:
-    """Return the least and greatest value of a declared range or set.
+    """Return the least and greatest value of a declared range or set, in the unit of the column.
 
-    An end is None for `inf`; the result is None for a distribution.
+    For `inf` the value is None; for a distribution, and for a set without values, the result is None.
     """
     if isinstance(domain, tuple):
         low, high = _stored(domain, column, unit, scope)
@@ -345,9 +353,10 @@ class Declared:
     """Declarations of a file.
 
     Attributes:
-        entries: names of values: signals, constants, definitions, functions, enum members.
+        entries: entry of each named value (signal, constant, definition, function, enum member), by its name.
         enums: (member, value) pairs of each enum, by its name.
-        columns: (declaration, columns without ranges, declared unit) of each signal and parameter.
+        columns: (declaration, columns without the declared range, declared unit) of each signal and
+            parameter.
         broken: names with an invalid declaration, whose uses are not reported again.
     """
 
@@ -360,7 +369,10 @@ class Declared:
 def declare(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
 ) -> Declared:
-    """Return the declarations of a file; E101, E102, E103, E104, E203 and E501 go to `scope`.
+    """Return the declarations of a file, and report the errors in them to `scope`.
+
+    E101 is an unknown type, E102 a name declared twice, E501 a tag on a declaration that takes none. A signal
+    that the system lacks is E103, one that it declares with another type or unit E104 or E203.
 
     Args:
         spec: syntax tree of the file.
@@ -508,7 +520,7 @@ def _about(item: ast.Item) -> str:
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """Return the value of a signal in the unit that the file declares, whatever the system stores."""
+    """Return the value of a signal in the unit that the file declares, even if the system stores another."""
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value
