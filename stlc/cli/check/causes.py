@@ -23,7 +23,10 @@ _WIDTH = 72
 
 
 def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> Answer[Explanation]:
-    """Judge a trace and explain every violation; the exit code is that of the verdict."""
+    """Judge a trace and explain every violation; the exit code states the verdict (0, 1 or 4).
+
+    With `talk`, remarks and warnings are printed to the standard error.
+    """
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
@@ -48,7 +51,7 @@ def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> A
 
 
 def _lines(cause: Cause, result: Checked) -> Iterator[str]:
-    """The place of a violation as in `stlc check`, and its tree of causes."""
+    """Lines of output about one violation: its place in the source, and the tree of its causes."""
     from stlc.cli.framework.render import render_place
 
     judged = cause.judgement
@@ -64,7 +67,11 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
 
 
 def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
-    """The nodes of the tree with their depths, first the child that decides the value; without recursion."""
+    """Yield (depth, node) for every node of a tree of causes, parents before their children.
+
+    Of several children, the one that decides the value of the parent comes first. There is no recursion, so
+    no formula exhausts the stack.
+    """
     stack = [(0, tree)]
     while stack:
         depth, node = stack.pop()
@@ -75,7 +82,11 @@ def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
 
 
 def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
-    """One sub-formula: text, value, instant, and values of its signals."""
+    """Line of output about one sub-formula in a tree of causes.
+
+    It shows the text of the sub-formula, its truth value and instant, the values of its signals, and its
+    robustness.
+    """
     text = " ".join(node.span.text.split())
     short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
     subject = result.verdict.subject
@@ -103,7 +114,7 @@ def _readings(node: CauseNode, cause: Cause, result: Checked) -> list[str]:
 
 
 def _record(cause: Cause, result: Checked) -> ViolationCause:
-    """Record of the cause of a violation; the tree of causes is a list of nodes with depths."""
+    """JSON record of the cause of a violation; its tree is a list of nodes, each with its depth."""
     subject = result.verdict.subject
     nodes: list[CauseNodeRecord] = [
         {

@@ -25,14 +25,18 @@ if TYPE_CHECKING:
 
 
 def document(outcomes: Sequence[Outcome]) -> documents.CheckResult:
-    """The record of `--json`: the result of one trace, or one verdict and the list of results."""
+    """JSON document that `stlc check --json` prints.
+
+    For one file it is the record of that file; for several files, the overall verdict and the list of their
+    records.
+    """
     entries = [outcome.entry for outcome in outcomes]
     only: Any = entries[0]
     return only if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
 
 
 def result_record(result: Checked, end: str) -> documents.CheckedTrace:
-    """The record of a judged trace."""
+    """JSON record of a judged trace; `end` is the value of `--end`."""
     verdict = result.verdict
     return trace_record(
         result.trace.name,
@@ -62,16 +66,16 @@ def trace_record(
     time: Callable[[int], float],
     **found: object,
 ) -> documents.CheckedTrace:
-    """The record of a trace.
+    """JSON record of a judged trace.
 
     Args:
         name: name of the trace.
         source: text of the specification.
         dt: time step in seconds.
         horizon: value of `T` in steps, if known.
-        gaps: signal -> its unknown samples.
-        time: time of a sample in seconds.
-        found: the other keys.
+        gaps: signal -> number and range of its unknown samples.
+        time: function that maps the index of a sample to its time in seconds.
+        found: the keys of the record that the other arguments do not determine, such as `verdict`.
     """
     made: Any = {
         "trace": name,
@@ -112,15 +116,15 @@ def requirement_record(
     start: float,
     **found: object,
 ) -> documents.CheckedRequirement:
-    """The record of a requirement.
+    """JSON record of a judged requirement.
 
     Args:
         rule: the requirement.
         cause: cause of its violation, if any.
-        margins: statistics of the robustness.
+        margins: minimum, mean and bounds of the robustness, by key of the record.
         trace: index of the trace with the least robustness.
-        start: instant of the least robustness, in seconds.
-        found: verdict and counts.
+        start: instant at which the robustness is least, in seconds.
+        found: the verdict and the counts, by key of the record.
     """
     robustness = {
         **margins,
@@ -137,7 +141,10 @@ def _least(values: NDArray[np.float64]) -> float | None:
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean; values are divided by their number before they are added, because their sum may overflow."""
+    """The mean of some values; None if there are none.
+
+    The values are divided by their number before they are added, because their sum may overflow.
+    """
     with np.errstate(invalid="ignore"):  # +inf and -inf have no mean
         return float((values / values.size).sum()) if values.size else None
 
@@ -156,7 +163,7 @@ def _cause(cause: Cause) -> documents.CauseRecord:
 
 
 def junit(outcomes: Sequence[Outcome]) -> str:
-    """The JUnit XML document."""
+    """The results as a JUnit XML document."""
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites{_counts(outcomes)}>"]
     for outcome in outcomes:
         lines += _suite(outcome)
@@ -203,10 +210,12 @@ def _attribute(text: str) -> str:
 
 
 def write_robustness(path: Path, result: Checked, question: Question) -> None:
-    """Write one signal per requirement, (traces, samples); NaN where it has no value.
+    """Write the robustness of each requirement to the trace file `path`, one signal per requirement.
+
+    A signal has the shape (traces, samples); it is NaN at samples from which the robustness is not defined.
 
     Raises:
-        MissingError: R201, no room or no permission.
+        MissingError: R201, the disk is full, or the user may not write there.
     """
     from dataclasses import replace
 

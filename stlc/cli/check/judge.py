@@ -64,7 +64,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One file and its options.
+    """Request to judge one trace file, as sent to a worker process.
 
     Attributes:
         name: name of the file as given.
@@ -72,8 +72,8 @@ class Work:
         runs: folder of all runs.
         out: file to which the robustness signals are written.
         chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
-        color: whether texts may be coloured.
-        mode: colour mode of the program.
+        color: whether the text of the result has colour codes.
+        mode: value of `--color`, which the worker process adopts.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Work:
 
 
 def found(name: str, runs: Path) -> Path:
-    """The file of a trace: the path `name`, or else the trace in the newest run."""
+    """Return the path of a trace: `name` if it exists, else that trace in the newest run below `runs`."""
     from stlc.files import find_trace
 
     path = find_trace(name, runs)
@@ -131,7 +131,7 @@ def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
 
 
 def _options(question: Question) -> tuple[str, ...]:
-    """The command-line options that determine how a trace is read and judged."""
+    """The command-line options that repeat how a trace was read and judged, as words."""
     words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
@@ -143,7 +143,7 @@ def _options(question: Question) -> tuple[str, ...]:
 
 
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:
-    """Options for reading trace files: names and grid; if there is a monitor, also the types of signals."""
+    """Options for reading trace files: names and grid; with a monitor, also the types of its signals."""
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
 
@@ -152,7 +152,10 @@ def reading_options(monitor: Monitor | None, question: Question) -> Reading:
 
 
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
-    """Specification for the trace `name`: the file `spec`, else the one in the trace; and a remark."""
+    """Return the specification for the trace `name`, and a remark to print ("" if there is none).
+
+    The specification is the file `spec`, or else the text that is stored in the trace (`carried`).
+    """
     if spec is not None:
         return read_source(find_spec(spec)), ""
     if not carried.text:

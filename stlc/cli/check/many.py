@@ -20,9 +20,10 @@ SMALL = 1_000_000
 
 
 def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
-    """The outcomes of all files in order, computed by `jobs` processes.
+    """Yield the outcomes of all files in order, computed by `jobs` processes (0: one per core).
 
-    If a single file cannot be judged, its error is raised; one of several files gives an outcome with errors.
+    If there is only one file and it cannot be judged, its error is raised. Of several files, one that cannot
+    be judged has an outcome that contains its errors.
     """
     if len(works) == 1:
         yield outcome_of(works[0])
@@ -40,13 +41,13 @@ def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
 
 
 def _end_all(_code: int = 0) -> None:
-    """Kill the processes of all jobs after an interruption."""
+    """Kill all worker processes after an interruption."""
     for process in multiprocessing.active_children():
         process.kill()
 
 
 def safe_outcome(work: Work) -> Outcome:
-    """The outcome of a file; errors become part of it."""
+    """Judge one file; errors are not raised, but stored in the outcome."""
     try:
         return outcome_of(work)
     except StlcError as error:
@@ -88,7 +89,10 @@ def outcome_of(work: Work) -> Outcome:
 
 
 def _too_large(path: Path) -> bool:
-    """True if a file should be read in chunks; never for small files, however well compressed."""
+    """True if the unpacked content of a file is too large for memory, so that it is read in chunks.
+
+    A file below `SMALL` bytes is never too large, however well it is compressed.
+    """
     if path.stat().st_size < SMALL:
         return False
     from stlc.trace.chunks import LARGE, size_of
@@ -100,7 +104,7 @@ def _too_large(path: Path) -> bool:
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """A table with a line for each file, and a total."""
+    """Text that summarises several files: a line for each file, a line for each requirement, and a total."""
     names = list(dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows))
     head = ("trace", "verdict", "least robustness", "requirement", "where")
     lines = [_line(outcome) for outcome in outcomes]
@@ -141,7 +145,13 @@ def _per_requirement(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 
 def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
-    """Output paths of robustness signals; several files need a folder. Raises UsageError (U101)."""
+    """Output path of the robustness signals of each trace; None for each if `--out` was not given.
+
+    With several traces, `out` is a folder.
+
+    Raises:
+        UsageError: U101, `out` is a file although several traces are judged.
+    """
     if out is None:
         return [None] * len(names)
     if len(names) == 1 and not out.is_dir():

@@ -1,7 +1,8 @@
-"""Online monitoring: the standard input, and files larger than memory, read in chunks.
+"""Online monitoring: samples from the standard input, and files larger than memory, read in chunks.
 
 The lines of the standard input are a `.csv` with a header, or one JSON object each. The time step is that of
-`--dt`, of the first two values of `t`, or of the system; `--resample` puts any times on a grid.
+`--dt`, of the first two values of `t`, or of the system; with `--resample`, samples at any times are
+resampled to a uniform grid.
 """
 
 from __future__ import annotations
@@ -48,7 +49,11 @@ def _outcome(
     remarks: tuple[str, ...],
     begun: float,
 ) -> Outcome:
-    """The outcome of a finished stream. Raises TraceError as `Online.finish`."""
+    """Finish the monitoring of a stream and return its outcome.
+
+    Raises:
+        TraceError: E306, the trace is too short and `--end strict` was given; E605, there is no sample.
+    """
     tallies = online.finish()
     found = {tally.status for tally in tallies.values()}
     status: Status = "violated" if "violated" in found else "inconclusive"
@@ -224,13 +229,16 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
 
 
 def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
-    """The sample in declared units, and its time."""
+    """Sample with its values converted to the declared units; a missing time is added."""
     converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}
 
 
 def _tell(decision: Decision, online: Online) -> None:
-    """Print a decided verdict: a violation always, satisfaction only of a requirement that is judged once."""
+    """Print a decided verdict.
+
+    For a requirement that is judged at many instants only violations are printed.
+    """
     repeated = online.repeats(decision.requirement)
     if decision.status == "satisfied" and repeated:
         return
@@ -247,11 +255,12 @@ CHUNK = 250_000
 
 
 def outcome_in_chunks(path: Path, work: Work) -> Outcome:
-    """Judge a file in chunks.
+    """Judge a file that is read in chunks of samples.
 
     Raises:
-        UsageError: U101, an option that needs the whole trace.
-        TraceError: as `stlc.trace.chunks.pieces`.
+        UsageError: U101, an option needs the whole trace at once.
+        TraceError: the file cannot be read in chunks, or its samples are invalid; see
+            `stlc.trace.chunks.pieces`.
     """
     from stlc.monitor.online.online import How
     from stlc.trace.chunks import pieces
@@ -275,7 +284,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
 
 
 def _require_pieces(path: Path, work: Work) -> None:
-    """Raise UsageError for options that need all samples at once."""
+    """Raise UsageError (U101) if an option was given that needs all samples at once, such as `--resample`."""
     question = work.question
     whole = {
         "--resample": question.resample is not None,

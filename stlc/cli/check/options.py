@@ -21,7 +21,7 @@ from stlc.cli.framework.options import (
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """Options on reading and judging of traces."""
+    """Command-line options on how traces are read and judged."""
 
     spec: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
@@ -52,7 +52,11 @@ class Traces:
     runs: RunsOption = Path("runs")
 
     def question(self, **more: Any) -> Question:
-        """The options as a `Question`; `more` are further fields of it. Raises UsageError (U101)."""
+        """Return the options as a `Question`; `more` sets the fields of it that are no options here.
+
+        Raises:
+            UsageError: U101, the value of an option is malformed.
+        """
         asked = {
             "spec": self.spec,
             "system": self.system,

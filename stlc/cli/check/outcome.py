@@ -33,16 +33,17 @@ EXIT_CODES: dict[Status, int] = {
 
 @dataclass(frozen=True, slots=True)
 class VerdictRow:
-    """Result of a requirement on all traces of a file, with texts of the table.
+    """Result of one requirement on all traces of a file, a row of the printed table.
 
     Attributes:
         name: name of the requirement.
         status: verdict.
-        robustness: least robustness.
-        share: share of the starts at which the requirement holds; "" if there is one start.
+        robustness: least robustness, as printed; "" if there is none.
+        share: percentage of the start instants at which the requirement holds, as printed; "" if it is judged
+            at only one instant.
         where: trace and time of the least robustness.
         why: reason in one line, if the requirement is not satisfied.
-        least: least robustness, or its lower bound; 0 if there is none.
+        least: least robustness as a number, or its lower bound if inconclusive; 0 if there is none.
     """
 
     name: str
@@ -56,7 +57,7 @@ class VerdictRow:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of one file, judged or not.
+    """Result of one trace file; it contains errors if the file could not be judged.
 
     Attributes:
         name: name of the file.
@@ -64,10 +65,10 @@ class Outcome:
         status: verdict over all traces and requirements.
         rows: results of the requirements.
         text: printed result.
-        traces: number of traces in scope.
-        holds: share of the starts at which all requirements hold.
-        fails: share of the starts at which one requirement is violated.
-        seconds: run time.
+        traces: number of traces to which the specification applies.
+        holds: share of the start instants at which all requirements hold.
+        fails: share of the start instants at which at least one requirement is violated.
+        seconds: time it took to judge the file.
         warnings: warnings of the compiler.
         remarks: further messages for the user.
         errors: reasons for which the file could not be judged.
@@ -90,10 +91,11 @@ class Outcome:
 
 
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
-    """Exit code: 0 satisfied, 1 violated, 4 inconclusive; `fail_under` bounds the satisfied share.
+    """Exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
-    A file that cannot be judged takes precedence over every verdict. Traces to which the specification does
-    not apply (out of scope) do not count.
+    With `fail_under`, 0 means that at least this share of the start instants satisfies all requirements, and
+    1 that fewer can. A file that cannot be judged takes precedence over every verdict. Traces to which the
+    specification does not apply (out of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:
@@ -109,7 +111,7 @@ def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> i
 
 
 def overall(outcomes: Sequence[Outcome]) -> Status:
-    """Status over all files in scope."""
+    """Verdict over all judged files, without those to which the specification does not apply."""
     found = {outcome.status for outcome in outcomes if not outcome.errors}
     if "violated" in found:
         return "violated"
@@ -118,13 +120,13 @@ def overall(outcomes: Sequence[Outcome]) -> Status:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A judged trace: its specification, verdict and causes.
+    """A judged trace with its specification, its verdict and the causes of violations.
 
     Attributes:
         trace: trace as read, signals renamed.
         source: text of the specification.
         verdict: verdict per requirement.
-        causes: violated requirement -> cause.
+        causes: name of a violated requirement -> cause of the violation.
         options: command-line options of reading and judging.
         remarks: messages for the user.
     """

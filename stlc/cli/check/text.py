@@ -76,14 +76,18 @@ def text_of(
 
 
 def robustness_text(status: Status, low: float, high: float, least: float, unit: str) -> str:
-    """The least robustness with its unit; its bounds if the verdict is inconclusive."""
+    """Text of the robustness of a requirement, with its unit.
+
+    It shows the bounds `low` and `high` if the verdict is inconclusive, else the minimum `least`, or
+    "boundary" if that is zero up to rounding.
+    """
     if status == "inconclusive":
         return in_unit(f"[{signed(low)}, {signed(high)}]", unit)
     return "boundary" if abs(least) <= TOLERANCE else in_unit(signed(least), unit)
 
 
 def in_unit(value: str, unit: str) -> str:
-    """A robustness with its unit, if any: `+1.500 m`."""
+    """Text of a robustness value with its unit, if it has one: `+1.500 m`."""
     return f"{value} {visible(unit)}".rstrip()
 
 
@@ -151,7 +155,7 @@ def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) ->
 
 
 def _gap_texts(result: Checked) -> dict[str, str]:
-    """Needed but unknown samples, one line per signal."""
+    """Lines about the samples that are unknown although a requirement reads them: signal -> its line."""
     subject = result.verdict.subject
     samples = subject.signals.samples * subject.signals.batch
     moment = subject.moment

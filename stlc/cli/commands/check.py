@@ -120,7 +120,7 @@ def check(
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
-    """Print a single result in full; of several, those that are not satisfied, and a table.
+    """Print a single result in full; of several results, print those not satisfied and a summary table.
 
     Remarks and warnings are printed first.
     """

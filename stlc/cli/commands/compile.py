@@ -65,7 +65,7 @@ def compile_(
 def _trees(
     names: Sequence[str], show: Literal["ast", "dot"]
 ) -> Answer[documents.ParsedFile | documents.ParsedFiles]:
-    """Parse specifications; the syntax errors of all files are raised together."""
+    """Return the syntax trees of specifications; the syntax errors of all files are raised together."""
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
@@ -108,9 +108,9 @@ def _compiled(
     set_: list[str] | None,
     show: Literal["all", "steps", "states", "ir"],
 ) -> Answer[documents.CompiledSpec]:
-    """Read the specification and the system file and compile the specification, without torch.
+    """Read the specification and the system file, and compile the specification, without importing torch.
 
-    A specification that judges closed-loop runs of its system is compiled for recorded traces.
+    A specification that is written to judge closed-loop runs of its system is compiled for recorded traces.
     """
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid

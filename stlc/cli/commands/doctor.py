@@ -25,9 +25,9 @@ _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 def doctor(
     quick: Annotated[bool, typer.Option("--quick", help="Do not import torch to look for devices.")] = False,
 ) -> Answer[InstallationReport]:
-    """Check the installation: versions, devices, packages.
+    """Check the installation: versions, devices, packages and shell completion.
 
-    Shell completion too. Exit code: 0, or 5 if a required package is missing.
+    Exit code: 0, or 5 if a required package is missing.
     """
     findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools()]
     missing = [finding["name"] for finding in findings if finding["state"] == "missing"]
@@ -134,7 +134,7 @@ def _cache() -> InstallationFinding:
 
 
 def _compiler() -> InstallationFinding:
-    """Finding on how plans are evaluated (in C or in torch), and on compiler failures that were recorded."""
+    """Finding on the C compiler: if plans are evaluated in C or in torch, and recent compiler failures."""
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()

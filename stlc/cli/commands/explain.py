@@ -100,7 +100,7 @@ def _page(name: str) -> Answer[documents.ManualPage]:
 
 
 def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
-    """Translate every requirement of a specification into English."""
+    """Translate requirements of a specification into English: those in `wanted`, or all if it is empty."""
     from stlc.files import find_spec, read_source
     from stlc.grammar import ast
     from stlc.grammar.parse.parser import parse
@@ -181,7 +181,7 @@ class Page:
 
 
 def read_page(name: str) -> Page | None:
-    """Manual page of a code, or of operator precedence (`precedence`); None if there is none."""
+    """Return the manual page of a code, or of operator precedence (`precedence`); None without a page."""
     path = FOLDER / f"{name}.md"
     if not path.is_file():
         return None
@@ -216,9 +216,9 @@ ASSUMED = (
 
 
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
-    """Probability that the grid search of a run's backup policy finds a plan that works.
+    """Bound the probability that the grid search of a run's backup policy finds a plan that works.
 
-    The record also states the assumptions.
+    The record that is returned also states the assumptions behind these lower bounds.
     """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances

@@ -37,9 +37,9 @@ _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 
 
 def examples(incomplete: str = "") -> list[str]:
-    """Names of examples that begin with a text.
+    """Return the names of examples that begin with the text `incomplete`, for shell completion.
 
-    Examples are the installed systems that a specification refers to.
+    Examples are `cart`, the installed systems to which an installed specification refers, and `empty`.
     """
     found = {system.removesuffix(".yaml") for _, system in _pairs()}
     return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
@@ -117,9 +117,10 @@ def _require_new(paths: Iterable[Path], *, force: bool) -> None:
 
 
 def _project(example: str) -> dict[str, str]:
-    """Files of a new project: path within the project -> text.
+    """Return the files of a new project: path within the project -> text.
 
-    Raises UsageError (U101) if there is no such example.
+    Raises:
+        UsageError: U101, there is no such example.
     """
     if example == EMPTY:
         return dict(_SETTINGS)
@@ -130,7 +131,10 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """Command to run next: training for the first specification that does not judge closed-loop runs."""
+    """Command to run next, which trains for the first specification in `files` that is for training.
+
+    A specification by which a system judges closed-loop runs is not for training.
+    """
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}
     for path in files:
@@ -159,7 +163,10 @@ def _example_files(name: str) -> dict[str, str]:
 
 
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
-    """Pairs of a specification that refers to an installed system, and the name of that system's file."""
+    """Yield (path of a specification, name of the installed system file to which it refers).
+
+    The specifications are `specs`, or by default all installed ones; those of other systems are skipped.
+    """
     for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
         if named and (SYSTEMS / named[2]).is_file():
@@ -178,7 +185,9 @@ def _template(name: str) -> str:
 
 
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
-    """New file `NAME.stl` with a declaration of a signal for each state of a system.
+    """Path and text of a new specification, which declares a signal for each state of a system.
+
+    Without a system (`from_` is None) it declares an example signal.
 
     Returns:
         Path -> text, and the command to run next.
@@ -198,7 +207,11 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
 
 
 def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
-    """New file `NAME.yaml` that declares a system: path -> text, and the command to run next."""
+    """Path and text of a new system file `NAME.yaml`.
+
+    Returns:
+        Path -> text, and the command to run next.
+    """
     path = _path(folder, name, "systems", ".yaml")
     text = _template("system.yaml").format(name=path.stem)
     return {path: text}, shell(("stlc", "system", "show", operand(str(path))))

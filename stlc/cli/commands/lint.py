@@ -101,7 +101,7 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """Load the system to check a specification against; None if no system is given."""
+    """Load the system file against which a specification is checked; None if no system is given."""
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
@@ -116,7 +116,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
 
 
 def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], code: int) -> None:
-    """Print the findings; the format never changes the exit code."""
+    """Print the findings in the format of `--format`; they do not change the exit code."""
     match format_:
         case "json":
             ok = code == CLEAN

@@ -96,7 +96,7 @@ def plan(
 
 
 def _target(text: str) -> float:
-    """The robustness at which a search ends; inf for `max`."""
+    """Parse the robustness at which a search ends; `max` is infinity. Raises UsageError (U101)."""
     try:
         return float("inf") if text.strip() == "max" else float(text)
     except ValueError:
@@ -125,7 +125,7 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path)
 
 
 def _lines(plans: Plans) -> list[str]:
-    """Result as lines of text."""
+    """Lines of text that show the result of `stlc plan`."""
     from stlc.controller.evaluation.held_out import wilson
     from stlc.view.words import interval, number
     from stlc.view.words import seconds as duration

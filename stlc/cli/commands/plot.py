@@ -82,7 +82,11 @@ def plot(
 
 
 def _find(what: str, runs: Path) -> Path:
-    """The trace file called `what`, or the trace of the run called `what`."""
+    """Return the path of the trace file `what`, or of the trace in the run called `what`.
+
+    Raises:
+        UsageError: U102, there is no such trace or run, or the run has no trace.
+    """
     from stlc.files import find_trace
     from stlc.rundir import TRACE, RunDir
 
@@ -112,7 +116,7 @@ def _target(output: Path | None, trace: Path) -> Path:
 
 
 def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
-    """The trace, with units from the specification for signals that have none in the file."""
+    """Return the trace; signals without a unit in the file get the unit that the specification declares."""
     from stlc.grammar import ast
     from stlc.signature import Signature
     from stlc.units import parse_unit
@@ -127,7 +131,7 @@ def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
-    """The trace file's trace with number `wanted`; all traces if None."""
+    """Return trace number `wanted` of a file with several traces; all of them if it is None."""
     if wanted is None:
         return trace
     _require_trace(trace.traces, wanted)

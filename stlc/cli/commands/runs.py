@@ -149,14 +149,14 @@ def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:
 
 
 def _accuracy(record: Mapping[str, Any]) -> float | None:
-    """Share of validation states (never used in training) whose plan satisfies the specification."""
+    """Share of the validation states (never used in training) whose plan satisfies the specification."""
     result = record.get("result")
     value = result.get("accuracy") if isinstance(result, Mapping) else None
     return float(value) if isinstance(value, int | float) else None
 
 
 def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ...]:
-    """Cells of a run's row in the table."""
+    """Texts of a run's row in the table of `stlc runs list`."""
     accuracy, result = _accuracy(record), record.get("result")
     seconds = result.get("seconds") if isinstance(result, Mapping) else None
     return (
@@ -188,6 +188,6 @@ _VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
 
 
 def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Differences of two flattened records as (key, value, other value), without timestamps."""
+    """Differences of two flattened records as (key, value, other value); timestamps are not compared."""
     keys = [key for key in {**one, **other} if key not in _VOLATILE]
     return [(key, one.get(key, ""), other.get(key, "")) for key in keys if one.get(key) != other.get(key)]

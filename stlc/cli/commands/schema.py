@@ -22,9 +22,9 @@ def schema(
         str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
     ] = None,
 ) -> None:
-    """Print the JSON Schema of a command's --json output, or list all.
+    """Print the JSON Schema of a command's --json output, or list all schemas.
 
-    Within a major version keys are only added.
+    Within one major version keys are added but never removed.
     """
     if name is None:
         emit("\n".join(names()))

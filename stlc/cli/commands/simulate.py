@@ -127,9 +127,9 @@ def simulate(
     The newest run by default; with --method, a planner for the specification RUN, without training. With
     --backup the paper's backup policy guards it, and the same seeds are simulated without it for comparison.
     Trace, scene and figures are written to the run's folder. Drives (closed-loop runs, one agent over one
-    seed each) are judged by the specification that the system names (test: judge). Means over seeds have
-    95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and noise, also with a
-    percentage (mismatch-20); --scenario disturbed runs them all.
+    seed each) are judged by the specification that the system names (key `judge` of its section `test`).
+    Means over seeds have 95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and
+    noise, also with a percentage (mismatch-20); --scenario disturbed runs them all.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
@@ -182,7 +182,11 @@ def simulate(
 def _planner(
     method: str | None, option: list[str] | None, budget: str | None, system: str | None
 ) -> PlannerChoice | None:
-    """The planner of `--method`; None without it, and then its options are refused."""
+    """Planner that `--method` selects; None without that option.
+
+    Raises:
+        UsageError: U101, an option of planners is given without `--method`, or its value is invalid.
+    """
     if method is not None:
         return planner_choice(method, option, budget or "20ms")
     for name, value in {"--option": option, "--budget": budget, "--system": system}.items():
@@ -194,7 +198,11 @@ def _planner(
 def _run_of(
     run: str, choice: PlannerChoice | None, system: str | None, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """The run to simulate: as given, or for a planner the folder of a new run of the specification."""
+    """Name or folder of the run to simulate.
+
+    With a planner, a run folder is created for it, and `run` is the specification; without one, `run` is
+    returned.
+    """
     if choice is None:
         return run
     from stlc.controller.problem.load import load_task
@@ -221,7 +229,7 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Options of a simulation."""
+    """Options of a simulation, as parsed from the command line."""
 
     run: Run
     guard: Mode
@@ -266,7 +274,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
-    """Function that prints text to the standard output, or to standard error if `--robustness -` uses that.
+    """Function that prints text to the standard output, or to stderr if `--robustness -` occupies it.
 
     Raises UsageError (U101) if `--json` and `--robustness -` are combined.
     """
@@ -297,14 +305,18 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _satisfied(document: Simulation, guard: Mode) -> float:
-    """Share of closed-loop runs that satisfy all requirements; the least share of all scenarios."""
+    """Least share, over all scenarios, of closed-loop runs that satisfy all requirements."""
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
-    """Simulate without a scenario and with each given one; only the trace without a scenario is stored."""
+    """Simulate without a scenario and with each of `scenarios`, and return one record of all results.
+
+    It is also written to the run's folder, as is the trace of the simulation without a scenario; the traces
+    under scenarios are replaced.
+    """
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():
         each = _deployed(order, name, writes=False)
@@ -334,9 +346,9 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate with one kind of guard and show progress live.
+    """Simulate with one kind of guard (`mode`) and show progress live.
 
-    If the simulation fails or Ctrl-C ends it, the results up to then are saved.
+    If the simulation fails or Ctrl-C ends it, the steps simulated until then are saved as a trace.
     """
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
@@ -352,7 +364,7 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
-    """Write traces, scene (data of the animation) and record to the run's folder; return the record."""
+    """Write traces, scene (data of the animation) and record of a simulation; return the record."""
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
@@ -389,7 +401,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
 
 
 def _pictures(run: Run) -> dict[str, str]:
-    """Draw the animation and the report if matplotlib is installed; return kind of picture -> file."""
+    """Draw the animation and the report if matplotlib is installed; return kind of picture -> its path."""
     from stlc.view import available
 
     if not available():
@@ -419,7 +431,7 @@ def _pictures(run: Run) -> dict[str, str]:
 
 
 def _require_robots(run: Run) -> None:
-    """Check before the simulation that the world has robots and a window can be opened.
+    """Raise an error before the simulation if the world has no robots or no window can be opened.
 
     Raises:
         UsageError: U101, the run's world has no robots.

@@ -129,7 +129,10 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Compare the forward kinematics with those of pytorch-kinematics; raise an error if they differ."""
+    """Compare the kinematics of robots read from URDF files with those that pytorch-kinematics computes.
+
+    Raises SystemFileError if they differ.
+    """
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:
         return []
@@ -139,7 +142,7 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
 
 
 def _facts(decl: SystemDecl) -> documents.SystemFacts:
-    """Record of the declarations of a system, as the commands print it."""
+    """Record of the declarations of a system, which `stlc system show` prints."""
     flow = {assign.name: assign.text for assign in decl.flow}
     return {
         "name": decl.name,
@@ -166,7 +169,7 @@ def _facts(decl: SystemDecl) -> documents.SystemFacts:
 
 
 def _all_systems() -> Iterator[documents.ListedSystem]:
-    """Every system file in the search path, with the first sentence of its description if it is valid."""
+    """Yield a record of every system file in the search path: name, path, and description or first error."""
     from stlc.diagnostics import StlcError
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS

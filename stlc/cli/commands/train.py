@@ -182,9 +182,9 @@ def train(
 
 
 def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object]) -> None:
-    """Raise an error for options that exclude each other or do not apply.
+    """Raise UsageError (U101) for options that exclude each other or do not apply.
 
-    Some do not apply to a single run, some not to several runs, and some not to a cluster.
+    Some do not apply to a single run, some not to several specifications, and some not to a cluster.
     """
     for one, other in (("--budget", "--steps"), ("--seed", "--seeds")):
         if given[one] is not None and given[other] is not None:
@@ -235,7 +235,7 @@ def _steps(text: str) -> int | StepSchedule:
 
 
 def _rate(value: float) -> float:
-    """Parse a learning rate: a positive number."""
+    """Check that a learning rate is positive and finite, and return it. Raises UsageError (U101)."""
     if not 0.0 < value < math.inf:
         raise usage(f"`--lr {value:g}` is not a learning rate", "--lr 1e-3")
     return value
@@ -287,8 +287,8 @@ def _resume(
 ) -> Session:
     """Resume a run from its last checkpoint.
 
-    It ends at a total number of `steps`, after `more` seconds, or, if both are None, where it was planned to
-    end.
+    The training ends at `steps` steps in total, or after `more` seconds; if both are None, where it was
+    planned to end.
     """
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
@@ -302,7 +302,10 @@ def _resume(
 
 
 def _refuse_on_resume(given: Mapping[str, object]) -> None:
-    """Raise an error for options that a resumed run cannot change: all but its length and `--device`."""
+    """Raise UsageError (R104) for an option that a resumed run cannot change.
+
+    Only the length of the training and `--device` can be changed.
+    """
     named = [option for option, value in given.items() if value is not None]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
@@ -317,7 +320,7 @@ LOST = "R403"
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Context in which only the first of the processes that `torchrun` started prints.
+    """Context for one of several training processes that `torchrun` started: only the first one prints.
 
     Of the other processes, the first one on each machine prints its errors, and every one reports a missing
     package.

@@ -16,7 +16,7 @@ _COMMENT = re.compile(r"(#|//).*")
 
 
 def run_names(context: typer.Context, incomplete: str) -> list[str]:
-    """The runs below `--runs`, newest first, their specifications, and `latest`."""
+    """Names of runs below `--runs` for completion: `latest`, the runs, newest first, their specifications."""
     from stlc.rundir import LATEST, every_run
 
     root = Path(str(context.params.get("runs") or "runs"))
@@ -26,7 +26,10 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
-    """The requirements of a specification on the command line, or of one stored in a trace there."""
+    """Names of requirements, for completion: those of the first specification found on the command line.
+
+    If only a trace is given, the specification stored in it is used.
+    """
     names: dict[str, None] = {}
     for path in _named(context):
         with suppress(Exception):  # no diagnostics during completion
@@ -38,13 +41,13 @@ def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def _fitting(names: Iterable[str], incomplete: str) -> list[str]:
-    """Names with the prefix that need no quoting, as completions are not quoted."""
+    """Return the names that begin with `incomplete` and need no quoting, since completions are not quoted."""
     plain = (name for name in dict.fromkeys(names) if shell((name,)) == name and not name.startswith("-"))
     return [name for name in plain if name.startswith(incomplete)]
 
 
 def _named(context: typer.Context) -> Iterator[Path]:
-    """Files on the command line, a specification first."""
+    """Paths of the files named on the command line, specifications first."""
     given = list(context.args)  # parameters of an incomplete line are not assigned yet
     for key in ("spec", "files", "what"):
         value = context.params.get(key)

@@ -1,7 +1,7 @@
-"""Documents that commands print with `--json`, as typed records: their JSON Schemas are derived from these.
+"""Documents that commands print with `--json`, as typed records from which their JSON Schemas are derived.
 
-Times are in seconds, positions in files count from 1; a `Num` that is not finite is a text.
-Within a major number of a schema keys are added and never taken away.
+Times are in seconds, positions in files count from 1; a number (`Num`) that is not finite is written as a
+text. Within one major version of a schema keys are added and never removed.
 """
 
 from types import NoneType
@@ -32,7 +32,10 @@ Positive = Annotated[float, 0]
 
 
 def record(kind: type[R], source: object, **given: object) -> R:
-    """A record whose keys are the attributes of `source` with the same names; `given` has the other keys."""
+    """Return a record of the type `kind`.
+
+    The value of a key is taken from `given`, else from the attribute of `source` with the same name.
+    """
     names = [name for name in kind.__annotations__ if name not in given]
     made: Any = {name: getattr(source, name) for name in names} | given
     found: R = made
@@ -398,7 +401,7 @@ class TrainingVerdict(TypedDict):
 
 
 def verdict_record(learning: "Learning") -> TrainingVerdict:
-    """The record of the verdict on a training."""
+    """JSON record of the assessment of a training: level (such as "undertrained"), advice, next command."""
     share, following = learning.share, learning.command
     return record(TrainingVerdict, learning, share_of_feasible=share, next=following)
 
@@ -749,7 +752,10 @@ def _object(kind: Any) -> dict[str, Any]:
 
 
 def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Schema of alternatives; a type or null, or several plain types, are joined into one schema."""
+    """Schema of a value that matches one of `parts`.
+
+    Plain types, as in "string or null", are joined into one schema.
+    """
     plain = [part["type"] for part in parts if part.keys() == {"type"}]
     rest = [part for part in parts if part.keys() != {"type"}]
     if not rest:

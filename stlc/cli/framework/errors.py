@@ -1,4 +1,4 @@
-"""The error boundary: the only place where exceptions become messages and exit codes."""
+"""The place where the exceptions of all commands become messages and exit codes."""
 
 from __future__ import annotations
 
