@@ -34,17 +34,20 @@ if TYPE_CHECKING:
 
 
 class Method(ABC):
-    """A training method or planner.
+    """Interface of a training method, or of planning without training.
+
+    It resolves the options of a run, makes the learner (the state of a training), and loads the policy of a
+    run.
 
     Attributes:
-        options: type of the resolved options; a method with further options derives a type whose added fields
-            are int or float, with defaults.
+        options: class of the resolved options. A method with options of its own declares a subclass of
+            `ResolvedConfig`, whose added fields are int, float or str and have defaults.
     """
 
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve all options of a run from those of the user and the system file."""
+        """Resolve the options of a run: those of the user, else of the system file, else of the method."""
         return base_config(task, config, kind=self.options)
 
     def learner(
@@ -56,7 +59,7 @@ class Method(ABC):
         device: torch.device,  # noqa: ARG002
         ranks: Ranks,  # noqa: ARG002
     ) -> Learner | None:
-        """Make the learner, in its state before the first step; None for a planner, which learns nothing."""
+        """Make the learner, in its state before the first step; None if the method plans without training."""
         return None
 
     @abstractmethod
@@ -71,16 +74,20 @@ class Method(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Results of judging and searching on newly drawn states, over all ranks (processes that train together).
+    """Result of a validation: of the verdicts on plans from newly drawn states, and of the search for others.
+
+    A method that searches starts a search for satisfying plans from the states where the policy's plans fail.
 
     Attributes:
         accuracy: share of states whose plan satisfies the specification.
-        requirements: share of states whose plan satisfies a requirement, in the order of the task's rules.
-        feasible: share of states for which a satisfying plan is known after the search; None if there was
-            none.
-        failing: number of states that were searched.
-        repaired: number of searched states for which a satisfying plan was found.
-        explored: number of plans found by exploration, including those from states along other plans.
+        requirements: for each requirement, in the order of `task.rules`, the share of states whose plan
+            satisfies it.
+        feasible: estimated share of states for which a satisfying plan is known, from the policy or from the
+            last search; None if no search has ended.
+        failing: number of states from which the last search started.
+        repaired: number of these states for which it found a satisfying plan.
+        explored: number of plans that exploration (search over plan prefixes) has found since the validation
+            before; remainders of a plan from states that it passes are counted too.
     """
 
     accuracy: float
@@ -92,12 +99,15 @@ class Validation:
 
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
-        """Shares of satisfying plans among the judged plans."""
+        """Validation with the shares of satisfying plans among the judged plans, without a search."""
         shares = satisfied(judged.requirements).double().mean(0)
         return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
 
     def mean(self, ranks: Ranks) -> Validation:
-        """The validation over all ranks: means of shares, sums of counts."""
+        """Combine the validations of all ranks: shares are averaged, counts are added.
+
+        All ranks (processes that train together) must call this at the same time.
+        """
         counts = (self.failing, self.repaired, self.explored)
         own = (self.feasible or 0.0, *counts, self.accuracy, *self.requirements)
         feasible, failing, repaired, explored, accuracy, *shares = ranks.mean(own)
@@ -151,7 +161,10 @@ class Learner(ABC):
 
     @abstractmethod
     def advance(self) -> float:
-        """Make one step and return its loss; NaN, and no change, if loss or gradient is not finite."""
+        """Make one step and return its loss.
+
+        If the loss or its gradient is not finite, the step is not counted and NaN is returned.
+        """
 
     @property
     @abstractmethod
@@ -199,15 +212,22 @@ class Learner(ABC):
         return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Part of the training -> reason why it runs in torch; "" if it runs in C."""
+        """Reasons why parts of the training run in torch: name of the part -> reason; "" if it runs in C.
+
+        See `Task.torch_reasons` for the parts.
+        """
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Search for plans by exploration if that is due; return False if `stop` ended it."""
+        """Explore plan prefixes for satisfying plans, if the last search found too few.
+
+        Returns:
+            False if `stop` ended the exploration early, else True.
+        """
         return True
 
     def wait(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Wait for the end of the concurrent search; return False if `stop` ended the waiting."""
+        """Wait for the end of the concurrent search; return False if `stop` ended the wait, else True."""
         return True
 
     def close(self) -> None:  # noqa: B027

@@ -39,7 +39,9 @@ class ActorConfig(ResolvedConfig):
 
 
 class ActorPolicy(Policy):
-    """Policy of an actor that observes the state and the fraction of the plan that has elapsed.
+    """Policy whose plan is the sequence of controls of an actor in closed loop on the model.
+
+    The actor observes the state and the elapsed fraction of the plan.
 
     Args:
         task: specification and system.
@@ -78,7 +80,7 @@ class ActorLearner(Learner):
     """Training of an actor (a network that chooses one action per step) by rewards."""
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reason why plans are judged in torch; "" if they are judged in C. Gradients are not needed."""
+        """Reason, under the name `verdicts`, why plans are judged in torch; "" if they are judged in C."""
         reasons = super().torch_reasons()
         return {"verdicts": reasons["verdicts"]}
 
@@ -96,7 +98,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restore an optimiser from `optimizer_tensors`, whose names here lack the prefix."""
+    """Restore an optimiser from the result of `optimizer_tensors`, its names without `prefix.`."""
     layout = optimizer.state_dict()
     for key, value in tensors.items():
         index, name = key.split(".")

@@ -33,14 +33,14 @@ FEWEST = 2
 
 
 class BatchedMlp(nn.Module):
-    """Several MLPs of the same shape, evaluated side by side in one batched matrix product a layer.
+    """Several MLPs of the same shape, evaluated together by one batched matrix product per layer.
 
     Args:
         count: number of networks, E.
-        widths: of all layers, inputs first.
-        activation: between the layers.
-        generator: of the initial weights: normal with standard deviation 1 / (2 sqrt(inputs)), cut off at
-            twice that (Chua et al. 2018); biases are 0.
+        widths: number of inputs, of units in each hidden layer, and of outputs.
+        activation: function between the layers.
+        generator: random numbers of the initial weights, which are normal with standard deviation
+            1 / (2 sqrt(inputs)), cut off at twice that value (Chua et al. 2018); biases are 0.
     """
 
     def __init__(
@@ -97,8 +97,9 @@ class Fit:
 class Ensemble(nn.Module):
     """Ensemble of networks that predict the change of a state in one step, each as a Gaussian.
 
-    The networks learn from different samples. Inputs and targets are normalised, since the components of a
-    state have different units. Components that never change in the data are predicted not to change.
+    Inputs are states and controls; targets are the changes of the states in one step. The networks learn from
+    different bootstrap samples. Inputs and targets are normalised, since the components of a state have
+    different units. Components that never change in the data are predicted not to change.
 
     Attributes:
         body: the networks, (E, B, inputs) -> (E, B, 2 outputs): means and logarithms of variances.
@@ -143,9 +144,11 @@ class Ensemble(nn.Module):
         return len(self.body.weights[0])
 
     def normalise(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set the mean and scale of normalisation from inputs (N, inputs) and targets (N, outputs).
+        """Set the means and standard deviations of the normalisation.
 
-        Component i of a target is the change of component i of the input.
+        Args:
+            inputs: (N, inputs).
+            targets: (N, outputs); component i is the change of component i of the input.
         """
         spread = inputs.std(0)
         scale = targets.std(0)
@@ -156,7 +159,10 @@ class Ensemble(nn.Module):
         self.scale.copy_(torch.where(still, torch.zeros_like(scale), scale))
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and log-variances, in units of `scale`: (E, B, inputs) -> two tensors (E, B, outputs)."""
+        """Means and log-variances of the normalised change, (change - `drift`) / `scale`.
+
+        (E, B, inputs) -> two tensors (E, B, outputs).
+        """
         mean, log = self.body((inputs - self.centre) / self.spread).chunk(2, -1)
         return mean, _bounded(log, self.lowest, self.highest)
 
@@ -165,7 +171,7 @@ class Ensemble(nn.Module):
 
         Args:
             inputs: (E, B, inputs).
-            targets: in the units of the data, (E, B, outputs).
+            targets: changes in physical units, (E, B, outputs).
         """
         mean, log = self(inputs)
         error = (mean - self._scaled(targets)).square()
@@ -175,7 +181,12 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def errors(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        """Mean squared errors of all networks on the same samples, in units of `scale`: (E,)."""
+        """Mean squared error of each network's normalised predictions, all on the same samples: (E,).
+
+        Args:
+            inputs: (N, inputs).
+            targets: changes in physical units, (N, outputs).
+        """
         total, wanted = self.scale.new_zeros(self.networks), self._scaled(targets)
         for part, target in zip(torch.split(inputs, 2048), torch.split(wanted, 2048), strict=True):
             mean = self(part.expand(self.networks, -1, -1))[0]
@@ -184,14 +195,17 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def variance(self, inputs: Tensor) -> Tensor:
-        """Variance of the mixture of the elites, in physical units: (B, inputs) -> (B, outputs)."""
+        """Variance of the change predicted by the elites, an equal mixture of their Gaussians.
+
+        (B, inputs) -> (B, outputs), in squared physical units.
+        """
         mean, log = self(inputs.expand(self.networks, -1, -1))
         mean, log = mean[self.elites], log[self.elites]
         found: Tensor = (log.exp().mean(0) + mean.var(0, unbiased=False)) * self.scale.square()
         return found
 
     def predictor(self) -> Predictor:
-        """Predictor with the present weights of the elites, which draws samples without gradient."""
+        """Make a predictor with a copy of the elites' present weights; it draws samples without gradient."""
         return Predictor(self)
 
     def _scaled(self, targets: Tensor) -> Tensor:
@@ -230,14 +244,14 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw a sample of the change for every input; inputs `[i]` are evaluated by elite number i.
+        """Draw a sample of the change for every input; elite number i predicts for `inputs[i]`.
 
         Args:
             inputs: (k, B, inputs), where k is at most `elites`.
             generator: random numbers of the noise.
 
         Returns:
-            Changes in the units of the data, (k, B, outputs).
+            Changes in physical units, (k, B, outputs).
         """
         count, x = len(inputs), inputs
         last = len(self._layers) - 1
@@ -251,7 +265,7 @@ class Predictor:
 
 
 def optimizer_of(ensemble: Ensemble, fit: Fit) -> torch.optim.Optimizer:
-    """Adam for all networks together; weight decay does not apply to the bounds on variances."""
+    """Make an Adam optimiser of all networks; weight decay does not apply to the bounds on variances."""
     groups = [
         {"params": list(ensemble.body.parameters()), "weight_decay": fit.decay},
         {"params": [ensemble.lowest, ensemble.highest], "weight_decay": 0.0},
@@ -283,7 +297,8 @@ def train_ensemble(
 
     Returns:
         Mean over the elites of the mean squared error on the validation data (on the training data if there
-        are none), in units of the spread of the targets; NaN where the loss is not finite.
+        are none), in units of the spread of the targets; NaN if a loss was not finite, which ends the
+        training.
     """
     ensemble.normalise(inputs, targets)
     order = torch.randperm(len(inputs), generator=generator)
@@ -312,14 +327,24 @@ def train_ensemble(
 
 
 class _Best:
-    """For each network the weights with the least validation error, and the passes since any improved."""
+    """Record of each network's weights with the least validation error, to which `restore` returns.
+
+    It counts the passes over the data since a network last improved.
+    """
 
     def __init__(self, ensemble: Ensemble, errors: Tensor | None) -> None:
         self._ensemble, self._errors, self._idle = ensemble, errors, 0
         self._kept = [] if errors is None else [each.detach().clone() for each in ensemble.body.parameters()]
 
     def update(self, errors: Tensor) -> int:
-        """Store the weights of the networks that improved; return the passes since the last improvement."""
+        """Store the weights of the networks whose validation error has improved by 1 %.
+
+        Args:
+            errors: present validation errors, (E,).
+
+        Returns:
+            Number of calls since a network last improved.
+        """
         assert self._errors is not None
         better = errors < (1.0 - GAIN) * self._errors
         self._idle = 0 if bool(better.any()) else self._idle + 1
@@ -330,6 +355,6 @@ class _Best:
 
     @torch.no_grad()
     def restore(self) -> None:
-        """Give every network its stored weights, those with the least validation error."""
+        """Set every network to its stored weights; without validation data none are stored or changed."""
         for kept, now in zip(self._kept, self._ensemble.body.parameters(), strict=False):
             now.copy_(kept)

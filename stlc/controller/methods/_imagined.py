@@ -1,4 +1,4 @@
-"""Observed and imagined episodes of a task, and their rewards.
+"""Episodes of a task, simulated (observed) or predicted by a learnt model (imagined), and their rewards.
 
 Observed episodes are simulated with the model of the system and stored; an ensemble learns from them, and
 predicts imagined episodes. The ensemble predicts only the states of the system itself. The states that the
@@ -45,8 +45,9 @@ class ModelConfig(ActorConfig):
         model_decay: factor of the penalty on the sum of squared weights.
         model_batch: number of samples per gradient step and network.
         model_epochs: maximum number of passes over the data after new episodes.
-        model_patience: passes without improvement that end the training of the networks; 0: none.
-        model_held: share of the samples held out for their validation.
+        model_patience: number of passes without improvement after which training of the networks ends; 0: all
+            passes are made.
+        model_held: share of the samples held out for validation of the networks.
         growth: share by which the data have to grow before the networks are trained again; 0: every time.
         first: number of episodes with random controls before the first training of the networks.
         capacity: number of episodes that are stored; new ones replace the oldest.
@@ -84,7 +85,7 @@ class ModelConfig(ActorConfig):
 
 
 def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor:
-    """Rewards of all steps of whole episodes, as `Environments` gives them: (B, T).
+    """Rewards of all steps of whole episodes, the same as those of `Environments`: (B, T).
 
     Args:
         task: specification and system.
@@ -100,7 +101,7 @@ def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor
 
 
 def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
-    """Reward at the end of episodes with states (B, T+1, n): (B,); not for the reward `task`."""
+    """Reward `robustness` or `accuracy` of whole episodes, from their states (B, T+1, n): (B,)."""
     rho = task.robustness(states)
     if kind == "accuracy":
         return SATISFIED * satisfied(rho).to(rho)
@@ -108,7 +109,14 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
-    """Reward that the system declares, for steps `before` (…, n), `after` (…, n), `actions` (…, m): (…)."""
+    """Reward `task`, which the system file declares, of single steps: (…).
+
+    Args:
+        task: specification and system.
+        before: states before the steps, (…, n).
+        after: states after the steps, (…, n).
+        actions: controls of the steps, within their ranges, (…, m).
+    """
     system, shape = task.system, actions.shape[:-1]
     flat = [part.reshape(-1, part.shape[-1]) for part in (before, after, actions)]
     return system.reward(flat[1], system.commanded(flat[0], flat[2])).to(actions).view(shape)
@@ -140,7 +148,10 @@ class Episodes:
         self.count = min(self.total, len(self.states))
 
     def transitions(self, own: int) -> tuple[Tensor, Tensor]:
-        """Training data of the ensemble, where `own` is the number of states of the system itself.
+        """Training data of the ensemble: one sample per stored step.
+
+        Args:
+            own: number of states of the system itself, without those that the specification adds.
 
         Returns:
             Inputs (states and controls), (N, own + m), and targets (changes of the states in a step), (N,
@@ -157,7 +168,7 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from what `tensors` returned, whose names here lack their prefix."""
+        """Restore the episodes from the result of `tensors`, its names without `episodes.`."""
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
             getattr(self, name)[: self.count] = tensors[name]
@@ -165,7 +176,7 @@ class Episodes:
 
 @torch.no_grad()
 def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[Tensor, Tensor]:
-    """Simulate episodes from states `x0`, (N, n), under the controls `act(states, step)`.
+    """Simulate episodes from states `x0`, (N, n), under the controls `act(states, step)`, clipped to range.
 
     Returns:
         States (N, T+1, n) and controls (N, T, m).
@@ -208,6 +219,9 @@ class LearntModel:
             x: states, (k, B, n), where k is at most the number of elites.
             u: controls within their ranges, (k, B, m).
             generator: random numbers of the predictions.
+
+        Returns:
+            Next states, (k, B, n).
         """
         own = x[..., : self._own]
         moved = own + self.predictor(torch.cat((own, u), -1), generator)
@@ -227,8 +241,8 @@ class ModelLearner(Learner):
     Attributes:
         episodes: the stored episodes.
         ensemble: the learnt model.
-        fitted: number of episodes at the latest training of the ensemble.
-        error: validation error after that training, see `train_ensemble`.
+        fitted: number of episodes ever observed (`episodes.total`) at the latest training of the ensemble.
+        error: result of `train_ensemble` at that training; NaN before it.
     """
 
     config: ModelConfig
@@ -236,7 +250,12 @@ class ModelLearner(Learner):
     def __init__(
         self, task: Task, config: ModelConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
     ) -> None:
-        """Raise UsageError (U101) for several ranks (processes), a GPU, or an undeclared reward."""
+        """Make an untrained ensemble and an empty memory of episodes.
+
+        Raises:
+            UsageError: U101, there are several ranks (processes), the device is not the CPU, or there is no
+                such reward.
+        """
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         if ranks.size > 1:
             raise usage(f"method `{config.method}` trains in one process", "start it without torchrun")
@@ -261,12 +280,15 @@ class ModelLearner(Learner):
         return LearntModel(self.task, self.ensemble.predictor())
 
     def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
-        """Play one episode in every environment and train the ensemble if due.
+        """Simulate one episode per environment, and train the ensemble if enough data were added.
 
-        Returns False if the training of the ensemble diverged.
+        The first call simulates at least `config.first` episodes, with random controls.
 
         Args:
             act: function from states (N, n) and the step to controls (N, m); None for random controls.
+
+        Returns:
+            False if the training of the ensemble diverged, else True.
         """
         config = self.config
         count = config.environments if self.episodes.total else max(config.first, config.environments)
@@ -288,7 +310,10 @@ class ModelLearner(Learner):
         return not math.isnan(self.error)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly; no episode is in progress between two steps."""
+        """Tensors from which training resumes exactly.
+
+        They hold the random numbers, the stored episodes, the ensemble and its optimiser.
+        """
         found = super().tensors() | self.episodes.tensors()
         found |= {f"ensemble.{name}": value for name, value in self.ensemble.state_dict().items()}
         return found | optimizer_tensors(self.optimizer, "adam")

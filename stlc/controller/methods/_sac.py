@@ -1,4 +1,4 @@
-"""Options and actor of soft actor-critic; they need no stable-baselines3, which only training uses."""
+"""Options and actor of the method `sac`; only its training (`_sb3.py`) needs stable-baselines3."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SacConfig(ActorConfig):
-    """Options of SAC. The paper uses 8 environments, 1 update, and 5 to 20 million transitions.
+    """Options of SAC. Meng and Fan (2023) use 8 environments, 1 update, and 5 to 20 million transitions.
 
     Attributes:
         updates: number of gradient steps after each step of all environments.
         capacity: capacity of the replay buffer, in transitions.
         warmup_transitions: number of transitions with random controls before the first update.
-        discount: gamma of the return.
+        discount: discount factor of the return.
         smoothing: share by which the target critics move towards the critics in an update (tau).
     """
 
@@ -37,9 +37,9 @@ class SacConfig(ActorConfig):
 
 
 class SacActor(nn.Module):
-    """Network with the mean of the actor of stable-baselines3, with the same names of its weights.
+    """Network from observations to the most probable controls of the actor of stable-baselines3.
 
-    It does not need that package.
+    Its weights have the same names as there, so that they can be copied; the package is not needed.
 
     Attributes:
         centre: mean of the observations of initial states, (k,).
@@ -74,6 +74,6 @@ class SacActor(nn.Module):
         return self.middle + self.extent * scaled
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The most probable controls: (B, k) -> (B, m)."""
+        """The most probable controls in physical units, for observations: (B, k) -> (B, m)."""
         mean: Tensor = self.mu(self.latent_pi(self.normalised(observation)))
         return self.controls(torch.tanh(mean))

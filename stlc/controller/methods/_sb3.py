@@ -54,7 +54,7 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
 
     Args:
         environments: the episodes.
-        actor: actor whose scales of observations and controls are used.
+        actor: actor whose methods normalise the observations and scale the controls.
     """
 
     render_mode = None
@@ -66,23 +66,24 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         super().__init__(environments.count, seen, Box(-1.0, 1.0, (controls,), np.float32))
 
     def reset(self) -> np.ndarray[Any, Any]:
-        """Begin all episodes at new initial states; return the observations, (N, k)."""
+        """Begin all episodes at new initial states; return the normalised observations, (N, k)."""
         self.environments.reset()
         return self.observed()
 
     def observed(self) -> np.ndarray[Any, Any]:
-        """Normalised observations of the present states at the beginning of episodes, (N, k)."""
+        """Normalised observations of the present states, which must be initial states, (N, k)."""
         return self._seen(self.environments.observe(self.environments.states, 0))
 
     def step_async(self, actions: np.ndarray[Any, Any]) -> None:
-        """Store the controls (N, m) that `step_wait` applies."""
+        """Store the controls (N, m), from -1 to 1, that `step_wait` applies."""
         self._actions = torch.from_numpy(np.asarray(actions, np.float32))
 
     def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
         """Advance all episodes by one step under the stored controls.
 
         Returns:
-            Observations (N, k), rewards (N,), whether episodes ended (N,), and one dictionary per episode.
+            Normalised observations (N, k), rewards (N,), whether the episodes ended (N,), and one dictionary
+            per episode: at its end with `terminal_observation` (k,), the observation before the restart.
         """
         result = self.environments.step(self._actor.controls(self._actions))
         done = result.done.numpy()
@@ -104,11 +105,11 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
-        """Set an attribute of all environments."""
+        """Set an attribute of this object, and so of all environments, whatever `indices`."""
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method for every environment."""
+        """Call a method of this object once per environment in `indices`; return the results."""
         return [getattr(self, method_name)(*args, **kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:  # noqa: ARG002
@@ -117,7 +118,7 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
 
 
 class RandomState:
-    """State of the random numbers that the library draws from the global generators of torch and NumPy.
+    """Random numbers of stable-baselines3, which draws from the global generators of torch and NumPy.
 
     Attributes:
         torch: state of torch's generator.
@@ -130,7 +131,10 @@ class RandomState:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Context in which the global generators have this state; afterwards their own state is restored."""
+        """Context in which the global generators continue from the states stored here.
+
+        At its end, the states that they have reached are stored, and their former states are restored.
+        """
         others = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002 - the library's
         torch.set_rng_state(self.torch)
         np.random.set_state(self.numpy)  # noqa: NPY002
@@ -155,7 +159,10 @@ class RandomState:
 
 
 class SacLearner(ActorLearner):
-    """Training by SAC. On one machine the same seed and number of steps give the same weights."""
+    """Training of an actor by soft actor-critic (SAC), with stable-baselines3.
+
+    On one machine the same seed and number of steps give the same weights.
+    """
 
     config: SacConfig
 
@@ -198,7 +205,7 @@ class SacLearner(ActorLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """Policy with the most probable controls of the actor."""
+        """Policy that applies the actor's most probable controls, without exploration noise."""
         theirs = {name: value.detach().cpu() for name, value in self.model.actor.state_dict().items()}
         own = {name: theirs[name] for name in self.actor.state_dict() if name in theirs}
         self.actor.load_state_dict(own, strict=False)
@@ -232,7 +239,11 @@ class SacLearner(ActorLearner):
         return loss
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step; False, since the finite weights before that step are not kept."""
+        """Find the cause of a step whose loss was not finite.
+
+        Returns:
+            The error that describes the cause, and False: the weights before the step are lost.
+        """
         return super().diagnose()[0], False
 
     # ------------------------------------------------------------- checkpoints
@@ -249,7 +260,7 @@ class SacLearner(ActorLearner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly.
 
-        They are those of networks, optimisers, entropy coefficient, replay buffer and random numbers.
+        They hold networks, optimisers, entropy coefficient, replay buffer, states and random numbers.
         """
         found = super().tensors()
         found |= {f"policy.{name}": value for name, value in self.policy.actor.state_dict().items()}  # type: ignore[attr-defined]

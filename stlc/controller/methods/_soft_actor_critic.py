@@ -1,7 +1,7 @@
-"""Soft actor-critic (Haarnoja et al., arXiv 1812.05905), for methods that learn a model.
+"""Soft actor-critic (Haarnoja et al., arXiv 1812.05905), for methods that learn a model of the system.
 
-These methods need only its gradient steps, on transitions that they make themselves. All random numbers come
-from a given generator, and a checkpoint holds the whole state.
+Such a method supplies the transitions; this module makes the gradient steps. All random numbers come from the
+caller's generator, and a checkpoint holds the whole state.
 """
 
 from __future__ import annotations
@@ -72,16 +72,19 @@ class SacOptions:
 
 
 class SoftActorCritic(nn.Module):
-    """Actor with a squashed Gaussian, and two critics side by side in one batched network.
+    """Actor and two critics of soft actor-critic.
+
+    The actor's actions are Gaussian, squashed by tanh to [-1, 1]. The two critics are one batched network.
 
     Attributes:
-        actor: normalised observations -> means and logarithms of deviations, (1, B, k) -> (1, B, 2m).
+        actor: normalised observations -> means and logarithms of standard deviations before the tanh,
+            (1, B, k) -> (1, B, 2m).
         critics: normalised observations and actions -> values, (2, B, k + m) -> (2, B, 1).
         targets: target critics, a copy that follows the critics slowly.
         temperature: logarithm of the weight of the entropy, ().
         centre: mean of the observations, (k,).
-        spread: their standard deviation, (k,).
-        scale: unit of the rewards, ().
+        spread: standard deviation of the observations, (k,).
+        scale: number by which rewards are divided, ().
     """
 
     centre: Tensor
@@ -112,19 +115,24 @@ class SoftActorCritic(nn.Module):
         }
 
     def normalise(self, seen: Tensor, returns: Tensor) -> None:
-        """Set the units of observations from samples (N, k), that of rewards from returns (E,)."""
+        """Set the normalisation of observations and rewards.
+
+        Args:
+            seen: samples of observations, (N, k).
+            returns: sums of the rewards of E episodes, (E,).
+        """
         spread = seen.std(0)
         self.centre.copy_(seen.mean(0))
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
         self.scale.copy_(torch.nan_to_num(returns.std(), nan=1.0).clamp(min=1e-3))
 
     def forward(self, seen: Tensor) -> Tensor:
-        """The most probable actions, -1 to 1: (B, k) -> (B, m)."""
+        """The most probable actions, from -1 to 1, for observations: (B, k) -> (B, m)."""
         return torch.tanh(self._parameters_of(self._normalised(seen))[0])
 
     @torch.no_grad()
     def explore(self, seen: Tensor, generator: torch.Generator) -> Tensor:
-        """Actions drawn from the policy, from -1 to 1: (B, k) -> (B, m)."""
+        """Draw actions, from -1 to 1, from the actor's distribution for observations: (B, k) -> (B, m)."""
         return self._sampled(self._normalised(seen), generator)[0]
 
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -167,7 +175,11 @@ class SoftActorCritic(nn.Module):
         return mean, LOG_LOW + 0.5 * (LOG_HIGH - LOG_LOW) * (torch.tanh(log) + 1.0)
 
     def _sampled(self, seen: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Random actions, (B, m), and the logarithms of their probability densities, (B,); Appendix C."""
+        """Draw random actions for normalised observations (Haarnoja et al., Appendix C).
+
+        Returns:
+            Actions, (B, m), and the logarithms of their probability densities, (B,).
+        """
         mean, log = self._parameters_of(seen)
         noise = torch.randn(mean.shape, generator=generator)
         raw = mean + noise * log.exp()

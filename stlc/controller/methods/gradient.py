@@ -1,4 +1,4 @@
-"""The paper's own method: gradient descent on smooth robustness (Meng and Fan 2023, Eq. 6 to 10)."""
+"""Method of Meng and Fan (2023, Eq. 6 to 10): gradient descent on smooth robustness."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 
 class Gradient(NetworkMethod):
-    """Gradient descent on log-sum-exp robustness with tanh switching; one plan per state, no search."""
+    """Gradient descent on smooth robustness; the network proposes one plan per state, without search.
+
+    Minima and maxima are smoothed by log-sum-exp; jumps and conditions of the system, by tanh.
+    """
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
         """Resolve the options: as in the paper, every step uses new states, unless `samples` is given.
@@ -28,7 +31,7 @@ class Gradient(NetworkMethod):
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 
     def objective(self, learner: Trainer) -> Objective:
-        """The paper's objective; its margin is the gamma of the system file."""
+        """Objective of Meng and Fan (2023); its margin is the gamma of the system file."""
         return paper_objective(learner.task)
 
 

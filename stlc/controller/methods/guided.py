@@ -2,7 +2,7 @@
 
 Every few dozen steps the policy's plans from newly drawn states are judged; failing plans are repaired by a
 search that starts from them, and repaired plans are imitated for as long as the policy fails at their state
-(decision 7).
+(docs/decisions/0007-training-engine.md).
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class Guided(NetworkMethod):
-    """Gradient descent on exact robustness, supported by local search; the best of several plans is used."""
+    """Gradient descent on exact robustness, supported by local search.
+
+    The network proposes several plans per state, of which the policy selects the best.
+    """
 
     searches = True
     mirrored = True
@@ -30,14 +33,17 @@ class Guided(NetworkMethod):
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
         """Resolve the options.
 
-        By default the policy proposes four plans, and a step uses as many states at which it failed before as
-        new states.
+        By default the network proposes four plans. Half of the states of a step are newly drawn, the other
+        half are states at which the policy failed before and for which the search found a plan.
         """
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective with exact min and max and a saturating hinge, at a margin that search can reach."""
+        """Objective with exact min and max, and a saturating hinge at the margin.
+
+        The margin of the learner is a robustness that the search reaches on most states.
+        """
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance
         )

@@ -2,12 +2,12 @@
 
 An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
 and soft actor-critic learns from their transitions, together with a few observed ones. The reward of imagined
-steps is that of the task. If an imagined episode reaches its end, its robustness is computed on the observed
-steps before its beginning and the imagined steps after it.
+steps is that of the task. If an imagined episode reaches the last step of a plan, its robustness is computed
+on the observed states before its beginning together with the imagined states.
 
 The settings of Meng and Fan (2023) for their comparison: the options `environments=1 growth=0 imagined=400
 longest=15 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
-temperature=0.2`, and `--lr 3e-4`. Their reward is learnt; here it is that of the task.
+temperature=0.2`, and `--lr 3e-4`. They learn the reward too; here it is computed by the task.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class MbpoConfig(ModelConfig):
 
 
 class Acting(nn.Module):
-    """Controls in physical units by the actor of a soft actor-critic.
+    """Network from observations to controls in physical units: the actor of a soft actor-critic.
 
     Args:
         task: the task, whose control ranges scale the actions from [-1, 1].
@@ -84,7 +84,7 @@ class Acting(nn.Module):
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
     def forward(self, seen: Tensor) -> Tensor:
-        """The most probable controls: (B, k) -> (B, m)."""
+        """The most probable controls in physical units, for observations: (B, k) -> (B, m)."""
         return self.physical(self._learner(seen))
 
     def physical(self, actions: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class Acting(nn.Module):
 
 
 class MbpoLearner(ModelLearner):
-    """Training by MBPO: of an ensemble on observed episodes, of actor and critics on short imagined ones."""
+    """Training by MBPO: the ensemble learns from observed episodes, actor and critics from imagined ones."""
 
     config: MbpoConfig
 
@@ -110,7 +110,7 @@ class MbpoLearner(ModelLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """Policy with the most probable controls of the actor."""
+        """Policy that applies the actor's most probable controls, without exploration noise."""
         return ActorPolicy(self.task, self.acting)
 
     @property
@@ -122,7 +122,11 @@ class MbpoLearner(ModelLearner):
         return max(1, round(config.shortest + share * (config.longest - config.shortest)))
 
     def advance(self) -> float:
-        """Play one episode in every environment; then train ensemble, actor and critics, in this order."""
+        """Simulate one episode per environment; then train ensemble, actor and critics, in this order.
+
+        Returns:
+            The mean loss of the critics; NaN if it is not finite or the ensemble diverged.
+        """
         before = self.environment_steps
 
         def act(states: Tensor, step: int) -> Tensor:
@@ -151,7 +155,7 @@ class MbpoLearner(ModelLearner):
         return torch.cat((seen, (steps / self.task.horizon)[:, None].to(seen)), 1)
 
     def _normalise(self) -> None:
-        """Set the units of observations and rewards from the episodes observed first."""
+        """Set the normalisation of observations and rewards from the episodes stored at present."""
         kept = self.episodes
         states = kept.states[: kept.count]
         steps = torch.arange(states.shape[1]).repeat(len(states))
@@ -160,12 +164,12 @@ class MbpoLearner(ModelLearner):
         )
 
     def _drawn(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw random observed steps: indices of episodes and indices of steps, (count,) each."""
+        """Draw random observed steps: index of the episode and index of the step in it, (count,) each."""
         episodes = torch.randint(self.episodes.count, (count,), generator=self.generator)
         return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
 
     def _mixed(self, imagined: Batch) -> Batch:
-        """Batch of random transitions, imagined and observed ones in the share that the options say."""
+        """Draw a batch of transitions: the share `config.observed` is observed, the rest is imagined."""
         size = self.config.batch
         real = min(size, round(self.config.observed * size))
         rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
@@ -185,7 +189,11 @@ class MbpoLearner(ModelLearner):
 
     @torch.no_grad()
     def _imagined(self, count: int) -> Batch:
-        """Imagine at least `count` episodes from random observed states; return their transitions."""
+        """Imagine at least `count` episodes of up to `length` steps, from random observed states.
+
+        Returns:
+            The transitions of all steps; those with non-finite states or rewards are left out.
+        """
         model, horizon, length = self.model, self.task.horizon, self.length
         members = model.predictor.elites
         count = -(-count // members) * members
@@ -216,9 +224,14 @@ class MbpoLearner(ModelLearner):
         return whole
 
     def _earned(self, paths: Tensor, x: Tensor, moved: Tensor, controls: Tensor, ends: Tensor) -> Tensor:
-        """Rewards of one imagined step from states `x` to `moved` under `controls`: (B,).
+        """Rewards of one imagined step of B episodes: (B,).
 
-        `ends` marks the episodes that end with the step; `paths` are the states of all episodes, (B, T+1, n).
+        Args:
+            paths: states of the episodes, including those after the step, (B, T+1, n).
+            x: states before the step, (B, n).
+            moved: states after the step, (B, n).
+            controls: controls of the step, (B, m).
+            ends: whether the episode ends with the step, (B,).
         """
         if self.reward == "task":
             return step_rewards(self.task, x, moved, controls)
@@ -229,7 +242,7 @@ class MbpoLearner(ModelLearner):
         return earned
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly; imagined transitions are not kept between steps."""
+        """Tensors from which training resumes exactly; no step uses the imagined transitions of another."""
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
@@ -255,7 +268,7 @@ class Mbpo(Method):
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> MbpoLearner:
-        """Training state before the first step. Raises UsageError (U101), see `ModelLearner`."""
+        """Make the learner, in its state before the first step. Raises UsageError, see `ModelLearner`."""
         assert isinstance(config, MbpoConfig)
         return MbpoLearner(task, config, steps=steps, device=device, ranks=ranks)
 

@@ -54,15 +54,16 @@ class PetsConfig(ModelConfig):
     """Options of PETS.
 
     Attributes:
-        ahead: number of steps that a search covers; 0: the horizon of a plan, which is required for rewards
-            other than `task`. Otherwise every step has a search of its own, of which the plan takes the first
-            control.
+        ahead: number of steps that a search covers. 0: one search covers the whole plan, as always for
+            rewards other than `task`, which need a whole episode. Otherwise a search is made for every step
+            of the plan, and only the first control of its result is used.
         piece: number of steps over which a control is constant.
         population: number of control sequences in a round.
         rounds: number of rounds of the cross-entropy method.
         elite_share: share of the population, the best sequences, from which the next round is sampled.
         inertia: weight of the former mean and variance (the paper's alpha).
-        particles: number of imagined episodes per control sequence, distributed evenly over the elites.
+        particles: number of imagined episodes per control sequence, distributed evenly over the elites (the
+            networks with the least validation error).
     """
 
     environments: int = 8
@@ -102,16 +103,17 @@ class PetsPolicy(Policy):
 
     @torch.no_grad()
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a single round of the search over the whole horizon: (B, n) -> (B, T, m)."""
+        """Plans found by a single round of one search over the whole plan: (B, n) -> (B, T, m)."""
         other = PetsPolicy(self.task, self._model, replace(self._config, ahead=0, rounds=1))
         generator = torch.Generator().manual_seed(self._config.seed)
         return other.sequence(x0.float(), generator).to(x0)
 
     @torch.no_grad()
     def sequence(self, x0: Tensor, generator: torch.Generator) -> Tensor:
-        """Plans (B, T, m) from states (B, n): by one search, or by a search at every step.
+        """Search for plans from states: (B, n) -> (B, T, m).
 
-        In the second case each search gives one control, and the task's model moves the states.
+        With `config.ahead` 0 one search finds the whole plan. Otherwise each step has its search, of which
+        the first control is used; the model of the system, not the learnt one, computes the next state.
         """
         if not self._config.ahead or self._reward != "task":
             return self._optimised(x0, self.task.horizon, generator)
@@ -128,14 +130,27 @@ class PetsPolicy(Policy):
     def _optimised(
         self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None = None
     ) -> Tensor:
-        """Controls (B, steps, m) of the next steps from states (B, n), found by the cross-entropy method."""
+        """Search by the cross-entropy method for the controls of the next steps, from states `x0` (B, n).
+
+        Args:
+            x0: states, (B, n).
+            steps: number of steps.
+            generator: random numbers of the search and of the predictions.
+            guess: mean of the first round, (B, steps, m); None: the middle of the control ranges.
+
+        Returns:
+            Controls, (B, steps, m).
+        """
         size = max(1, ROWS // (self._config.population * math.prod(self._shape)))
         guesses = [None] * len(x0) if guess is None else torch.split(guess, size)
         parts = zip(torch.split(x0, size), guesses, strict=False)
         return torch.cat([self._climbed(part, steps, generator, start) for part, start in parts])
 
     def _climbed(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
-        """Search of `_optimised`; each round samples by mean and variance of the best of the round before."""
+        """Search as `_optimised` does, for all states in one batch.
+
+        Each round samples from a Gaussian with mean and variance of the best sequences of the round before.
+        """
         config, system = self._config, self.task.system
         low, high = system.control_low, system.control_high
         pieces = -(-steps // config.piece)
@@ -165,7 +180,7 @@ class PetsPolicy(Policy):
         return chosen.repeat_interleave(config.piece, 1)[:, :steps]
 
     def _values(self, x0: Tensor, sequences: Tensor, generator: torch.Generator) -> Tensor:
-        """Mean reward of control sequences over their particles, (B, P).
+        """Mean over the particles of the reward of imagined episodes under control sequences, (B, P).
 
         Args:
             x0: states, (B, n).
@@ -191,17 +206,21 @@ class PetsPolicy(Policy):
 
 
 class PetsLearner(ModelLearner):
-    """Training of the ensemble on episodes that are controlled by plans of its own."""
+    """Training by PETS: the ensemble learns from episodes under plans that were searched with it."""
 
     config: PetsConfig
 
     @property
     def policy(self) -> PetsPolicy:
-        """Policy that plans with the present model."""
+        """Policy that plans with the present weights of the ensemble."""
         return PetsPolicy(self.task, self.model, self.config)
 
     def advance(self) -> float:
-        """Plan and play one episode in every environment, and train the ensemble on these episodes."""
+        """Plan and simulate one episode per environment, and train the ensemble if enough data were added.
+
+        Returns:
+            The validation error of the ensemble, see `train_ensemble`; NaN if its training diverged.
+        """
         plans: list[Tensor] = []
         planner = self.policy
 
@@ -231,7 +250,7 @@ class Pets(Method):
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> PetsLearner:
-        """Training state before the first step. Raises UsageError (U101), see `ModelLearner`."""
+        """Make the learner, in its state before the first step. Raises UsageError, see `ModelLearner`."""
         assert isinstance(config, PetsConfig)
         return PetsLearner(task, config, steps=steps, device=device, ranks=ranks)
 

@@ -77,7 +77,12 @@ class PlanMethod(Method):
 
 
 def planner_of(name: str, options: Mapping[str, str]) -> Planner:
-    """The planner of a closed loop. Raises UsageError (U101) for `policy`, which would be a run of a run."""
+    """Return the planner `name` with its options, for planning in closed loop.
+
+    Raises:
+        UsageError: U101, the planner is `policy` (to simulate a trained policy, simulate its own run), or
+            there is no such planner or option.
+    """
     if name == "policy":
         raise usage(
             "planner `policy` takes the plans of a trained run", "simulate that run: stlc simulate RUN"

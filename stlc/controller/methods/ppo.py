@@ -64,8 +64,9 @@ class PpoConfig(ActorConfig):
     Attributes:
         epochs: number of passes over the transitions of a training step.
         minibatches: number of gradient steps in a pass.
-        discount: gamma of the return; 1 since episodes are finite and the elapsed share is observed.
-        trace: lambda of the advantage estimates.
+        discount: discount factor of the return; 1 since episodes are finite and their elapsed share is
+            observed.
+        trace: lambda of the generalised advantage estimation.
         ratio: bound on the change of the probability ratio (the paper's epsilon).
         entropy: weight of the entropy bonus.
         deviation: initial standard deviation of the controls before the tanh.
@@ -105,7 +106,10 @@ class Moments(nn.Module):
 
     @torch.no_grad()
     def add(self, vectors: Tensor, ranks: Ranks) -> None:
-        """Add vectors (B, k) of this rank, together with those of all other ranks (processes)."""
+        """Update mean and standard deviation with vectors (B, k) of each rank (process).
+
+        All ranks must call this at the same time.
+        """
         found = vectors.double()
         sums = torch.stack((torch.full_like(found[0], len(found)), found.sum(0), found.square().sum(0)))
         if ranks.size > 1:
@@ -122,7 +126,7 @@ class Moments(nn.Module):
 class ActorCritic(nn.Module):
     """Two separate networks of a normalised observation: a Gaussian policy and a value function.
 
-    The policy gives raw controls, which are then squashed to the control ranges.
+    The policy network outputs w raw controls, unbounded numbers that are then squashed to the control ranges.
 
     Attributes:
         deviation: logarithm of the standard deviation of each raw control, (w,).
@@ -150,7 +154,7 @@ class ActorCritic(nn.Module):
         return squash(raw, self._task.system.decl.controls)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The most probable controls: (B, k) -> (B, m)."""
+        """The most probable controls in physical units, for observations: (B, k) -> (B, m)."""
         mean: Tensor = self.actor(self.normalised(observation))
         return self.controls(mean)
 
@@ -166,7 +170,7 @@ class ActorCritic(nn.Module):
         return self.density(self.actor(seen), noise, raw), values
 
     def drawn(self, noise: Tensor, white: Tensor) -> Tensor:
-        """Exploration noise of a step, (B, w), in standard deviations.
+        """Exploration noise of a step, (B, w), in standard deviations, correlated with the step before.
 
         Args:
             noise: exploration noise of the step before, (B, w).
@@ -175,7 +179,13 @@ class ActorCritic(nn.Module):
         return self._correlation * noise + math.sqrt(1.0 - self._correlation**2) * white
 
     def density(self, mean: Tensor, noise: Tensor, raw: Tensor) -> Tensor:
-        """Log-density of raw controls, given the noise of the step before: (B, w) each -> (B,)."""
+        """Logarithm of the probability density of raw controls: (B, w) each -> (B,).
+
+        Args:
+            mean: mean of the raw controls without noise.
+            noise: exploration noise of the step before, in standard deviations.
+            raw: the raw controls.
+        """
         innovation = math.sqrt(1.0 - self._correlation**2)
         distance = (raw - mean) * torch.exp(-self.deviation) - self._correlation * noise
         whitened = (distance / innovation).square()
@@ -209,8 +219,8 @@ class Episodes:
     Attributes:
         seen: observations, (T, N, k).
         raw: controls before squashing, (T, N, w).
-        noise: exploration noise of the preceding step, drawn for the first one, in standard deviations,
-            (T, N, w).
+        noise: exploration noise of the step before (of the first step: a random draw), in standard
+            deviations, (T, N, w).
         density: logarithm of the probability density of the controls, (T, N).
         rewards: (T, N).
     """
@@ -223,7 +233,10 @@ class Episodes:
 
 
 class PpoLearner(ActorLearner):
-    """Training by PPO. On one machine the same seed and number of steps give the same weights."""
+    """Training of an actor by proximal policy optimisation (PPO).
+
+    On one machine the same seed and number of steps give the same weights.
+    """
 
     config: PpoConfig
 
@@ -239,13 +252,13 @@ class PpoLearner(ActorLearner):
 
     @property
     def policy(self) -> ActorPolicy:
-        """Policy with the most probable controls, on the CPU."""
+        """Policy that applies the actor's most probable controls, without exploration noise, on the CPU."""
         on_processor = self.device.type == "cpu"
         return ActorPolicy(self.task, self.network if on_processor else deepcopy(self.network).cpu())
 
     @property
     def rate(self) -> float:
-        """Learning rate of the next step, which falls linearly."""
+        """Learning rate of the next step; it falls linearly over the training."""
         left = 1.0 - self.step / max(self.steps, 1)
         return self.config.lr * max(left, LEAST)
 
@@ -294,7 +307,7 @@ class PpoLearner(ActorLearner):
         return torch.randn(shape, generator=self.generator).to(self.device)
 
     def _estimated(self, seen: Tensor, rewards: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised advantages and targets of the critic, (T, N) each.
+        """Normalised advantages of the steps, and the values that the critic is to learn, (T, N) each.
 
         Args:
             seen: normalised observations, (T, N, k).
@@ -314,13 +327,15 @@ class PpoLearner(ActorLearner):
     def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
         """Make all gradient steps of a training step on its episodes.
 
+        They end early if a loss or gradient is not finite.
+
         Args:
             episodes: transitions, with normalised observations.
             advantages: normalised advantages, (T N,).
-            targets: targets of the critic, (T N,).
+            targets: values that the critic is to learn, (T N,).
 
         Returns:
-            The mean loss; NaN if a loss or gradient is not finite; later gradient steps are then left out.
+            The mean loss; NaN if a loss or gradient is not finite.
         """
         config, total = self.config, 0.0
         seen, raw, noise = (part.flatten(0, 1) for part in (episodes.seen, episodes.raw, episodes.noise))
@@ -346,7 +361,11 @@ class PpoLearner(ActorLearner):
         return total / (config.epochs * -(-len(seen) // size))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly; no episode is in progress between two steps."""
+        """Tensors from which training resumes exactly: random numbers, network, optimiser.
+
+        On the first rank the random numbers are those of all ranks (processes that train together); all ranks
+        must call this at the same time.
+        """
         own = super().tensors()
         found = dict(own)
         for index, theirs in enumerate(self.ranks.gather(own), start=1):
@@ -368,7 +387,7 @@ class Ppo(Method):
     options = PpoConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PpoConfig:
-        """Resolve the options; `--batch` is the number of environments."""
+        """Resolve the options; `--batch` sets the number of episodes that are simulated in parallel."""
         found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS)
         assert isinstance(found, PpoConfig)
         lr = config.lr or task.system.decl.train.lr or RATE
@@ -377,7 +396,11 @@ class Ppo(Method):
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> PpoLearner:
-        """Training state before the first step. Raises UsageError (U101): the reward is not declared."""
+        """Make the learner, in its state before the first step.
+
+        Raises:
+            UsageError: U101, there is no such reward, or it is `task` and the system declares none.
+        """
         assert isinstance(config, PpoConfig)
         return PpoLearner(task, config, steps=steps, device=device, ranks=ranks)
 

@@ -1,7 +1,7 @@
 """Soft actor-critic (Haarnoja et al., ICML 2018) by stable-baselines3.
 
 RL_R, RL_S and RL_A of Meng and Fan (2023) are this method with `--reward task`, `robustness` and `accuracy`.
-Training needs the extra `stlc[rl]`; the trained policy does not.
+Training needs the optional packages of `stlc[rl]`; the trained policy does not.
 """
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ class Sac(Method):
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Learner:
-        """Training state before the first step.
+        """Make the learner, in its state before the first step.
 
         Raises:
             MissingError: R301, stable-baselines3 is not installed.
-            UsageError: U101, the reward is not declared, or several processes are to train together.
+            UsageError: U101, there is no such reward, or it is `task` and the system declares none, or
+                several processes are to train together.
         """
         try:
             from stlc.controller.methods._sb3 import SacLearner

@@ -43,7 +43,10 @@ FIRST_SEARCH = 1.0
 
 
 def cores() -> int:
-    """Number of cores that this process may use: its share if several trainings run on this machine."""
+    """Number of cores that this process may use.
+
+    Processes that `torchrun` started on this machine share the cores evenly.
+    """
     found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
@@ -51,8 +54,8 @@ def cores() -> int:
 def processor() -> float:
     """Processor time in seconds, comparable with wall time on an idle machine.
 
-    It is the larger of this thread's time and the time of all threads divided by the cores, plus compilers'
-    time.
+    It is the larger of two times: that of this thread, and that of all threads divided by the number of
+    cores. The time of child processes that have ended (compilers) is added.
     """
     ended = os.times()
     mine = max(time.thread_time(), time.process_time() / cores())
@@ -60,7 +63,7 @@ def processor() -> float:
 
 
 def clock_of(name: Clock) -> Callable[[], float]:
-    """The clock of that name, in seconds from an arbitrary origin."""
+    """Return the function that reads the clock `name`, in seconds from an arbitrary origin."""
     return processor if name == "processor" else time.perf_counter
 
 
@@ -98,7 +101,15 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Budget reduced by `late`, the predicted seconds by which work around the training exceeds it."""
+        """Budget of which the training gets what other work leaves, but at least half.
+
+        Args:
+            now: function that reads the clock, in seconds.
+            started: clock reading at the start.
+            allowed: the user's budget in seconds; 0: unlimited.
+            late: function from the budget to the seconds by which the training together with the other work
+                of the run, such as the evaluation, is predicted to exceed it; None: by nothing.
+        """
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
 
@@ -110,7 +121,7 @@ class TimeBudget:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """Entry of a schedule: from `step` on, the run has `steps` steps in total."""
+    """Entry of a schedule: after step `step`, a total of `steps` steps is planned for the run."""
 
     step: int
     steps: int
@@ -121,7 +132,7 @@ _TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
 
 @dataclass(frozen=True, slots=True)
 class StepSchedule:
-    """Numbers of steps planned in the course of a run; with the seed they determine the weights.
+    """Total numbers of steps planned in the course of a run; with the seed they determine the weights.
 
     Attributes:
         plannings: entries in order; the first is at step 0, and of two at the same step the later one
@@ -137,10 +148,14 @@ class StepSchedule:
 
     @classmethod
     def parse(cls, text: str) -> StepSchedule:
-        """Parse `1200`, or `10000,1240@10,900@455`: 10000 steps, from step 10 on 1240, from 455 on 900.
+        """Parse the text of a schedule.
+
+        `1200` is a fixed number of steps. With `10000,1240@10,900@455` the planned total is 10000 at first,
+        1240 after step 10, and 900 after step 455.
 
         Raises:
-            ValueError: not a schedule, or the steps do not increase.
+            ValueError: the text is not a schedule, its steps are not in order, or a total is less than the
+                number of steps already made.
         """
         if not _TEXT.fullmatch(text):
             raise ValueError("it is neither a number of steps nor a schedule")
@@ -159,12 +174,12 @@ class StepSchedule:
         return ",".join((str(first.steps), *(f"{each.steps}@{each.step}" for each in later)))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
-        """The schedule with a further entry: from `step` on, `steps` steps in total."""
+        """This schedule with a further entry: after `step`, the total number of steps is `steps`."""
         return StepSchedule((*self.plannings, Planned(step, steps)))
 
     @property
     def steps(self) -> int:
-        """Number of steps of the whole run."""
+        """Total number of steps of the run, as planned last."""
         return self.plannings[-1].steps
 
     def at(self, step: int) -> int:
@@ -175,9 +190,10 @@ class StepSchedule:
 class Pace:
     """Measured pace of a run, and the number of steps that fit into its budget.
 
-    A search round judges new states and starts a search that runs concurrently with the steps; the next
-    round, or a checkpoint, waits for its end. The durations of searches and rounds are measured in steps: if
-    the machine becomes twice as slow, all of them are assumed to take twice as long.
+    A search round (validation) judges the policy's plans from new states, and starts a search for better ones
+    that runs concurrently with the steps; the next round, or a checkpoint, waits for the end of that search.
+    The durations of searches and rounds are measured in steps: if the machine becomes twice as slow, all of
+    them are assumed to take twice as long.
     """
 
     def __init__(self, *, every: int, searching: bool, now: float, seconds: float = 0.0) -> None:
@@ -239,9 +255,12 @@ class Pace:
         return max(now - then, 0.0) / (last - first)
 
     def remaining(self, step: int, steps: int, next_validation: int) -> float:
-        """Predicted seconds from `step` to the end of the run after `steps` steps.
+        """Predicted seconds from `step` to the end of the run.
 
-        `next_validation`: step of the next search round.
+        Args:
+            step: number of completed steps.
+            steps: total number of steps of the run.
+            next_validation: step of the next search round.
         """
         if steps < step:
             return 0.0
@@ -257,9 +276,17 @@ class Pace:
         return self.per_step * (steps - step + round_ * rounds + waits)
 
     def plan(self, step: int, steps: int, next_validation: int, left: float) -> int:
-        """Number of steps of a run with `left` seconds remaining; `steps` is kept if the prediction fits.
+        """Total number of steps of the run that fit into the remaining time.
 
-        The result is at least 1, and at least the number of steps that are already made.
+        Args:
+            step: number of completed steps.
+            steps: total number of steps planned at present; returned unchanged if it is predicted to fit, or
+                if too few steps were timed to plan again.
+            next_validation: step of the next search round.
+            left: remaining seconds.
+
+        Returns:
+            At least 1, and at least `step`.
         """
         cost = self.per_step
         if left > 0.0 and (cost <= 0.0 or (steps > step and not self._due(left))):
@@ -281,7 +308,7 @@ class Pace:
 
     @property
     def planned(self) -> bool:
-        """True once steps were planned for a budget."""
+        """True once the number of steps has been planned from measured durations."""
         return self._left is not None
 
     def _due(self, left: float) -> bool:

@@ -46,7 +46,7 @@ class Checkpoint:
 def save_checkpoint(
     run: RunDir, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int
 ) -> Path:
-    """Write a checkpoint, make it the latest, and remove older ones.
+    """Write a checkpoint, make it the latest, remove older ones, and return the path of its tensors.
 
     Raises:
         MissingError: R201, the disk is full or not writable; the last good checkpoint stays.
@@ -67,7 +67,7 @@ def save_checkpoint(
 
 
 def never_saved(run: RunDir) -> bool:
-    """True if the run has never had a checkpoint."""
+    """True if no checkpoint of the run was ever written: it has no folder `ckpt`."""
     return not (run.path / FOLDER).exists()
 
 
@@ -105,7 +105,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
 
 @contextmanager
 def restoring(run: RunDir) -> Iterator[None]:
-    """Context in which an error of restoring objects from a checkpoint becomes RunError (R101)."""
+    """Context for restoring objects from a checkpoint: errors caused by damage become RunError (R101)."""
     try:
         yield
     except _DAMAGE as error:
@@ -113,7 +113,12 @@ def restoring(run: RunDir) -> Iterator[None]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
-    """Scalars and tensor bytes of the latest checkpoint, after a check that both belong together."""
+    """Read the scalars and the bytes of the tensor file of the latest checkpoint.
+
+    Raises:
+        RunError: R101, there is no checkpoint, it cannot be read, or the bytes are not those that were
+            written with the scalars.
+    """
     try:
         facts = json.loads((folder / POINTER).read_text())
         name = facts["file"]
@@ -147,6 +152,6 @@ def _shown(folder: Path) -> str:
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
-    """Tensors whose names begin with `prefix`, the weights of one module, without the prefix."""
+    """Weights of one module: the tensors whose names begin with `prefix.`, under names without it."""
     start = prefix + "."
     return {name[len(start) :]: value for name, value in checkpoint.tensors.items() if name.startswith(start)}

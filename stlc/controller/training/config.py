@@ -56,19 +56,22 @@ class TrainConfig:
     Attributes:
         method: name of a training method, see `stlc.registry.METHODS`.
         budget: training time in seconds, final evaluation included; the number of steps is adapted to it.
-        clock: clock of the budget.
-        steps: optimiser steps, or the schedule of a run with a budget; takes precedence over `budget`.
+        clock: clock that measures the budget: `wall` time or `processor` time.
+        steps: number of training steps, or the recorded schedule of an earlier run, which is followed again;
+            takes precedence over `budget`.
         seed: seed of all random numbers in training.
         device: torch device.
-        threads: number of threads of torch; None leaves one core to the concurrent search.
-        plans: number of plans of the network.
+        threads: number of threads of torch; None: all cores, less one if a search runs concurrently.
+        plans: number of plans that the network proposes per state.
         lr: peak learning rate.
         batch: number of newly drawn states per step.
-        held_out: number of held-out states.
-        drives: maximum closed-loop runs per guard after the training; 0: none.
-        planner: the planner of the method `plan`.
-        reward: of a method that learns from rewards; None leaves the choice to the method.
-        options: of the method alone, name -> text.
+        held_out: number of initial states of the final evaluation, on which no policy is trained.
+        drives: maximum number of closed-loop simulations per guard (check of plans at run time) after the
+            training; 0: none.
+        planner: planner of the method `plan`, with its options.
+        reward: name of the reward, for a method that learns from rewards; None leaves the choice to the
+            method.
+        options: options that only this method has, name -> text.
     """
 
     method: str | None = None
@@ -90,15 +93,19 @@ class TrainConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedConfig:
-    """Resolved options of a run; fresh states are newly drawn, hard ones are those that failed.
+    """Resolved options of a run.
+
+    Fresh states are newly drawn initial states; hard states are those from which the policy's plans failed.
+    A search round (validation) judges the policy's plans from fresh states, and starts a search for plans
+    where they fail.
 
     Attributes:
         method: name of the method.
         seed: seed of all random numbers.
         hidden: widths of the network's hidden layers.
-        plans: number of plans of the network.
+        plans: number of plans that the network proposes per state.
         batch: number of fresh states per step.
-        hard: number of hard states with a repaired plan per step, once there are any.
+        hard: number of hard states per step, for which the search has found a plan; 0 until it has.
         lr: peak learning rate.
         warmup: share of the steps over which the learning rate rises.
         hold: share of the steps at the peak learning rate; if it is positive, the learning rate rises over a
@@ -107,17 +114,17 @@ class ResolvedConfig:
         average: decay of the moving average of the weights.
         pool: number of fresh states judged per search round.
         every: steps between search rounds; doubled after a round that repaired few plans.
-        most: maximum number of failing states repaired per round.
-        slope: slope, per unit, that replaces the derivative of jumps and conditions.
-        imitation: weight of the distance to a repaired plan in the loss.
-        share: weight of the mean loss of all plans, in addition to the loss of the best one.
-        performance: factor of the performance terms in the loss.
-        held_out: number of held-out states.
+        most: maximum number of hard states from which a search round searches.
+        slope: slope, per unit, that replaces the derivative of jumps and conditions of the system.
+        imitation: weight in the loss of the distance to the plan that the search found.
+        share: weight in the loss of the mean loss of all plans of a state, added to that of its best plan.
+        performance: weight in the loss of the performance terms.
+        held_out: number of initial states of the final evaluation, on which no policy is trained.
         threads: number of threads of torch, on which the rounding of sums depends; 0: not changed.
         samples: size of a fixed training set; 0: fresh states in every step.
-        clock: clock of budgets and recorded times.
+        clock: clock of budgets and recorded times: `wall` or `processor`.
         ranks: number of processes that train together, each with its own batch.
-        drives: maximum number of closed-loop runs per guard after the training.
+        drives: maximum number of closed-loop simulations per guard after the training.
     """
 
     method: str
@@ -157,7 +164,7 @@ MOST_TEXT = 1000
 
 
 def bounded(default: float, least: float, most: float) -> Any:
-    """Field of a method's options: a number with its bounds, which `checked_config` enforces."""
+    """Field of an options class: a number from `least` to `most`, which `checked_config` enforces."""
     return field(default=default, metadata={"bounds": (least, most)})
 
 
@@ -168,7 +175,7 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
     """Return the options unchanged if all are valid.
 
     Raises:
-        ValueError: an option has the wrong type or is too large.
+        ValueError: an option has the wrong type, is out of its bounds, or names something unknown.
     """
     words = {
         "method": METHODS.names,
@@ -212,7 +219,11 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
 
 
 def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
-    """The options with those of the method alone, as the user gave them."""
+    """Set the options that only the method has to the values that the user gave as text.
+
+    Raises:
+        UsageError: U101, the method has no such option, or a value is invalid.
+    """
     own = {each.name: each.type for each in fields(found)[len(fields(ResolvedConfig)) :]}
     texts = dict(config.options)
     if config.reward is not None:
@@ -231,7 +242,7 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
 
 
 def _number(name: str, text: str, kind: str) -> int | float:
-    """Parse the value of an option that is a whole number (`kind` is `int`) or any number."""
+    """Parse the value of option `name`, a whole number if `kind` is `int`. Raises UsageError (U101)."""
     try:
         return int(text) if kind == "int" else float(text)
     except ValueError:
@@ -248,7 +259,7 @@ def base_config(
     plans: int = 1,
     searches: bool = False,
 ) -> ResolvedConfig:
-    """Resolve the options that do not depend on the method.
+    """Resolve the options that all methods have: those of the user, else of the system file, else defaults.
 
     Args:
         task: problem to train for.
@@ -256,7 +267,7 @@ def base_config(
         kind: type of the options; fields that a method adds keep their defaults.
         batch: default number of fresh states per step.
         plans: default number of plans of the network.
-        searches: whether a search runs concurrently; torch then leaves a core to it.
+        searches: whether a search runs concurrently with the training steps; torch then leaves it one core.
     """
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)

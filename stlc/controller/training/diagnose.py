@@ -1,4 +1,7 @@
-"""Diagnosis of trainings that fail: wrong mirrors, non-finite steps, requirements without a plan.
+"""Diagnosis of trainings that fail.
+
+The causes are a declared mirror symmetry that the system lacks, a non-finite quantity in a training step, and
+a requirement that no plan satisfies.
 
 A training step computes network -> plans -> states -> robustness of each requirement and performance terms ->
 gradient; the first of these that is not finite is reported. A search that finds no plan does not prove that

@@ -26,13 +26,13 @@ SAME = 1e-5
 
 
 class _Space(Protocol):
-    """Space of the vectors that the cross-entropy method samples; each vector represents one plan."""
+    """Space of the vectors (d,) that the cross-entropy method samples; each represents one plan."""
 
     def centre(self, start: Tensor) -> Tensor:
         """Mean of the first population for initial guesses of plans: (k, T, m) -> (k, d)."""
 
     def deviation(self, x0: Tensor) -> Tensor:
-        """Standard deviation of the first population: (d,)."""
+        """Standard deviation of the first population: (d,), or (1,) if all components have the same."""
 
     def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
         """Plans that the vectors represent: states (k, n), p vectors per state (k, p, d) -> (k, p, T, m)."""
@@ -45,8 +45,9 @@ class Cem:
     Attributes:
         population: number of samples per round.
         elites: number of samples, the most robust ones, to which the Gaussian is fitted.
-        deviation: standard deviation of the first population, in half-widths of the control ranges.
-        physical: whether `deviation` is in the physical units of the controls instead.
+        deviation: standard deviation of the first population, in half-widths of the control ranges; with
+            `over=policy`, of the weights themselves.
+        physical: whether `deviation` is in the physical units of the controls instead of half-widths.
         floor: least standard deviation, in the units of `deviation`.
         rounds: maximum number of rounds, after which the search from an initial state begins anew.
         over: `plan` samples plans, `policy` the weights of a network with `hidden` ReLU units.
@@ -63,7 +64,7 @@ class Cem:
     hidden: int = 16
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver, with the space that is sampled.
+        """Return a function that searches for plans by the cross-entropy method.
 
         Raises:
             UsageError: U101, `over` is neither `plan` nor `policy`.
@@ -82,7 +83,10 @@ class Cem:
                 self._climb(search, part, space)
 
     def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
-        """Sample rounds for initial states `rows` until each has converged, succeeded or spent its budget."""
+        """Make up to `rounds` rounds for each of the initial states with indices `rows`, (k,).
+
+        The rounds of a state end once it has converged, reached the target robustness, or spent its budget.
+        """
         mean = space.centre(search.start[rows])
         wide = space.deviation(search.states[rows]).expand_as(mean).clone()
         least = wide * self.floor / self.deviation
@@ -128,7 +132,7 @@ class _Plans:
 
 
 class _Policies:
-    """Space of the weights of a small policy: one hidden layer from the observation to the controls."""
+    """Space of the weights of a small policy network, with one hidden layer from observations to controls."""
 
     def __init__(self, task: Task, how: Cem) -> None:
         self._task, self._hidden, self._std = task, how.hidden, how.deviation

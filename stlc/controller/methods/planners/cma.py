@@ -1,4 +1,4 @@
-"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package `cma`; extra `stlc[plan]`."""
+"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package `cma` of `stlc[plan]`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Cma:
-    """CMA-ES with restarts of twice the population (IPOP); controls are scaled to [-1, 1].
+    """CMA-ES in which every restart doubles the population (IPOP); controls are scaled to [-1, 1].
 
     Attributes:
         sigma: initial standard deviation, in half-widths of the control ranges.
-        population: number of samples per generation; 0 for the package's default, 4 + 3 ln(d).
+        population: number of samples per generation; 0 for the package's default, 4 + 3 ln(d), where d is the
+            number of entries of a plan.
         diagonal: whether the covariance is diagonal, which is faster for long plans.
     """
 
@@ -31,7 +32,11 @@ class Cma:
     diagonal: bool = False
 
     def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
-        """Load the package. Raises MissingError (R301)."""
+        """Return a function that searches for plans by CMA-ES.
+
+        Raises:
+            MissingError: R301, the package `cma` is not installed.
+        """
         try:
             import cma
         except ModuleNotFoundError:
@@ -47,7 +52,11 @@ class Cma:
                 restarts += 1
 
     def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
-        """Run CMA-ES once for initial state `row`, until it converges or reaches target or budget."""
+        """Run CMA-ES once for the initial state with index `row`.
+
+        The run ends once it has converged, reached the target robustness, or spent the budget. Its population
+        is doubled `restarts` times; with `restarts` 0 it begins at the initial guess, else at random.
+        """
         system, rows = search.task.system, torch.tensor([row])
         low, high = system.control_low.double(), system.control_high.double()
         middle, half = 0.5 * (low + high), 0.5 * (high - low)

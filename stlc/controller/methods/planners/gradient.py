@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GradientPlanner:
-    """Adam on latent plans, which are mapped to the control ranges like the outputs of a policy network.
+    """Adam on latent plans: unbounded numbers, mapped to the control ranges like outputs of a policy network.
 
     Attributes:
         objective: `exact`: exact robustness, with gradients by generated C code; `paper`: smooth robustness
@@ -27,7 +27,8 @@ class GradientPlanner:
         steps: number of gradient steps, after which the search begins anew from random latent plans.
         starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
         rate: learning rate of Adam.
-        slope: slope that replaces the derivative of jumps and conditions with the objective `exact`.
+        slope: slope that replaces the derivative of jumps and conditions of the system if the objective is
+            `exact`.
     """
 
     objective: str = "exact"
@@ -37,7 +38,10 @@ class GradientPlanner:
     slope: float = 2.0
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver for the objective; the performance terms of the system file are left out."""
+        """Return a function that searches for plans by gradient steps on the objective.
+
+        The objective `exact` leaves out the performance terms of the system file.
+        """
         if self.objective == "paper":
             return partial(self._run, objective=paper_objective(task))
         gamma = task.system.decl.objective.gamma

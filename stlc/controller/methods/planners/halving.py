@@ -40,7 +40,7 @@ class Halving:
     pieces: int = 12
 
     def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
-        """Return the solver; no preparation is necessary."""
+        """Return a function that searches for plans by successive halving."""
         return self._run
 
     def _run(self, search: PlanSearch) -> None:

@@ -35,19 +35,21 @@ MOST_RHO = 1e6
 class Milp:
     """Mixed-integer linear program for each initial state, solved by HiGHS.
 
-    The initial state is infeasible if a second program, whose solutions include all satisfying plans, has
-    none.
+    If it has no solution, a second program is solved, whose solutions include all satisfying plans. If that
+    has none either, it is proved that no plan from the initial state satisfies the specification.
 
     Attributes:
         gap: relative optimality gap at which the maximisation of robustness ends.
-        prove: whether to prove states without a plan infeasible, by a second program.
+        prove: whether to solve the second program.
     """
 
     gap: float = 1e-3
     prove: bool = True
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver, after encoding one initial state to find out whether that is possible.
+        """Return a function that searches for plans by mixed-integer linear programs.
+
+        Programs of a few initial states are written at once, to find expressions that cannot be encoded.
 
         Raises:
             UsageError: U101, an expression has no mixed-integer linear form; the message shows it.
@@ -71,7 +73,10 @@ class Milp:
                 return
 
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
-        """Find a plan for the initial state with index `row`, or prove that there is none."""
+        """Find a plan from the initial state with index `row`, or prove that no plan satisfies.
+
+        The result is stored in `search`.
+        """
         task, state, budget = search.task, search.states[row], search.budget
         search.ended[row] = True
         for beyond in (MARGIN, 0.0):  # away from the boundary; then on it, where timers end exactly
@@ -90,7 +95,7 @@ class Milp:
     def _solved(
         self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Solve the program for one state.
+        """Solve the program for a plan from one state, (n,), with a robustness of at least `target`.
 
         Returns:
             `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), None unless

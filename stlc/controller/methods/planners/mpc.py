@@ -54,7 +54,7 @@ class Mpc:
     margin: float = 0.01
 
     def prepare(self, task: Task) -> Solver:
-        """Write the nonlinear program of the task.
+        """Return a function that searches for plans by solving the nonlinear program of the task.
 
         Raises:
             UsageError: U101, the system or the specification is discontinuous; the message shows the
@@ -113,10 +113,10 @@ class Mpc:
     def _improve(
         self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
     ) -> None:
-        """Solve the program from a guess (T, m) and offer the plan to the search.
+        """Solve the program for one initial state from a guess (T, m), and offer the plan to the search.
 
-        If the exact robustness misses the target, solve again with a margin that is larger by what was
-        missing.
+        If the program is nearly feasible, but the exact robustness of the plan misses the target, the program
+        is solved once more, with a margin that is larger by what was missing.
         """
         target = search.budget.target
         maximise = math.isinf(target)
@@ -134,7 +134,7 @@ class Mpc:
             margin += self.margin + target - rho
 
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
-        """Guess number `number` of a plan, (T, m) float64: 0 is the initial guess, the others are random."""
+        """Guess of a plan, (T, m) float64: for `number` 0 the initial guess of the search, else random."""
         if not number:
             return search.start[row]
         system = search.task.system

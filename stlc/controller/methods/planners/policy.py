@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PolicyPlans:
-    """The plan that a trained policy selects; one evaluation per initial state, whatever the budget.
+    """Planner that returns the plan selected by a trained policy.
+
+    It makes one evaluation per initial state, whatever the budget.
 
     Attributes:
-        run: the run, given by its folder, number, name or specification, or `latest`.
+        run: the training run, given by its folder, number, name or specification, or `latest`.
         runs: folder of all runs.
     """
 
@@ -28,7 +30,7 @@ class PolicyPlans:
     runs: str = "runs"
 
     def prepare(self, task: Task) -> Solver:
-        """Load the policy and return the solver.
+        """Load the policy and return a function that proposes its plans.
 
         Raises:
             RunError: R101, the run is damaged; U101, it was trained for another system.

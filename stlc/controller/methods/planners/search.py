@@ -22,14 +22,15 @@ class SearchPlanner:
     """Local search: in every generation the best of a batch of changed plans is kept.
 
     A change is noise over an interval of time, a shift of an interval, an interval held at one level, or a
-    part of a plan that solved another initial state. Each round restarts alternately from such plans and from
-    the best plan until then.
+    part of a plan that solved another initial state. The first round starts from the initial guess; later
+    rounds start alternately from plans of a library and from the best plan found. The library begins with
+    piecewise constant plans, and plans that solve an initial state are added.
 
     Attributes:
         tries: number of plans tried per initial state in the first round; each later round tries twice as
             many, up to `longest`.
         longest: maximum number of plans tried per initial state and round.
-        library: number of plans of solved initial states that are kept for the other ones.
+        library: maximum number of plans in the library, which all initial states share.
     """
 
     tries: int = 2_000
@@ -37,7 +38,7 @@ class SearchPlanner:
     library: int = 2_048
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver, with the library of piecewise constant plans that all initial states share."""
+        """Return a function that searches for plans by local search, with the initial library."""
         return partial(self._run, library=extremes(task, torch.Generator().manual_seed(0)).double())
 
     def _run(self, search: PlanSearch, library: torch.Tensor) -> None:
