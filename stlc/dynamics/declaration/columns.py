@@ -66,7 +66,7 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
-    """The section `time`: time step, horizon, integrator. A horizon of 0 means that it is not known."""
+    """The section `time`: time step, horizon, integration method. A missing or invalid horizon is 0."""
 
     dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
     horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
@@ -132,7 +132,7 @@ def read_time(node: Node | None, cx: Context) -> Clockwork:
 
 
 def read_constants(node: Node | None, cx: Context) -> None:
-    """Read the section `const`: numbers and vectors with units; each may use those before it."""
+    """Read the section `const` and declare its numbers and vectors; a value may use earlier constants."""
     names = cx.names
     for entry in cx.reader.entries(node, "`const`"):
         name = entry.key.text
@@ -157,7 +157,7 @@ def read_constants(node: Node | None, cx: Context) -> None:
 
 
 def read_definitions(node: Node | None, cx: Context) -> None:
-    """Read the section `def`: named expressions (numbers or formulas). Unused ones are checked too."""
+    """Read the section `def` and declare its named numbers and formulas; unused ones are checked too."""
     parsed: list[ast.Expr] = []
     for entry in cx.reader.entries(node, "`def`"):
         name = entry.key.text
@@ -176,7 +176,7 @@ def read_definitions(node: Node | None, cx: Context) -> None:
 
 
 def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
-    """Read the section `state`; return the keys of every state."""
+    """Read the section `state`, declare its columns as names, and return the keys of every state."""
     reader, names = cx.reader, cx.names
     if node is None:
         reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
@@ -276,9 +276,8 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
 def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
     """Read the timers: states with `timer: up` or `timer: down`.
 
-    Returns their flow, which counts while `run` holds, and one jump for each timer, which sets it to `to`
-    where
-    `reset_when` holds.
+    Returns their flow and one jump per timer: a timer counts seconds while its condition `run` holds, and its
+    jump sets it to `to` when `reset_when` holds.
     """
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
@@ -321,10 +320,8 @@ def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
     """Read the section `param`; return the distributions of the parameters, in order.
 
     The parameters are appended to the columns, after the states. `r: {unit: m, range: [0.6, 1.2]}` is uniform
-    on
-    its range; `draw` gives another distribution, and may stand alone: `r: normal(1 m, 0.1 m)`. The
-    distribution
-    of a parameter may depend on earlier parameters.
+    on its range; the key `draw` gives another distribution, and `r: normal(1 m, 0.1 m)` is short for it. The
+    distribution of a parameter may depend on earlier parameters.
     """
     names = cx.names
     found: list[Assign] = []
@@ -385,7 +382,10 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Return the column; if it has no `range`, then with the usual range of its distribution in `assigns`."""
+    """Return the column with a range: its own, or else the range of nearly all draws of its distribution.
+
+    `assigns` holds the distribution. If that range is unknown, the column is returned unchanged.
+    """
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])

@@ -207,7 +207,7 @@ def _control(decl: SystemDecl, index: int) -> Row:
 def _feedback(decl: SystemDecl) -> list[Row]:
     """Return one row per control that describes the feedback law.
 
-    For example `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`.
+    For example `u  [N]  actuator [-8, 8]  plan +0, and +3.1 (0 - x) within 4`.
     """
     feedback = decl.feedback
     rows: list[Row] = []

@@ -55,7 +55,10 @@ Starts = Literal["any", "savable", "feasible"]
 
 @reads(mapping_of({"type": "array", "items": EXPRESSION}))
 def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
-    """Read values of controls that the backup policy tries in place of their declared levels."""
+    """Read `levels` of the section `backup`: name of a control -> values that the backup policy tries.
+
+    They replace the levels that the declaration of the control gives.
+    """
     found = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -82,7 +85,10 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """Read the section `backup` of a file or of a scenario; drop prefix lengths beyond the horizon."""
+    """Read the section `backup` of a file or of a scenario.
+
+    Prefix lengths beyond the horizon are reported (S103) and dropped.
+    """
     backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
     if lengths is not None and 0 < horizon < max(backup.lengths):
@@ -98,7 +104,10 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 
 @reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` of a state formula."""
+    """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` of a state formula.
+
+    Returns the fields `when` and `edge` of `EventDecl`; None if the text cannot be parsed.
+    """
     expr = cx.here.parse(node, label)
     match expr:
         case None:
@@ -119,7 +128,7 @@ def _instant(cx: Context, node: Node, label: str) -> int | None:
 class EventDecl:
     """An exogenous event: a change of states between two steps, which the planner does not foresee.
 
-    `edge`: the event happens only where `when` has just become true (`rise`) or false (`fall`).
+    With `edge` the event happens only at the step where `when` becomes true (`rise`) or false (`fall`).
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -150,7 +159,7 @@ def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
 
 @dataclass(frozen=True, slots=True)
 class WorldRef:
-    """Reference to a world: a Python class, beside the system file, that simulates the true system."""
+    """Reference to a world: the class `name` in the Python file `path`, which simulates the true system."""
 
     path: Path
     name: str
@@ -163,7 +172,7 @@ class JudgeRef:
 
     Attributes:
         path: path of the file.
-        written: the path as it stands in the system file; a run folder lists its copy under it.
+        written: the path as the system file writes it; run folders store a copy of the file under this path.
         span: source location of the path.
     """
 
@@ -174,7 +183,10 @@ class JudgeRef:
 
 @reads({"type": ["string", "null"]})
 def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
-    """Read `file.py:Class`, relative to the system file."""
+    """Read the reference `file.py:Class` to a world; the path of the file is relative to the system file.
+
+    Returns None for a null, and for an invalid reference, which is reported.
+    """
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`world`")
     if text is None:
         return None
@@ -233,12 +245,11 @@ class TestDecl:
 
 @dataclass(frozen=True, slots=True)
 class ErrorsDecl:
-    """Errors of actuators, parameters and sensors, as fractions (0.1 is 10 %).
+    """Errors of actuators, parameters and sensors in a scenario, as fractions (0.1 is 10 %).
 
     For a control with squash `angle` (a direction) the error is a fraction of one radian. Parameters are the
     numbers in the dynamics (see `stlc.dynamics.scenarios.perturbed`). States with the unit second are clocks
-    and
-    have no error.
+    and have no error.
     """
 
     actuator_gain: float = key(fraction, "constant relative error of every control of an agent", 0.0)
@@ -249,7 +260,7 @@ class ErrorsDecl:
 
 @reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
-    """Read new values of constants, kept as text, by name."""
+    """Read new values of constants: name of a constant -> text of its new value."""
     found: dict[str, str] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text
@@ -307,7 +318,7 @@ class ScenarioDecl:
 
 
 def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
-    """Read the section `scenario`: all scenarios, in order. Each is checked, whether or not it is applied."""
+    """Read the section `scenario` and return all scenarios, in order; those not applied are checked too."""
     return tuple(
         _scenario(entry, cx)
         for entry in cx.reader.entries(node, "`scenario`")

@@ -23,12 +23,13 @@ _OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", 
 
 @dataclass(frozen=True, slots=True)
 class FunctionDecl:
-    """External function that specifications may call: in Python, or given as IR expressions.
+    """External function that specifications may call: in Python, or kinematics as IR expressions.
 
     Attributes:
         name: its name in the declaration `extern fn` of a specification.
-        module: Python module, or file beside the system file, that holds it.
-        attribute: its name within that module.
+        module: Python module, or path of the Python or URDF file that defines the function.
+        attribute: name of the function within that module; for kinematics, the link whose position is
+            computed.
         library: array library of its arguments; None accepts the arrays of any caller.
         span: source location of its name.
         body: IR expressions that compute the result vector from one argument vector; None for Python.
@@ -44,9 +45,14 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """Return the function's body if it has the declared sizes (None: a scalar).
+        """Return the IR expressions of the function, given the sizes that a specification declares.
 
-        Raises SystemFileError (S208) for other sizes.
+        Args:
+            arguments: declared size of each argument; None for a number.
+            result: declared size of the result; None for a number.
+
+        Raises:
+            SystemFileError: S208, the declared sizes differ from those of the function.
         """
         assert self.body is not None
         takes, gives = len(self.body.formals), len(self.body.outputs)
@@ -76,10 +82,9 @@ class FunctionKeys:
 def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
     """Read the section `functions`; a function with IR expressions can also be called in the system file.
 
-    `f: {kind: python, target: "package.module:function"}`, or `"file.py:function"` for a file beside the
-    system
-    file. `ee: {kind: urdf, file: arm.urdf, tip: flange}`: the position of the link `flange` from the joint
-    positions.
+    `f: {kind: python, target: "package.module:function"}` is a Python function; `"file.py:function"` refers
+    to a file beside the system file. `ee: {kind: urdf, file: arm.urdf, tip: flange}` is the position of the
+    link `flange` as a function of the joint positions.
     """
     found = [_function(entry, cx) for entry in cx.reader.entries(node, "`functions`")]
     kept = tuple(function for function in found if function is not None)
@@ -122,7 +127,10 @@ def _python(entry: Entry, keys: FunctionKeys, where: str, cx: Context) -> Functi
 
 
 def _kinematics(entry: Entry, keys: FunctionKeys, cx: Context) -> FunctionDecl | None:
-    """Read the forward kinematics of one link from a URDF file."""
+    """Read the forward kinematics of one link from a URDF file.
+
+    Reports S208 and returns None if the file is unusable or no joint moves the link.
+    """
     file, tip, place = keys.file or "", keys.tip or "", entry.place("file")
     path = Path(place.source.name).parent / file
     try:

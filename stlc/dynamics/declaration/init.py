@@ -43,14 +43,17 @@ _DRAWS = raw(mapping_of(VECTOR))
 
 @dataclass(frozen=True, slots=True)
 class GridDecl:
-    """Grid of initial states: name of a column -> its values, in its unit; every combination is a state."""
+    """Grid of initial states: (column, its values in the unit of the column) for each axis.
+
+    Every combination of values, one of each axis, is a possible state.
+    """
 
     axes: tuple[tuple[str, tuple[float, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """Initial states from a file with one array per column; every sample is a possible state."""
+    """Initial states from a file with one array per column in `names`; every sample is a possible state."""
 
     path: Path
     names: tuple[str, ...]
@@ -59,14 +62,14 @@ class FileDecl:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Component of the mixture of initial states: its assignments in order, then one of its branches.
+    """Component of the mixture from which initial states are drawn: assignments, then one of the branches.
 
     Attributes:
         name: for messages and tables; "" for an unnamed branch.
         weight: relative probability among the components of the same mixture, not normalised.
         draws: assignments in order; later ones may read earlier ones. Names that are not columns are local.
-        branches: mixture of continuations, one of which is drawn after `draws`; may be empty.
-        points: grid or file of states, one of which is taken before `draws`; None without one.
+        branches: alternative situations, one of which is drawn by weight after `draws`; may be empty.
+        points: grid or file, from which a state is drawn before `draws`; None if the situation has neither.
     """
 
     name: str
@@ -78,14 +81,14 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class InitDecl:
-    """Distribution of initial states: a mixture with rejection by conditions.
+    """Distribution of initial states: a mixture of situations, with rejection of states by conditions.
 
     Attributes:
-        mixture: the situations, of which one is picked by weight.
+        mixture: the situations; for every state one of them is drawn by weight.
         where: conditions that every state must meet; other states are rejected.
         where_text: source text of these conditions.
-        params: assignments drawn before a situation is picked; situations may draw them again.
-        override: assignments drawn last, which replace draws of situations.
+        params: distributions of the parameters, drawn before a situation is; situations may draw them again.
+        override: assignments drawn last, which replace the values that situations draw.
         span: source location of the section, for messages.
     """
 
@@ -134,7 +137,7 @@ class AxisKeys:
 
 
 def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
-    """Read the section `init`; `params` are drawn before everything else."""
+    """Read the section `init`; the assignments `params` (distributions of parameters) are drawn first."""
     reader = cx.reader
     if node is None:
         advice = "init: {mixture: [{draw: {x: 0}}]}"
@@ -165,7 +168,7 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
 
 
 def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
-    """Read the situations of a mixture; at least one must have a positive weight.
+    """Read the situations of a mixture; report S103 if all weights are 0.
 
     `outer` holds the assignments made before, which the situations may read.
     """
@@ -188,10 +191,10 @@ def _situation(node: Node, outer: _Draws) -> Situation:
 
 
 class _Draws:
-    """The assignments of one situation; a local name (from `let`) is drawn just before its first use.
+    """Reader of the assignments of one situation; a local name (from `let`) is drawn before its first use.
 
     Attributes:
-        found: assignments, in order.
+        found: the assignments read, in the order in which they are drawn.
         ready: columns, and components of local names, that already have a value.
         locals: local names that already have a value.
     """
@@ -212,7 +215,10 @@ class _Draws:
         return self.cx.drawing(self.locals, self.ready)
 
     def require_all(self, called: str, node: Node) -> None:
-        """Report states that have no initial value; `called` names the situation at `node` in the message."""
+        """Report S102 if a state has no initial value.
+
+        `called` names the situation at `node` in the message.
+        """
         undrawn = [column.name for column in self.cx.names.columns if column.name not in self.ready]
         missing = list(dict.fromkeys(map(base_name, undrawn)))
         if missing and not self.failed:
@@ -221,7 +227,7 @@ class _Draws:
             self.cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
 
     def read(self, keys: SituationKeys | InitKeys) -> None:
-        """Read `let`, `draw` and `also`, with every local name before the expressions that use it."""
+        """Add the assignments of `let`, `draw` and `also`; a local name is assigned before it is used."""
         reader = self.cx.reader
         before = len(reader.findings)
         for entry in reader.entries(keys.let, "`let`"):
@@ -241,7 +247,7 @@ class _Draws:
         self.failed = len(reader.findings) > before
 
     def _draw(self, entry: Entry, where: str) -> None:
-        """Read the initial value of one state."""
+        """Add the assignments that draw the initial value of one state."""
         columns = states_of(entry, where, self.cx)
         if not columns:
             return
@@ -282,7 +288,7 @@ class _Draws:
 
 
 def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
-    """Read initial states from a grid or a file; `draw` gives the states that the grid or file lacks."""
+    """Read initial states from a grid or a file; `draw` must give the states that these lack."""
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
@@ -352,7 +358,7 @@ def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[flo
 
 
 def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
-    """Read `from: starts.npz`, a path relative to the system file; `names` are its columns."""
+    """Read the path of a file of initial states, relative to the system file; `names` are its columns."""
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None

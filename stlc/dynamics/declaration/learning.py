@@ -79,9 +79,8 @@ class Term:
 def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
     """Read the performance terms of the objective.
 
-    A term may read the outcome of a plan (`sat`: satisfied, `rho`: robustness), the step `k`, the time `t`,
-    and
-    `x_start`, the value at the start of the plan, for each state `x`.
+    A term may read the outcome of a plan (`sat`: satisfied, `rho`: robustness), the step `k`, the time `t` in
+    seconds, and `x_start`, the value at the start of the plan, for each state `x`.
     """
     known = cx.names.entries
     entries: dict[str, Entry] = {
@@ -104,7 +103,7 @@ def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
 
 
 def _at_start(number: Number) -> Number:
-    """A number with its columns replaced by their values at the start of the plan."""
+    """Return a number with its columns replaced by their values at the start of the plan."""
     table = {name: ir.Signal(name + START) for name in names_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 
@@ -180,7 +179,10 @@ def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackDecl:
-    """The entry `feedback` of the policy, from which `stlc.dynamics.model.feedback` computes a gain."""
+    """The entry `feedback` of the section `policy`: settings from which the feedback gain is computed.
+
+    The computation is in `stlc.dynamics.model.feedback`.
+    """
 
     around: Mapping[str, float] = key(_around, "point of operation: states and controls", {})
     weights: Mapping[str, float] = key(_weights, "weights of the regulator's cost, by state or control", {})
@@ -192,7 +194,10 @@ class FeedbackDecl:
 
 @reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the entry `feedback`: the word `lqr`, or a mapping of its settings."""
+    """Read the entry `feedback`: the word `lqr`, or a mapping of its settings.
+
+    Returns the fields `feedback` and `feedback_span` of `PolicyDecl`.
+    """
     request = None
     if not isinstance(node, Scalar):
         request = read(FeedbackDecl, cx, node, label)
@@ -229,7 +234,8 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """Read the images of states and controls under a mirror symmetry; those not listed are unchanged.
 
-    `stlc.controller.training.diagnose.check_mirror` checks the symmetry before a training.
+    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`. The symmetry is checked before a training,
+    by `stlc.controller.training.diagnose.check_mirror`.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)
@@ -282,7 +288,7 @@ class PolicyDecl:
 
 @dataclass(frozen=True, slots=True)
 class TrainDecl:
-    """The section `train`: training settings of this system; None leaves one to the method."""
+    """The section `train`: training settings of this system; None leaves a setting to the training method."""
 
     budget: float | None = key(
         Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION), "time for training"

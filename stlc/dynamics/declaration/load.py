@@ -1,4 +1,4 @@
-"""Loading of a system file as a declaration; the findings of all sections are reported together. No torch."""
+"""Loading of a system file as a declaration, without torch; all errors in the file are reported together."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ class _Named:
 
 
 def _named(found: SystemKeys, reader: Reader) -> _Named:
-    """Read the sections that declare names, in order."""
+    """Read the sections that declare names, each before the sections that may use its names."""
     cx = Context.of(reader, Names())
     read_constants(found.const, cx)
     clock = read_time(found.time, cx.plain)
@@ -268,7 +268,7 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 
 @dataclass(frozen=True, slots=True)
 class MovingParts:
-    """Context and nodes of the sections `flow` and `jump` of a valid file, to read these sections again."""
+    """YAML nodes of the sections `flow` and `jump` of a valid file, and the context to read them in again."""
 
     cx: Context
     flow: Node | None
@@ -276,7 +276,7 @@ class MovingParts:
 
 
 def moving_parts(decl: SystemDecl) -> MovingParts:
-    """Return the sections that determine the motion of the states, and the context to read them in."""
+    """Return the YAML nodes of `flow` and `jump` of a declared system, and the context to read them in."""
     reader = Reader(decl.source)
     found, _ = _sections(decl.source, decl.overrides, reader)
     return MovingParts(_named(found, reader).cx, found.flow, found.jump)
@@ -320,7 +320,10 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
-    """Merge the mapping `own` over `base`, entry by entry; with `sections` also the mappings inside."""
+    """Merge the mapping `own` over the mapping `base`, entry by entry.
+
+    With `sections`, values that are mappings in both are merged too, one level deep.
+    """
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
         key, value, old = entry.key, entry.value, base.get(entry.key.text)
@@ -362,7 +365,7 @@ def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) 
 
 
 def _keys(node: Node | None) -> dict[str, Node]:
-    """Return the keys of a section by name; empty if the section is missing."""
+    """Return the values of a section by key; empty if the section is missing."""
     return {entry.key.text: entry.value for entry in node.entries} if isinstance(node, Mapping) else {}
 
 
@@ -396,7 +399,7 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
 
 
 def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
-    """Report that `head`, a part of the dotted key `key`, does not exist in `node`, and return `node`."""
+    """Report S101 because `head`, a part of the dotted key `key`, does not exist in `node`; return `node`."""
     keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
     near = closest(head, keys)
     guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
@@ -405,7 +408,7 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """Apply the overrides that name states: `x=3m` or a distribution replaces the initial value of `x`."""
+    """Return `init` with the overrides of states: `x=3m`, or a distribution, replaces the value of `x`."""
     params = {base_name(assign.name) for assign in init.params}
     found: list[Assign] = []
     for name, text in overrides.items():

@@ -37,7 +37,13 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Assign:
-    """New value of a column (or of a local name), in the unit of that column."""
+    """Assignment of a number to a column or a local name: a new value or, in `flow`, a derivative.
+
+    Attributes:
+        name: name of the column or local name.
+        value: the number, in the unit of the column; a derivative in that unit per second.
+        text: source text of the value.
+    """
 
     name: str
     value: ir.Num
@@ -102,7 +108,10 @@ def component_texts(node: Node, size: int) -> tuple[str, ...]:
 
 
 def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
-    """Read the value of one column: members by name for an enum, formulas for a bool, units checked."""
+    """Read the value of one column: a member's name for an enum, a formula for a bool, else a number.
+
+    Units are checked. Returns None if the value is invalid.
+    """
     where = f"`{column.name}`"
     boolean, here = column.kind == "bool", cx.here
     value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
@@ -127,7 +136,7 @@ def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
 
 
 def rate_unit(unit: Unit) -> Unit:
-    """Return the unit of the derivative of a column; undeclared if that of the column is undeclared."""
+    """Return the unit of the derivative of a column with unit `unit`; undeclared if `unit` is undeclared."""
     return unit / SECOND if unit.text else replace(unit)
 
 
@@ -227,10 +236,11 @@ def latch_name(jump: str) -> str:
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """Draw a sampler, such as `uniform(0, 1)`, only once, as a local name, if several assignments share it.
+    """Return assignments in which a sampler, such as `uniform(0, 1)`, that several share is drawn once.
 
-    `p: "uniform(0, 1) * [1, 2]"` multiplies one random number by each component; `p: "uniform(low, high)"`
-    with vectors draws one random number per component.
+    An assignment to a local name, placed before them, draws it. `p: "uniform(0, 1) * [1, 2]"` multiplies one
+    random number by each component; `p: "uniform(low, high)"` with vectors draws one random number per
+    component.
     """
     if len(assigns) < 2:
         return tuple(assigns)

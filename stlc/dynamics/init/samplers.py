@@ -32,7 +32,7 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """A number of rows (states) to draw, and the random generator; values are float64 on its device."""
+    """Number of rows (states) to draw, and the random generator, on whose device the values are (float64)."""
 
     count: int
     generator: torch.Generator
@@ -62,7 +62,14 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """One occurrence of a sampler; two occurrences with equal arguments are drawn independently."""
+    """One occurrence of a sampler in an expression; equal occurrences are drawn independently.
+
+    Attributes:
+        name: generated column that receives the numbers drawn.
+        sampler: name of the sampler, such as `uniform`.
+        args: compiled arguments, with outputs "0", "1", ….
+        arity: number of arguments.
+    """
 
     name: str
     sampler: str
@@ -81,7 +88,10 @@ class Drawing:
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
-        """Return the value in every row, (count,) float64; `env` must hold at least one column (count,)."""
+        """Return the assigned value in every row, (count,) float64.
+
+        `env` maps the names that the assignment reads to their values (count,), and must hold at least one.
+        """
         if self._calls:
             env = dict(env)
             for call in self._calls:
@@ -91,7 +101,7 @@ class Drawing:
         return value.expand(rows.count)
 
     def _extract(self, num: ir.Num) -> ir.Num:
-        """Replace every sampler in a number by a column, and append the sampler to the list of draws."""
+        """Replace every sampler in a number by a column that receives its draws, and add it to `_calls`."""
         if id(num) in self._seen:
             return self._seen[id(num)]
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:
@@ -141,7 +151,7 @@ Table = dict[str, Tensor]
 
 
 class _Draws:
-    """A situation compiled for drawing."""
+    """A situation (component of the mixture of initial states) compiled for drawing."""
 
     def __init__(self, situation: Situation) -> None:
         self.weight = situation.weight
@@ -154,7 +164,7 @@ class _Draws:
             self.points = _File(situation.points)
 
     def __call__(self, table: Table, rows: Rows) -> Table:
-        """Draw this situation; return `table` with its names added, (count,) each."""
+        """Draw this situation; return `table` (name -> values, (count,)) extended by the values drawn."""
         if self.points is not None:
             table = {**table, **self.points(rows)}
         for drawing in self.draws:
@@ -280,7 +290,7 @@ class InitialStates:
         return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """Return W601 if few of the proposed states were accepted, else nothing."""
+        """Return W601 if less than 1 % of the proposed states was accepted, else nothing."""
         if self.acceptance >= FEW:
             return ()
         message = f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`"
@@ -315,7 +325,7 @@ class _Grid:
 
 
 class _File:
-    """Random states out of those that a file holds."""
+    """Random states drawn from the samples that a file holds."""
 
     def __init__(self, decl: FileDecl) -> None:
         self._decl = decl
@@ -375,7 +385,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Return random indices below `count`, one per row; each index occurs equally often (up to one)."""
+    """Return random indices below `count`, one per row; the numbers of occurrences differ by at most one."""
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)
     orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]

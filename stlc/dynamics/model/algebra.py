@@ -1,4 +1,4 @@
-"""Arithmetic on numbers of the IR: the names that a number reads, substitution, sums and products."""
+"""Algebra on numeric expressions of the IR: names of columns, substitution, sums and products."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ N = TypeVar("N", ir.Num, ir.Formula)
 
 
 def names_in(node: ir.Num | ir.Formula) -> frozenset[str]:
-    """Names of all columns that a number or a state formula reads."""
+    """Names of all columns that occur in a numeric expression or a state formula."""
     return frozenset(leaf.name for leaf in leaves(node) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)))
 
 
 def map_parts(node: N, rewrite: Callable[[ir.Num], ir.Num]) -> N:
-    """Apply `rewrite` to the operands of a number, or to the numbers in a state formula's predicates."""
+    """Apply `rewrite` to the operands of a numeric expression, or of the predicates in a state formula."""
     return map_children(node, numbers=rewrite, formulas=lambda part: map_parts(part, rewrite))
 
 
 def substitute(node: N, table: Mapping[str, ir.Num]) -> N:
-    """Replace the columns that `table` names by its numbers, in a number or a state formula."""
+    """Replace columns by expressions (`table`: column -> expression), in an expression or a state formula."""
     return map_leaves(node, lambda leaf: table.get(leaf.name, leaf) if isinstance(leaf, ir.Signal) else leaf)
 
 
 def add(left: ir.Num, right: ir.Num) -> ir.Num:
-    """Sum of two numbers."""
+    """Sum of two numeric expressions."""
     return ir.Op("add", (left, right))
 
 
 def multiply(left: ir.Num, right: ir.Num) -> ir.Num:
-    """Product of two numbers."""
+    """Product of two numeric expressions."""
     return ir.Op("mul", (left, right))
 
 
@@ -40,7 +40,7 @@ class Assignments:
     """Growing list of assignments that name intermediate results, so that each is computed once.
 
     Attributes:
-        lets: (name, number), in order.
+        lets: (name, numeric expression), in order.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,8 @@ class Assignments:
     def name(self, num: ir.Num, pattern: str) -> ir.Num:
         """Append an assignment of `num` to a new name, and return a reference to it.
 
-        `{}` in `pattern`, the form of the name, is replaced by the number of the assignment.
+        `pattern` is the form of the name: `{}` in it is replaced by the index of the assignment. A constant
+        or a column is returned unchanged, without an assignment.
         """
         if isinstance(num, ir.Const | ir.Signal):
             return num

@@ -111,8 +111,9 @@ def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
 def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubles]:
     """Return the operating point: state (n,) and control (m,), in the units of the columns.
 
-    A state that `around` does not give is 0, or the middle of its range if that excludes 0. The other
-    controls are those within their ranges that keep the state as constant as possible.
+    A state that `around` does not give is 0, or the middle of its range if the range excludes 0. Controls
+    that `around` does not give are chosen within their ranges such that the state stays as constant as
+    possible.
     """
     state = np.array(
         [
@@ -136,7 +137,7 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask of the moving states to keep constant at the operating point: the dynamics depend on them."""
+    """Mask (n,) of the moving states that the dynamics depend on; the operating point keeps them constant."""
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
@@ -179,7 +180,7 @@ def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
 
 
 def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
-    """Step exactly, without feedback, from `points` of a state and a control each: (k, n + m) -> (k, n)."""
+    """Next states (k, n) of `points` (k, n + m), each a state and a control; exact step without feedback."""
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
     env = dict(zip(names, points.T, strict=True))
@@ -245,7 +246,7 @@ def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
 
 
 def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
-    """Return W602 if the plant is so unstable that errors grow too much over a horizon, else nothing."""
+    """Return W602 if small errors grow more than tenfold over a horizon (`growth_of`), else nothing."""
     growth = growth_of(decl)
     if not growth > GROWING:
         return ()
@@ -263,9 +264,9 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 
 
 def growth_of(decl: SystemDecl) -> float:
-    """Growth factor of the fastest mode over a horizon, linearised at the operating point.
+    """Factor by which the fastest mode grows over a horizon, linearised at the operating point.
 
-    With an inner feedback it is that of the closed loop. It is 1 if it cannot be computed.
+    With an inner feedback the closed loop is linearised. Returns 1 if the factor cannot be computed.
     """
     feedback = decl.feedback
     try:

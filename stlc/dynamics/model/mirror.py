@@ -48,7 +48,10 @@ class Mirror:
         return _applied(self._states, x, self._names)
 
     def plans(self, u: Tensor) -> Tensor:
-        """Mirror images of controls: (…, m) -> (…, m). Angles stay in one turn of their range."""
+        """Mirror images of controls: (…, m) -> (…, m).
+
+        Angles are wrapped into one turn that begins at the lower end of their range.
+        """
         moved = _applied(self._inputs, u, [control.name for control in self._controls])
         for index, each in enumerate(self._controls):
             if each.squash == "angle":

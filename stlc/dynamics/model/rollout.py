@@ -44,7 +44,7 @@ class _Columns:
         }
 
     def enter(self, name: str, column: Tensor) -> None:
-        """Add a state, given its T+1 samples (T+1, B)."""
+        """Store the samples (T+1, B) of a state."""
         self.states[name] = column
         self.now[name] = column[:-1]
 
@@ -53,7 +53,7 @@ class _Columns:
         return values.expand(self.steps, self.batch)
 
     def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
-        """Split values into constants and those that change over time, as one tensor per step."""
+        """Split the values of `names`: constants by name, and (name, one tensor per step) for the others."""
         fixed: dict[str, Tensor] = {}
         timed: list[tuple[str, Sequence[Tensor]]] = []
         for name in names:
@@ -88,7 +88,10 @@ class _Accumulated(torch.autograd.Function):
 
 
 def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
-    """Running sum as in `_Accumulated`; a single operation while a program is exported."""
+    """Running sum: start (B,) and increments (T, B) -> (T+1, B).
+
+    Uses `_Accumulated`, or the single operation `cumsum` while torch exports a program.
+    """
     if torch.compiler.is_exporting():
         return torch.cat((start[None], increments)).cumsum(0)
     column: Tensor = _Accumulated.apply(start, increments)  # type: ignore[no-untyped-call]
@@ -96,7 +99,7 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """A stage of a rollout (`RolloutStage`) with compiled programs."""
+    """Compiled stage of a rollout: states and expressions that are computed together (`RolloutStage`)."""
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
@@ -150,7 +153,7 @@ class Stepper:
         self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
-        """Return the columns (B,) one step later; a state that does not move keeps its tensor."""
+        """Return the states (B,) one step later, by name; a state that does not move keeps its tensor."""
         env = {**state, **controls}
         for block in self.once:
             env.update(block(env, TORCH, switch))
@@ -161,7 +164,7 @@ class Stepper:
         return {**state, **{name: value.expand_as(like) for name, value in moved.items()}}
 
     def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
-        """Roll out from states (B,) under controls (T, B); return (T+1, B) by name.
+        """Roll out from states (B,) under controls (T, B), where T is `steps`; return state -> (T+1, B).
 
         States that do not move are expanded views.
         """

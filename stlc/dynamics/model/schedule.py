@@ -1,4 +1,4 @@
-"""Order in which the numbers and states of a step are computed in a rollout.
+"""Order in which the states and intermediate results of a step are computed in a rollout.
 
 Not all states need a loop over time. They are ordered by dependencies: a state that depends only on earlier
 ones is computed for all steps at once, a state to which a known increment is added is a cumulative sum, and
@@ -22,15 +22,16 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 @dataclass(frozen=True, slots=True)
 class RolloutStage:
-    """States and numbers that can be computed together once the earlier stages are.
+    """States and expressions that can be computed together once the earlier stages are.
 
     Attributes:
-        early: numbers computed for all steps at once, before the rest of the stage.
-        follows: state -> name of the number in `early`, of this or an earlier stage, that is its next value.
-        sums: state -> name of the number in `early` that is its increment per step.
-        blocks: numbers computed in a loop over the steps; each block reads only earlier ones.
-        stepped: state -> name of the number in `blocks` that is its next value.
-        lets: names of numbers in `blocks` that later stages read.
+        early: name -> expression computed for all steps at once, before the rest of the stage.
+        follows: state -> name of the expression in `early`, of this or an earlier stage, that is its next
+            value.
+        sums: state -> name of the expression in `early` that is its increment per step.
+        blocks: expressions computed in a loop over the steps; each block reads only earlier blocks.
+        stepped: state -> name of the expression in `blocks` that is its next value.
+        lets: names of expressions in `blocks` that later stages read.
     """
 
     early: Lets
@@ -42,7 +43,7 @@ class RolloutStage:
 
 
 def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
-    """Split a step into stages; each reads only states and numbers of itself and earlier stages."""
+    """Split a step into stages; each reads only states and expressions of itself and earlier stages."""
     numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
@@ -64,7 +65,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 
 
 class _StageWriter:
-    """Builder of one stage, which holds all groups of the same depth in the dependency graph."""
+    """Builder of one stage: all strongly connected groups at the same depth of the dependency graph."""
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
         self.numbers = numbers
@@ -111,7 +112,7 @@ class _StageWriter:
 
 
 def blocks(numbers: Lets) -> tuple[Lets, ...]:
-    """Split numbers into blocks, each of which reads only earlier blocks."""
+    """Split named expressions into blocks, each of which reads only names of earlier blocks."""
     level: dict[str, int] = {}
     for name, num in numbers.items():
         level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
@@ -120,7 +121,12 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """Return the increment of a state if its next value is the state plus that increment, else None."""
+    """Return the increment of a state if its next value is the state plus that increment, else None.
+
+    Args:
+        states: the states of a group, each with the name of its next value.
+        body: the expressions of the group.
+    """
     if len(states) != 1 or len(body) != 1:
         return None
     (state,) = states
@@ -174,11 +180,11 @@ def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
 
 @dataclass
 class Hoist:
-    """Rewriter that moves loop-invariant parts of numbers out of a loop.
+    """Rewriter that moves loop-invariant parts of numeric expressions out of a loop.
 
     Attributes:
         moving: names that change within the loop.
-        early: name -> loop-invariant number, to be computed before the loop; grows with each call of `split`.
+        early: name -> loop-invariant expression to be computed before the loop; grows with calls of `split`.
         prefix: prefix of the generated names.
     """
 
@@ -201,7 +207,10 @@ class Hoist:
                 return map_parts(num, self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
-        """Return a name in `early` for a loop-invariant number; constants and columns as they are."""
+        """Add a loop-invariant expression to `early` and return its name.
+
+        Constants and columns are returned unchanged.
+        """
         if isinstance(num, ir.Const | ir.Signal):
             return num
         for name, known in self.early.items():
@@ -220,7 +229,7 @@ class Hoist:
         return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
-        """Rewrite a sum: its loop-invariant terms are combined into one number in `early`."""
+        """Rewrite a sum: its loop-invariant terms are combined into one expression in `early`."""
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
         steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
@@ -229,7 +238,7 @@ class Hoist:
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
     def _product(self, num: ir.Num) -> ir.Num:
-        """Rewrite a product: its loop-invariant factors are combined into one number in `early`."""
+        """Rewrite a product: its loop-invariant factors are combined into one expression in `early`."""
         factors = _factors(num)
         moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
         steady = [factor for factor in factors if not names_in(factor) & self.moving]
@@ -269,7 +278,7 @@ def _signed_sum(terms: Sequence[tuple[int, ir.Num]]) -> ir.Num:
 
 
 def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
-    """Add loop-invariant terms to one number; constants among them are added up."""
+    """Return the sum of loop-invariant (sign, term) pairs; the constants among them are added up."""
     constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
     variable = [(sign, term) for sign, term in terms if not isinstance(term, ir.Const)]
     if not variable:

@@ -18,8 +18,8 @@ class ModelStep:
     """One step as a list of assignments; each reads states, controls and earlier assignments.
 
     Attributes:
-        lets: (name, number), in order.
-        next: name of a state that moves -> its value one step later.
+        lets: (name, numeric expression) of the intermediate results, in order.
+        next: name of a state that moves -> expression for its value one step later.
     """
 
     lets: tuple[tuple[str, ir.Num], ...]
@@ -48,7 +48,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
 
 
 def commands(decl: SystemDecl) -> dict[str, ir.Num]:
-    """Actuator commands computed from the state and the plan: name of a control -> number.
+    """Actuator commands as functions of state and plan: name of a control -> numeric expression.
 
     Empty without inner feedback. Commands are computed once per step, as in a sampled-data controller.
     """
@@ -77,7 +77,10 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
 
 
 def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
-    """Integrate the flow over all substeps of a step; `given` are the actuator commands."""
+    """Return the states after the flow of one step, integrated over all substeps.
+
+    Intermediate results are appended to `writer`; `given` are the actuator commands.
+    """
 
     def named(at: State) -> State:
         return {name: writer.name(num, name + "#{}") for name, num in at.items()}
@@ -97,7 +100,10 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 
 
 def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
-    """Apply one jump to `state`, the result of the flow and of earlier jumps; `soft`: as a blend."""
+    """Return the states after one jump; `state` is the result of the flow and of earlier jumps.
+
+    With `soft` the jump is a differentiable blend, otherwise an exact choice.
+    """
     changed = dict(state)
     for assign in jump.resets:
         flowed = changed[assign.name]

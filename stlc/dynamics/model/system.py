@@ -157,7 +157,8 @@ class System:
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """Append the columns that a specification adds: (B, n - added) -> (B, n).
 
-        Its parameters are drawn; its timers get their values at the start of the mission.
+        The parameters of the specification are drawn; its timers get their values at the start of the
+        mission.
         """
         if not self.added:
             return states
@@ -217,7 +218,7 @@ class System:
         return torch.stack([columns[name].t() for name in self.names], 2)
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
-        """Roll out as `rollout` does; return (T+1, B) by state name; constant states are expanded views."""
+        """Roll out as `rollout` does; return state -> (T+1, B), where constant states are expanded views."""
         if (
             x0.shape[1:] != (len(self.names),)
             or u.shape[2:] != (len(self.decl.controls),)
@@ -309,7 +310,7 @@ class System:
 
     @cached_property
     def observed(self) -> tuple[ir.Num, ...]:
-        """Inputs of the policy as numbers over the states; those of added parameters and timers come last."""
+        """Inputs of the policy as expressions over the states; added parameters and timers come last."""
         states = (ir.Signal(name) for name in self.decl.signature.names)
         added = (ir.Signal(column.name) for column in self.added)
         return (*(self.decl.policy.observe or states), *added)
@@ -333,7 +334,7 @@ class System:
         return ArrayProgram({"reward": self.require_reward()})
 
     def require_reward(self) -> ir.Num:
-        """The declared reward of a step as a number in the IR.
+        """The declared reward of a step as a numeric expression of the IR.
 
         Raises UsageError (U101) if the file declares no reward.
         """
@@ -405,7 +406,7 @@ class System:
 
     @cached_property
     def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
-        """The numbers of `objective`, compiled."""
+        """Compiled programs of the two sums of `objective`; None where a sum is None."""
         states, controlled = (
             None if total is None else ArrayProgram({"cost": total}) for total in self.objective
         )
@@ -413,7 +414,10 @@ class System:
 
     @cached_property
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
-        """Weighted sums of the performance terms without controls, and of those with; None if empty."""
+        """Two weighted sums of the performance terms: those that read no control, and those that read one.
+
+        A sum without terms is None.
+        """
         sums: list[ir.Num | None] = [None, None]
         given = commands(self.decl)
         for term in self.decl.objective.terms:
@@ -445,9 +449,10 @@ class System:
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
-        """Simulate n initial states under random plans of at most `PROBED` steps; return warnings.
+        """Simulate n initial states under random plans of at most `PROBED` steps; return all warnings.
 
-        Raises SystemFileError if states cannot be drawn (S301) or become NaN or infinite (S302).
+        The warnings are those of the file, W601 (few states accepted) and W602 (unstable). Raises
+        SystemFileError if states cannot be drawn (S301) or become NaN or infinite (S302).
         """
         x0 = self.sample(n, seed=seed, dtype=torch.float64)
         self.require_finite(x0)

@@ -30,11 +30,12 @@ _NEAR = 1e-5
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Result of comparing the kinematics of one external function.
+    """Result of comparing the kinematics of one external function with pytorch-kinematics.
 
     Attributes:
         name: name of the function.
-        distance: largest distance between the two positions, in metres; None if not compared.
+        distance: largest difference of a coordinate between the two packages, in metres; None if not
+            compared.
         why: reason for not comparing.
     """
 

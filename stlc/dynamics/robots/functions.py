@@ -23,7 +23,7 @@ from stlc.registry import closest
 
 
 def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
-    """Load the functions of a system, by name; their modules are imported, which runs their code.
+    """Load the functions of a system: name -> function. Their modules are imported, which runs their code.
 
     Raises:
         SystemFileError: S208, a module or a function cannot be loaded.
@@ -97,7 +97,10 @@ class PythonFunction:
     call: Callable[..., Array]
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Bound:
-        """Return the function with the sizes that a specification declares; see `InterfaceFunction`."""
+        """Return the function for arguments and result of the sizes that a specification declares.
+
+        A size is the number of components of a vector, or None for a number.
+        """
         return Bound(self.decl, self.call, arguments, result)
 
 

@@ -167,7 +167,7 @@ NAME = "v{}"
 def position(joints: Sequence[Joint]) -> ir.Body:
     """IR expressions for the tip's position in the frame of the base, (3,) in metres.
 
-    The arguments are the positions of the moving joints.
+    The arguments are the positions of the moving joints, in radians or metres.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
@@ -183,7 +183,7 @@ def position(joints: Sequence[Joint]) -> ir.Body:
 
 
 def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> Point:
-    """Rotate a point about an axis by `angle` (Rodrigues' formula)."""
+    """Rotate a point by `angle` (in radians) about an axis through the origin, by Rodrigues' formula."""
     along = _linear(np.outer(axis, axis), point)
     across = tuple(writer.name(num, NAME) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
     if all(num == ir.Const(0.0) for num in across):

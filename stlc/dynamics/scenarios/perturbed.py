@@ -38,7 +38,7 @@ class Uncertain:
     """An uncertain number of the dynamics.
 
     Attributes:
-        factor: name of the column that multiplies it; the value 1 gives the model.
+        factor: name of the column that multiplies the number; with the value 1 the dynamics are the model's.
         text: source text of the number, such as `vy` or `0.01 m/rad`.
         states: names of the states whose equations or resets read it.
     """
@@ -53,7 +53,12 @@ class Uncertain:
 
 @dataclass(frozen=True, slots=True)
 class Perturbable:
-    """Declaration in which every uncertain number of `flow` and `jumps` is multiplied by a factor."""
+    """Declaration in which every uncertain number of `flow` and `jumps` is multiplied by a factor.
+
+    Attributes:
+        decl: the declaration, whose dynamics read the factors as columns.
+        numbers: the uncertain numbers.
+    """
 
     decl: SystemDecl
     numbers: tuple[Uncertain, ...]
@@ -88,7 +93,10 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """Return the declaration with new equations of its real states, and with new jumps."""
+    """Return the declaration with new guards, and with new equations and resets of its real states.
+
+    They come from `flow` and `jumps`; equations and resets of bool and enum states are kept.
+    """
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
 
     def replaced(assigns: tuple[Assign, ...], others: tuple[Assign, ...]) -> tuple[Assign, ...]:
@@ -151,7 +159,10 @@ _COMPUTED: Mapping[type[ast.Node], tuple[str, ...]] = {
 
 
 def _computed(node: ast.Node) -> tuple[str, ...]:
-    """Names of an expression's fields that hold operands of arithmetic, not exponents or indices."""
+    """Names of the fields of a syntax tree node that hold operands of arithmetic.
+
+    The fields of exponents, indices and conditions are left out.
+    """
     match node:
         case ast.Binary(op="%" | "^"):
             return ("left",)
@@ -162,7 +173,15 @@ def _computed(node: ast.Node) -> tuple[str, ...]:
 
 
 class _UsedNumbers:
-    """Collector of the numbers that expressions compute with, and of the constants that conditions read."""
+    """Collector of the numbers that expressions compute with, and of the constants that conditions read.
+
+    Attributes:
+        names: declared names of the system file.
+        constants: names of the constants.
+        computed_with: constants found as operands of arithmetic.
+        compared: constants found in conditions, exponents and indices.
+        literals: name of a factor -> literal to be multiplied by it.
+    """
 
     def __init__(self, names: Names) -> None:
         self.names = names
@@ -177,7 +196,9 @@ class _UsedNumbers:
         return expr
 
     def rewritten(self, node: Any, *, called: bool = False) -> Any:
-        """Add a factor to each number that an expression computes with; definitions are expanded.
+        """Multiply each literal that an expression computes with by a factor; definitions are expanded.
+
+        Records these literals, and the constants in the expression.
 
         Args:
             node: an expression, or an argument of a call.
@@ -225,7 +246,7 @@ class PerturbedSystem(System):
 
     Args:
         factored: dynamics in which every uncertain number is multiplied by a factor.
-        factors: (agents, numbers); 1 for a number without error.
+        factors: values of the factors, (agents, uncertain numbers); 1 for a number without error.
     """
 
     def __init__(self, factored: Perturbable, factors: Tensor) -> None:

@@ -1,6 +1,7 @@
 """Scenarios: named changes of a system for deployment.
 
-Every system has the scenarios `mismatch`, `disturb` and `noise`, optionally with a percentage after a hyphen.
+Every system has the standard scenarios `mismatch`, `disturb` and `noise`; a percentage may follow, as in
+`mismatch-20`.
 """
 
 from __future__ import annotations
@@ -62,14 +63,17 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the constants that a scenario changes, in specification and model alike, as text by name."""
+    """Return new values of the constants that a scenario changes in both model and specification.
+
+    The result maps the name of a constant to the text of its value.
+    """
     return find_scenario(load_system_decl(path, overrides), name).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:
-    """Apply a scenario to a system.
+    """Return the declaration with a scenario applied.
 
-    Of the model that plans are made with, only the scenario's constants (`const`) change.
+    The model that plans are made with changes only in the constants (`const`) of the scenario.
 
     Raises UsageError (U101) if the scenario does not exist.
     """

@@ -1,1 +1,1 @@
-"""Tools to read sections: YAML nodes with source locations, records of keys, declared names, expressions."""
+"""Tools to read sections: YAML nodes with locations, dataclasses of keys, declared names, expressions."""

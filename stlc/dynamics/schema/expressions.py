@@ -1,4 +1,4 @@
-"""Expressions in a system file: parsed where they stand, then given sorts and units by the compiler."""
+"""Expressions in a system file: parsing with source locations, and resolution of names and units."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Expressions:
     Attributes:
         reader: collects the findings.
         scope: table of the names that expressions may use.
-        ready: columns that already have a value; an expression that reads another one is an error. None: all.
+        ready: columns that already have a value; None means all. Reading another column is an error.
         amounts: whether numbers are increments of columns; one in degC is then a temperature difference.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
             nothing.
@@ -105,12 +105,15 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """Read a number, converted to SI units; a temperature in degC keeps the zero of that unit."""
+        """Read a number, converted to SI units; a temperature in degC keeps the zero of the Celsius scale."""
         expr = self.parse(node, where)
         return None if expr is None else self._typed(resolve_number, expr)
 
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
-        """Read a number or a vector, one expression or a list of them; return components as `number` does."""
+        """Read a number or a vector, written as one expression or as a list; return the components.
+
+        The components are converted as `number` does.
+        """
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
             found = tuple(number for number in each if number is not None)
@@ -176,14 +179,14 @@ class Expressions:
     # --------------------------------------------------------------------- values
 
     def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
-        """Read a number and convert it to `unit`, that of the column in which it is stored."""
+        """Read a number and convert it to `unit`, the unit of the column in which it is stored."""
         number = self.number(node, where)
         if number is None or node is None:
             return None
         return self._in_unit(number, node, where, unit)
 
     def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
-        """Read the components of a vector of length `size`, converted to `unit`, that of their columns.
+        """Read a vector of length `size`; return its components, converted to `unit`, that of the columns.
 
         A single number is repeated for all components; a single random number is drawn anew for each.
         """
@@ -202,7 +205,11 @@ class Expressions:
         return kept if len(kept) == size else None
 
     def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
-        """Convert a number to `unit`, that of its column; None, with E203 reported, if they do not fit."""
+        """Convert a number to `unit`, the unit of its column.
+
+        Reports and returns None if the dimensions differ (E203), or if a temperature is mixed up with a
+        temperature difference.
+        """
         if self._fits(number, unit):
             place = first_line(node.span)
             if self.amounts and number.unit.offset:
@@ -234,13 +241,13 @@ class Expressions:
                 return self.stored(node, where, Unit())
 
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
-        """Read a constant that is known at compile time, converted to `unit`, that of its column."""
+        """Read a constant that is known at compile time and convert it to `unit`, the unit of its column."""
         value = self.stored(node, where, unit)
         found = None if value is None or node is None else self._constants((value,), node, where)
         return None if found is None else found[0]
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
-        """Read a vector of constants known at compile time, converted to `unit`, that of their columns."""
+        """Read `size` constants known at compile time, converted to `unit`, the unit of their columns."""
         values = self.stored_each(node, where, unit, size)
         return None if values is None else self._constants(values, node, where)
 
@@ -263,7 +270,7 @@ class Expressions:
         return number.exact
 
     def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
-        """Read a number of steps, written as `25 steps`, as `25`, or as a time."""
+        """Read a number of steps: `25 steps`, `25`, or a time, which must be a multiple of the time step."""
         if node is None:
             return None
         expr = self.parse(node, where)

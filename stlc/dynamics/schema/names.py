@@ -45,7 +45,10 @@ class ControlDecl:
 
 
 def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
-    """Apply `change` to the number, or to each component of the vector, that a name stands for."""
+    """Return the entry of a name with `change` applied to its number, or to each component of its vector.
+
+    An entry of another kind is returned unchanged.
+    """
     match entry:
         case Known(value=Number() as number):
             return replace(entry, value=change(number))
@@ -106,12 +109,12 @@ class Names:
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """Give the component columns of a vector the source location of its declaration."""
+        """Record, for the component columns of a vector, the source location of the vector's declaration."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
-        """Declare a name; report a finding and return False if it is taken or not an identifier."""
+        """Declare a name; if it is taken or not an identifier, report a finding and return False."""
         first = self.places.get(key.text)
         if first is not None:
             message, advice = f"`{key.text}` is declared twice", "rename one of the two"

@@ -20,9 +20,10 @@ _OPENING, _CLOSING = "([{", ")]}"
 
 @dataclass
 class Reader:
-    """Checked access to the values of a system file; collects findings about them.
+    """Checked access to the values of a system file; collects findings (errors and warnings) about them.
 
-    Every method that reads a value returns None (or leaves out a key) if it has reported a finding.
+    A method that reads one value returns None if it has reported a finding; one that reads a mapping or a
+    list returns its valid entries.
     """
 
     source: Source
@@ -68,7 +69,10 @@ class Reader:
     def fields(
         self, node: Node | None, where: str, known: Collection[str], required: Iterable[str] = ()
     ) -> dict[str, Node]:
-        """Read the values of a mapping with fixed keys, by key; unknown and missing keys are reported."""
+        """Read a mapping with the keys `known`; return the values by key.
+
+        Unknown keys (S101) and missing keys among `required` (S102) are reported.
+        """
         found: dict[str, Node] = {}
         for entry in self.entries(node, where):
             if entry.key.text in known:
@@ -133,7 +137,7 @@ class Reader:
     # ---------------------------------------------------------------------- scalars
 
     def wrong(self, node: Node, where: str, wanted: str, *help_: str) -> None:
-        """Report a value of the wrong kind."""
+        """Report S103: the value is not `wanted`, a description of the accepted values in words."""
         self.report("S103", f"{where} must be {wanted}, this is {_kind(node)}", first_line(node.span), *help_)
 
     def text(self, node: Node | None, where: str) -> str | None:

@@ -57,13 +57,13 @@ class Key:
     """A key that a mapping of a system file may have.
 
     Attributes:
-        attribute: name of the record's field that takes the value.
+        attribute: name of the record's field that receives the value.
         name: name of the key in the file.
         kind: kind of the value.
         about: meaning of the value, for the documentation.
         label: name of the value in messages; `{of}` stands for the name of the mapping.
         required: whether the key is mandatory.
-        spread: whether reading gives values for several fields, as a mapping by field name.
+        spread: whether `kind.read` returns values of several fields, as a mapping by field name.
     """
 
     attribute: str
@@ -86,7 +86,7 @@ def key(
     spread: bool = False,
     shown: bool = True,
 ) -> Any:
-    """Make a field of a record that is read from the key `name` (by default the name of the field).
+    """Make a dataclass field whose value is read from the key `name` (by default the name of the field).
 
     With `shown=False` the field is left out of comparison and `repr`, for values that only the reader uses.
     """
@@ -112,7 +112,7 @@ def values_of(
 ) -> dict[str, Any]:
     """Read and check the values of a mapping; return those that are valid, by field of the record.
 
-    `of` names the mapping in messages; `label` is the label of a value whose key has none.
+    `of` names the mapping in messages, and `label` each value whose key declares no label of its own.
     """
     keys = keys_of(record)
     found = cx.reader.fields(node, of, tuple(keys), [name for name, each in keys.items() if each.required])
@@ -198,7 +198,7 @@ def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
 
 
 def mapping_of(schema: Mapping[str, Any]) -> Json:
-    """JSON Schema of a mapping with free keys.
+    """JSON Schema of a mapping with arbitrary keys, whose values meet `schema`.
 
     A null value (`~`) is allowed too; it removes an entry of an extended file.
     """
@@ -229,7 +229,7 @@ def part(record: type) -> Kind:
 
 
 def section(record: type, *, free: bool = False) -> Kind:
-    """Kind of a section of the file, kept as YAML node; with `free`, a mapping of free names to records."""
+    """Kind of a section of the file, kept as YAML node; with `free`, a mapping from any name to a record."""
     schema = json_schema(record)
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
 
@@ -266,7 +266,7 @@ def json_schema(record: type) -> Json:
 
 
 def reference(record: type, title: str) -> Iterator[str]:
-    """Yield lines of Markdown: a table of the keys of a record, then those of the records inside."""
+    """Yield lines of Markdown: a table of the keys of a record, then tables of the records in its values."""
     yield from (f"### {title}", "", "| key | value | default | meaning |", "|---|---|---|---|")
     fields = {each.name: each for each in dataclasses.fields(record)}
     inner: list[tuple[type, str]] = []

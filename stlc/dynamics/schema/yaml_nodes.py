@@ -83,7 +83,10 @@ class Entry:
     value: Node
 
     def place(self, key: str) -> Span:
-        """Source location of the value of `key` in the mapping of this entry, or else of that mapping."""
+        """Source location of the value of `key` in the mapping that is this entry's value.
+
+        Without this key, it is the source location of the mapping.
+        """
         node = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.value.span if node is None else node.span
 
@@ -299,7 +302,7 @@ class _Builder:
         return node
 
     def mapping(self, start: Any, depth: int) -> Mapping:
-        """Build a mapping up to its end event; its own entries come before merged ones (`<<`)."""
+        """Build a mapping up to its end event; entries written in it replace those of merge keys (`<<`)."""
         written: dict[str, Entry] = {}
         merged: dict[str, Entry] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
@@ -330,7 +333,7 @@ class _Builder:
         )
 
     def duplicate(self, key: Scalar, first: Scalar) -> None:
-        """Report a key that occurs twice in one mapping."""
+        """Report S102 for a key that occurs twice in one mapping, with both source locations."""
         self.sink.append(
             Diagnostic(
                 "S102",

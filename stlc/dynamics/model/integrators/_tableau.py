@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta methods as Butcher tableaux, applied to numbers of the IR.
+"""Explicit Runge-Kutta methods as Butcher tableaux, applied to numeric expressions of the IR.
 
 The result of a step is an expression, so one tableau serves rollouts in torch, NumPy programs and generated
 C.
@@ -57,7 +57,7 @@ def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], leng
 
 
 def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
-    """Return the weighted sum of one component's derivatives; `groups`: weight -> the derivatives."""
+    """Return the weighted sum of the derivatives of state `name`; `groups`: weight -> its derivatives."""
     total: ir.Num | None = None
     for weight, slopes in groups.items():
         part = slopes[0][name]
