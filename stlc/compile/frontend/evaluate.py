@@ -79,7 +79,7 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
 def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of `if ... then ... else ...` between formulas, numbers or vectors.
 
-    Between bools it is both a number and a formula.
+    The choice between two bools is both a number and a formula.
 
     Args:
         expr: the expression.
@@ -87,8 +87,8 @@ def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value
         scope: receives findings.
 
     Raises:
-        Failed: the condition is not a formula (E201), or for numbers not a state formula (E202), or the
-            branches disagree (E203, E205).
+        Failed: the condition is not a formula (E201), it selects between numbers and depends on several
+            instants (E202), or the branches have different units (E203) or types (E205).
     """
     decides, yes, no = values
     cond = as_formula(decides, expr.cond, Expectation("`if`"), scope)
@@ -121,7 +121,7 @@ def _choice_of_formulas(
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
-    """Return the number that a state formula selects; between bools it also has a formula."""
+    """Return the number `if cond then yes else no`; between two bools the result has `Number.formula` too."""
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
     yes = loose_number(branches[0], expr.yes, need, scope)
@@ -145,7 +145,10 @@ _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%":
 class Operation:
     """Evaluation rule of a class of syntax nodes.
 
-    `parts` returns the operands of a node in order; `value` computes its value from theirs.
+    Attributes:
+        parts: function that returns the operands of a node in order.
+        value: function that computes the value of a node from the node, the values of its operands and the
+            scope.
     """
 
     parts: Callable[[Any], Sequence[ast.Expr]]
@@ -237,7 +240,11 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
 def _refuse_products(
     expr: ast.Binary, sides: Sequence[Number | VectorValue], place: Span, scope: Scope
 ) -> None:
-    """Raise Failed (E205) for a sum of a vector and a number, or a product of two vectors."""
+    """Raise Failed (E205) for an operator that is not defined between a vector and its other operand.
+
+    These are the sum of a vector and a number, the product of two vectors, and a vector on the right of `/`,
+    `%` or `^`.
+    """
     vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
         scope.fail(Diagnostic("E205", f"`{expr.op}` does not mix a vector and a number", place))
@@ -322,7 +329,11 @@ def _value(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
-    """Return the values of independent expressions; each is evaluated even if another one fails."""
+    """Return the values of independent expressions, all of which are evaluated.
+
+    Raises:
+        Failed: an expression has errors; those of all expressions are in `scope.sink`.
+    """
     return _all(partial(evaluate, expr, scope) for expr in exprs)
 
 
@@ -348,7 +359,7 @@ def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
     """Return the value of an expression as a formula.
 
     Raises:
-        Failed: it has errors, or is no formula.
+        Failed: the expression has errors, or its value is no formula (E201).
     """
     return as_formula(evaluate(expr, scope), expr, need, scope)
 
@@ -357,7 +368,7 @@ def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> lis
     """Return the values of independent expressions as formulas.
 
     Raises:
-        Failed: one of them has errors, or is no formula.
+        Failed: an expression has errors, or its value is no formula (E201).
     """
     return _all(partial(formula, expr, need, scope) for expr, need in exprs)
 
@@ -382,7 +393,11 @@ def _attr(expr: ast.Attr, scope: Scope) -> Value:
 
 
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Return the value of a name that the file of `home` declares and an expression in `scope` uses."""
+    """Return the value of a name that the file of `home` declares, for use in an expression in `scope`.
+
+    Raises:
+        Failed: the name is not declared (E101), or stands for a function with arguments (E105).
+    """
     entry = home.entries.get(expr.name)
     if entry is None:
         return home.unknown(expr)
@@ -406,7 +421,8 @@ def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
 def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
     """Return the value of a definition without arguments.
 
-    It is computed once, but its size counts at every use towards the limit on expanded expressions.
+    The value is computed once; the size of the definition counts at every use towards the limit on expanded
+    expressions.
     """
     if entry.name not in scope.cache:
         if entry.name in scope.open:
@@ -447,7 +463,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> V
 
 @contextmanager
 def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Context in which a macro is expanded: findings also get the place of the call."""
+    """Context for the expansion of a macro: the place of the call is added to the findings if it fails."""
     before = len(scope.sink)
     try:
         yield
@@ -468,7 +484,7 @@ def _charge(cost: Cost, place: Span, scope: Scope) -> None:
 
 
 def _refuse_excess(place: Span, scope: Scope) -> None:
-    """Raise Failed if the expanded declaration exceeds the size limit; E005 is reported once."""
+    """Raise Failed if the expanded declaration exceeds the size limit; the first time, report E005."""
     meter = scope.meter
     if not meter.over:
         return
@@ -572,16 +588,16 @@ def _timed(
 
 @cache
 def _expansion(op: str) -> ast.Expr:
-    """Return the formula of `p` and `q`, without windows, that defines a temporal operator."""
+    """Return the definition of a temporal operator: a formula of `p` and `q`, without intervals."""
     plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
     return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))
 
 
 @cache
 def _repeats_operand(op: str) -> bool:
-    """True if the definition of a temporal operator contains an operand twice.
+    """True if the expansion of a temporal operator contains an operand twice.
 
-    `unless` counts as well, which is expanded at a later stage.
+    `unless` is such an operator too, although it is expanded at a later stage.
     """
     names = [node.name for node in descendants(_expansion(op)) if isinstance(node, ast.Name)]
     return op == "unless" or len(names) > len(set(names))
@@ -590,9 +606,9 @@ def _repeats_operand(op: str) -> bool:
 def _timed_node(
     pattern: ast.Node, operands: Mapping[str, typed.Formula], window: typed.Interval, span: Span
 ) -> typed.Formula:
-    """Return the definition of a temporal operator with its operands in place of `p` and `q`.
+    """Return the definition (`pattern`) of a temporal operator with its operands in place of `p` and `q`.
 
-    Each temporal operator in it gets the window.
+    Each temporal operator in the definition gets the interval `window`.
     """
     if isinstance(pattern, ast.Name):
         return operands[pattern.name]
@@ -654,9 +670,9 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 
 
 def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """Return a number bound by `freeze` as a frozen value with a unique name, added to `bindings`.
+    """Return a number that `freeze` binds as a frozen value, whose unique name is appended to `bindings`.
 
-    A constant is returned unchanged.
+    A constant is returned unchanged, without an entry in `bindings`.
     """
     if number.constant is not None:
         return number

@@ -32,7 +32,7 @@ from stlc.units import Unit, nearest, same_dims
 
 @contextmanager
 def _raising(scope: Scope) -> Iterator[None]:
-    """Context in which one expression is evaluated: `scope.error` is raised with its errors if it fails."""
+    """Context for the evaluation of one expression: if it fails, `scope.error` is raised with its errors."""
     before = len(scope.sink)
     try:
         with scope.meter.fresh():
@@ -96,15 +96,16 @@ def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.For
 def resolve_number(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> Number:
-    """Return an expression as one number, in SI units relative to the offset of its unit.
+    """Return the value of an expression as one number.
 
-    So 20 degC is 20.
+    The number is in SI units, counted from the zero of its unit: 20 degC is 20.
 
     Args:
         expr: syntax tree of the expression.
-        scope: names that it may use; findings are appended to `scope.sink`.
-        expected: column that stores the number. The members of its enum are in scope; `true` is 1, and a
-            formula is 1 where it holds; a number without a unit takes its unit, and any other unit is E203.
+        scope: names that the expression may use; findings are appended to `scope.sink`.
+        expected: column that stores the number, if any. The members of its enum are in scope; `true` is 1,
+            and a formula is 1 where it holds; a number without a unit takes the unit of the column, a number
+            in another unit is the error E203.
         what: role of the number, for messages: "the flow of `x`".
 
     Raises:
@@ -134,7 +135,7 @@ def resolve_numbers(
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
-    """Return a number in the stored form of a column in `unit`: the SI value divided by the unit's scale."""
+    """Return a number as a column in `unit` stores it: 20 degC is 20 in degC, and 72 km/h is 72 in km/h."""
     number = rebased(number, unit)
     if unit.ratio == 1:
         return number.num
@@ -145,7 +146,13 @@ def stored(number: Number, unit: Unit) -> ir.Num:
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
-    """Return a value as the number that a column stores."""
+    """Return a value as the number that a column stores; without a column, as any number.
+
+    For a bool column, a formula is the number 1 where it holds, else 0.
+
+    Raises:
+        Failed: the value has a type (E202, E205, S203) or unit (E203) that does not fit the column.
+    """
     if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
         cond = condition(value)
         truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
@@ -176,6 +183,9 @@ def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Num
     """Return a number after checking its type and unit against a column.
 
     A number without a unit takes the unit of the column.
+
+    Raises:
+        Failed: the number has another type (E205, S203) or another unit (E203).
     """
     values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
     if column.kind in ("bool", "enum"):

@@ -29,7 +29,12 @@ TIME_WORDS = MappingProxyType(
 
 
 def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
-    """Return a sum or difference with a time, or a multiple of one."""
+    """Return the sum or difference of two times, or a time multiplied or divided by a constant.
+
+    Raises:
+        Failed: the operator does not apply to these operands (E205), a factor is not constant (E311), or a
+            divisor is 0 (E401).
+    """
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
         if not (a.end or b.end):
@@ -80,7 +85,7 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
     """Return a value as a time.
 
     Raises:
-        Failed: it is not constant (E303), or no time (E203, E205).
+        Failed: the value is not constant (E303), has another unit (E203), or is no number (E205).
     """
     if isinstance(value, TimeExpr):
         return value
@@ -99,7 +104,7 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
 def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
     """Return a number without a unit as a time, in the unit given by `time UNIT`, else in seconds.
 
-    In seconds it is reported by W101, unless it is 0.
+    If the file has no `time UNIT`, W101 is reported for a number other than 0.
     """
     if scope.time_unit in ("step", "steps"):
         return TimeExpr(steps=value, span=expr.span)

@@ -43,7 +43,7 @@ def finished(entry: Definition, value: Value, scope: Scope) -> Value:
     """Return the value of a definition's body, converted to the declared type and unit.
 
     Raises:
-        Failed: it has another type or unit.
+        Failed: the value has another type (E201, E202, E205) or another unit (E203).
     """
     body = entry.body
     match entry.sort:
@@ -75,7 +75,11 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Return a value in the declared unit, which a number without a unit takes and others must agree with."""
+    """Return a value in the declared unit, which a number without a unit takes.
+
+    Raises:
+        Failed: a number has another unit (E203).
+    """
     if isinstance(value, VectorValue):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)

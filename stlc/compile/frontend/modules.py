@@ -91,7 +91,13 @@ class _Loader:
         self.found: dict[str, tuple[Module, ...] | SpecError] = {}
 
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
-        """Return the modules that one file imports; `around` are the keys of the files that import it."""
+        """Return the modules that one file imports.
+
+        `around` is the chain of the keys of the files that import this file. Each file is read once.
+
+        Raises:
+            SpecError: a file cannot be read or imports itself (E106), or has syntax errors.
+        """
         if key not in self.found:
             try:
                 self.found[key] = self._imports(spec, key, around)

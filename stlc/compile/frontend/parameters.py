@@ -31,7 +31,7 @@ def read_overrides(
 ) -> dict[str, ast.Expr]:
     """Return the expressions that `--set` gives to constants and parameters of a specification, by name.
 
-    Names that only the system has (constants, states, its own parameters, dotted keys) are skipped.
+    Names of the system are skipped: its constants, states and parameters, and keys with a dot.
 
     Raises:
         UsageError: U101, an unknown name, or a value that is not an expression.
@@ -126,10 +126,12 @@ def _even(
 
 
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
-    """Return the distribution of each column, in its unit; a single number applies to all components.
+    """Return the distribution of each column, in the unit of the column.
+
+    If the expression is a single number, each column is drawn from its distribution independently.
 
     Raises:
-        Failed: another unit (E203), or a value that is unknown before the trajectory begins (E205).
+        Failed: the unit is not that of the column (E203), or the distribution depends on a signal (E205).
     """
     here = scope.extended({}, samplers=True)
     first = evaluate(expr, here)
@@ -148,7 +150,11 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
 
 
 def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
-    """Return a drawn number in the unit that its column stores."""
+    """Return a drawn number in the unit that its column stores.
+
+    Raises:
+        Failed: the number depends on a signal (E205), or has another unit than the column (E203).
+    """
     if columns_of(number.num):
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))
@@ -165,7 +171,10 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
 
 
 def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:
-    """Report E104 if the system has a parameter of the same name with another range or distribution."""
+    """Raise Failed (E104) if the system draws a parameter of the same name differently.
+
+    This is so if the specification gives a distribution, or a range other than that of the system.
+    """
     place = interface.places.get(columns[0].name)
     labels = () if place is None else (Label(place, "declared here"),)
     if not isinstance(decl.domain, tuple | ast.SetLiteral):
@@ -203,7 +212,11 @@ def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> t
 
 
 def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed.Parameter]:
-    """Return the components of one parameter, fixed to the value in `text`."""
+    """Return the components of one parameter, fixed to the value in `text`.
+
+    Raises:
+        UsageError: U101, the value is not valid for the parameter.
+    """
     what = f"`{name}`"
     column = group[0].column
     try:

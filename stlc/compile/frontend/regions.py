@@ -76,7 +76,7 @@ def convex(corners: Sequence[VectorValue]) -> bool:
 
 
 def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
-    """Return triangles that together are a polygon, cut off by ear clipping; a convex one is returned whole.
+    """Return convex parts of a polygon: triangles from ear clipping, or the polygon itself if it is convex.
 
     Args:
         corners: corners of a simple polygon, constant and counter-clockwise.
@@ -164,10 +164,10 @@ def composed(
 
     Args:
         region: the composed region.
-        inner: function that returns the signed distance to a part.
-        opposite: function that returns the signed distance to a region whose complement is taken, before its
-            sign is reversed. Where `inner` returns the least distance, it returns the greatest, and vice
-            versa.
+        inner: function that returns the signed distance to a part of a union, intersection or dilation.
+        opposite: function that returns the signed distance to the region of which a complement is taken; the
+            sign is reversed afterwards. If `inner` returns the least distance along a segment, `opposite`
+            returns the greatest, and vice versa.
         margin: function that returns the margin of a dilation.
         span: source location of the expression.
         scope: receives findings.
@@ -184,7 +184,7 @@ def composed(
 def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the signed distance to a box.
 
-    Inside it is the least distance to a face, outside minus the Euclidean distance.
+    Inside the box this is the distance to the nearest face, outside minus the Euclidean distance.
     """
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:

@@ -123,7 +123,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
 
 
 def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """Return a file with `facts` as the enforced ranges of columns, in its scope and in its imports."""
+    """Return a file with `facts` as the ranges that signals never leave, in its scope and in its imports."""
     files = tuple(with_facts(part, facts) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
@@ -147,12 +147,12 @@ def resolve(
     Args:
         spec: syntax tree of the specification.
         interface: interface of the system, with which signals and constants are matched.
-        overrides: expression that replaces each constant in it, by name (`--set`).
+        overrides: text of the expression that replaces a constant or parameter, by its name (`--set`).
         sink: list to which warnings are appended, also when errors are raised.
 
     Raises:
         SpecError: all independent errors of the file in source order, at most `MAX_ERRORS`.
-        UsageError: an override of an unknown constant.
+        UsageError: U101, an override of an unknown constant.
     """
     values = read_overrides(overrides or {}, spec, interface)
     findings = Findings()
@@ -224,7 +224,7 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
 
 
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
-    """Give each override without a unit the unit of the value that it replaces."""
+    """Give each override without a unit the unit of the constant that it replaces; change `found`."""
     for item in spec.items:
         entry = found.entries.get(item.name)
         if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
@@ -322,7 +322,7 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 def _requirements(
     spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: KnownRanges
 ) -> tuple[typed.Requirement, ...]:
-    """Return the requirements (or assumptions) that resolve without errors."""
+    """Return the requirements or assumptions (`kind`) without errors; errors are reported to `scope`."""
     found: list[typed.Requirement] = []
     for item in _items(spec, kind):
         tags = read_tags(item.tags, scope)
@@ -351,10 +351,10 @@ def _requirements(
 
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
-    """Return the divisor of the robustness that `@scale` asks for.
+    """Return the divisor of the robustness that `@scale` sets.
 
     Raises:
-        Failed: the range of a signal that the divisor depends on is unknown (E205).
+        Failed: the divisor depends on a signal whose range is unknown (E205).
     """
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value

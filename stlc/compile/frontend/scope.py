@@ -71,7 +71,7 @@ class Meter:
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Context that measures the evaluations in a block without counting them.
+        """Context that measures the size of the expressions evaluated in a block, without counting them.
 
         The yielded `Cost` is set when the block ends.
         """
@@ -86,7 +86,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Context that counts the evaluations in a block from zero, as those of one declaration."""
+        """Context that counts the expressions evaluated in a block from zero, as those of one declaration."""
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
@@ -110,7 +110,7 @@ Sort: TypeAlias = Literal["any", "constant", "region", "number", "formula"]
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Name with a value: a signal, a constant, an enum member.
+    """Name with a value: a signal or an enum member, or a constant of the system.
 
     Attributes:
         value: its value, in SI units.
@@ -191,6 +191,9 @@ class Scope:
         modules: scopes of imported files, by alias.
         product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)` (`@product`).
         locals: value and expanded size of each argument of the current macro and each quantifier variable.
+        meter: counter of the nodes of the current declaration.
+        cache: value and expanded size of each definition already evaluated, by name; None if it has errors.
+        open: names of the definitions that are being evaluated, in order of nesting.
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
@@ -228,7 +231,7 @@ class Scope:
         )
 
     def as_products(self) -> Scope:
-        """Return the scope for requirements with `@product`, with an empty cache of definitions."""
+        """Return the scope for requirements with `@product`, in which definitions are evaluated anew."""
         broken = dict.fromkeys(name for name, value in self.cache.items() if value is None)
         modules = {alias: module.as_products() for alias, module in self.modules.items()}
         return replace(self, product=True, cache=broken, modules=modules)
@@ -262,7 +265,10 @@ class Scope:
 
 
 def column_value(column: Column, origin: Origin | None = None) -> Number:
-    """Return the value of a column, in SI units relative to the offset of its unit (20 degC is 20)."""
+    """Return the value of a column as a number in SI units.
+
+    The number is counted from the zero of its unit: 20 degC is 20.
+    """
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
         num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
@@ -290,7 +296,7 @@ def column_entries(
 def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, Known]:
     """Return the name-table entries of enum members.
 
-    A name may be a member of several enums; the other operand of a comparison then decides.
+    A name may be a member of several enums; the other operand of a comparison then decides which is meant.
     """
     options: dict[str, list[tuple[tuple[str, float], ...]]] = {}
     for labels in dict.fromkeys(enums):
@@ -300,7 +306,7 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
-    """Return a constant given in SI units; one without a unit takes any unit that is needed."""
+    """Return a constant given in SI units; without a unit, it takes the unit that its place requires."""
     bare = not unit.text
     exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
@@ -317,7 +323,7 @@ def constant_entries(
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
     """Return the ranges that columns never leave, each in the unit of its column.
 
-    These are the ranges of bools and enums, and those marked as never left (`Column.fact`).
+    These are the ranges of bools and enums, and those that the column marks as enforced (`Column.fact`).
     """
     facts: dict[str, Bounds] = {}
     for column in columns:

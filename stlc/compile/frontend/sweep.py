@@ -125,9 +125,10 @@ class _Sweep:
         return self._over(faces, (*self.at_ends(box), *outside))
 
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
-        """Return the greatest depth of the segment inside the faces of a convex region.
+        """Return the greatest signed distance of the segment to a convex region.
 
-        Where the segment stays outside, return the greatest of `outside`, its signed distances to the region.
+        Where the segment enters the region, this is the greatest depth below the faces (`_depth`), elsewhere
+        the greatest of `outside`: signed distances that include the one of the segment's nearest point.
         """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
@@ -136,9 +137,9 @@ class _Sweep:
     def _depth(self, faces: Sequence[Pair]) -> Number:
         """Return the maximum along the segment of the least distance to a face, positive inside.
 
-        It is negative if the segment stays outside. By duality of linear programs it is the least of two
-        kinds of values: the distance to each face at the end where it is greater, and that to two faces of
-        opposite slope at the point where both are equal.
+        The result is negative if the segment stays outside. By duality of linear programs it is the least of
+        two kinds of values: the greater of each face's distances at both ends of the segment, and, for two
+        faces with distances of opposite slope, the distance at the point where both are equal.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]
@@ -209,7 +210,10 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Return the distance of the segment to every edge; where they cross, minus the crossing depth."""
+        """Return the distance of the segment to every edge of a polygon; negative where they cross.
+
+        The magnitude is the least distance from an end of either of the two to the other one.
+        """
         now, then = self.ends
         past = edges([self.past(corner) for corner in corners])
         turns = edges([side(corner, now, then, self.span, self.scope) for corner in corners])
@@ -237,7 +241,10 @@ class _Sweep:
         )
 
     def past(self, place: VectorValue) -> Number:
-        """Return the least distance of the segment to a point that may itself move in a straight line."""
+        """Return the least distance of the segment to the point `place`.
+
+        The point may itself move in a straight line between both samples.
+        """
         now, then = (
             minus(end, there, self.span, self.scope)
             for end, there in zip(self.ends, (place, _later(place)), strict=True)
@@ -252,9 +259,9 @@ class _Sweep:
         return norm(VectorValue(moved), self.span, self.scope)
 
     def _ratio(self, upper: Number, lower: Number) -> Number:
-        """Return a quotient of squares that stays finite for a segment of length 0.
+        """Return `upper / lower`, with the denominator kept away from 0 for a segment of length 0.
 
-        Its value does not matter there.
+        For such a segment the result does not matter.
         """
         least = literal(_SHORT * _SHORT, self.span)
         return self.apply("div", upper, self.apply("max", lower, least))
@@ -275,7 +282,7 @@ class _Sweep:
 
 
 def _later(value: T) -> T:
-    """Return a number, vector or region at the next sample; at the last sample, as it is there."""
+    """Return a number, vector or region at the next sample; at the last sample, return it unchanged."""
     match value:
         case Number():
             return replace(value, num=shifted(value.num, 1, clamped=True))

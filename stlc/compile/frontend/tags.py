@@ -33,7 +33,9 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of the predicates in a formula.
+    """Return the greatest magnitude of the margins of a formula's predicates.
+
+    The margins are computed over the ranges of the signals by interval arithmetic.
 
     Raises:
         Failed: the range of a signal is unknown, or no predicate varies (E205).
@@ -46,7 +48,7 @@ def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, s
 
 
 def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of a number.
+    """Return the greatest magnitude of a number, over the ranges of its signals.
 
     Raises:
         Failed: the range of a signal is unknown (E205).
@@ -86,8 +88,8 @@ class Tags:
     Attributes:
         marks: names of tags without arguments (`safety`, `liveness`).
         weight: factor of the robustness.
-        scale: divisor of the robustness. A number that varies stands for the greatest magnitude of its range;
-            None stands for the greatest magnitude of the predicates (`@scale(auto)`).
+        scale: divisor of the robustness. If it is a number that varies, the divisor is the greatest magnitude
+            of that number; if None (`@scale(auto)`), the greatest magnitude of the predicates' margins.
         scale_span: source location of `@scale`.
         product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)`.
         id: text of `@id("…")`; "" without this tag.

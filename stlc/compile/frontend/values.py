@@ -26,25 +26,26 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """Scalar in SI units, relative to the offset of its unit: 20 degC is 20, a point of that scale.
+    """Scalar expression in SI units, counted from the zero of its unit: 20 degC is 20.
+
+    A number in a unit with an offset (degC) is a temperature, as opposed to a temperature difference.
 
     Attributes:
-        num: the number in the IR.
-        unit: physical unit, for checks and messages; `num` is in SI whatever the scale of the unit. A number
-            whose unit has an offset (degC) is a point of that scale, a temperature.
-        flexible: whether it agrees with any unit, since its own is unknown: no unit was declared, or a factor
-            is a number without a unit.
-        bare: whether it consists only of numbers without a unit; it then takes the unit that is needed, with
-            its scale (`psi < 30`).
+        num: the number in the IR, in SI units whatever the scale of `unit`.
+        unit: physical unit, for checks and messages.
+        flexible: whether the number agrees with any unit, since its own is unknown: no unit was declared, or
+            a factor is a number without a unit.
+        bare: whether the number consists only of numbers without a unit; it then takes the unit, with its
+            scale, that its place requires (`psi < 30`).
         exact: exact value of a rational constant, else None.
-        sense: `difference`: between two points, so not comparable with a point; `open`: a point or a
-            difference, as the result of subtracting a varying number in kelvin from a point, or of scaling a
-            point; "" otherwise.
-        kind: kind of its values; a `bool` is 0 or 1 and is also a formula, an `enum` is one of `labels`.
+        sense: `difference`: the difference of two temperatures, so not comparable with a temperature; `open`:
+            a temperature or a difference, since a varying number in kelvin was subtracted from a temperature,
+            or a temperature was scaled; "" otherwise.
+        kind: type of the values; a `bool` is 0 or 1 and is also a formula, an `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
         formula: for a choice between bools, the choice between formulas, with their margins; else None.
-        span: its place in the source.
-        origin: declaration of the name by which it was given.
+        span: source location of the expression.
+        origin: declaration of the name that stands for the number, if any.
     """
 
     num: ir.Num
@@ -61,7 +62,7 @@ class Number:
 
     @property
     def constant(self) -> float | None:
-        """Value of a constant, in SI units relative to the offset of its unit; None for a varying number."""
+        """Value of a constant, in SI units counted from the zero of its unit; None for a varying number."""
         return self.num.value if isinstance(self.num, ir.Const) else None
 
 
@@ -191,7 +192,7 @@ Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region
 
 
 def is_formula(value: Value) -> bool:
-    """True if the value is a formula with its own margin; a bool signal, with margin 1/2, is not one."""
+    """True if the value is a formula with a margin of its own, unlike a bool signal, whose margin is 1/2."""
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 

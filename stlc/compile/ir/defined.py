@@ -20,8 +20,8 @@ _Instants: TypeAlias = NDArray[np.int_]
 def defined(formula: ir.Formula, samples: int) -> Defined:
     """Return where `formula` is defined on a trace of `samples` samples, as a mask `(samples,)`.
 
-    Windows of the future are not cut: one that extends beyond the last sample is undefined, as are `prev`,
-    `next` and `shift` outside the trace. A window "to the end" is defined where it has a sample.
+    Windows of the future are not cut: a formula is undefined if its window extends beyond the last sample, as
+    are `prev`, `next` and `shift` outside the trace. A window "to the end" is defined where it has a sample.
     """
     return fold(formula, _Definedness(samples))
 
@@ -41,7 +41,7 @@ class _Definedness(Analysis[Defined]):
     def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
         """Return, per sample, whether the operands are defined at every instant at which they are read.
 
-        An operator with an empty window reads none.
+        If the window of the operator is empty, no operand is read, and the result is True.
         """
         if all(each == ir.NOW for each in offsets):
             return reduce(np.logical_and, parts)
@@ -67,7 +67,11 @@ class _Definedness(Analysis[Defined]):
         return np.full(self.samples, body[0])
 
     def _instants(self, first: int | None, last: int | None) -> _Ranges:
-        """Return the first and last instant of a window at each sample; past windows are cut at the start."""
+        """Return the first and last instant of a window at each sample, as two arrays `(samples,)`.
+
+        `first` and `last` are offsets from the sample; None extends to the start or end of the trace. Windows
+        that begin before the start of the trace are cut there.
+        """
         now = np.arange(self.samples)
         start = np.zeros_like(now) if first is None else np.maximum(now + first, 0)
         end = np.where(start < self.samples, self.samples - 1, self.samples) if last is None else now + last
@@ -80,9 +84,9 @@ class _Ranges(NamedTuple):
 
 
 def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """Return, per sample, whether all instants first..last are in the trace and defined.
+    """Return, per sample, whether all instants `first`..`last` are in the trace and defined.
 
-    An empty range of instants gives True.
+    All arrays have the shape `(samples,)`. An empty range of instants gives True.
     """
     samples = len(inside)
     known = int(np.argmin(inside)) if not inside.all() else samples

@@ -65,8 +65,9 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
     Args:
         interval: interval whose bounds are sums of seconds, steps and horizons.
         grid: time step and horizon.
-        sink: list to which E005, E301, E302, E305, E311 and W304 are appended; after an error the returned
-            window is only a placeholder.
+        sink: list to which findings are appended: W304 for a rounded bound, E305 for an interval without a
+            sample, E311 for an unknown time step or horizon, E301, E302 and E005 for an invalid interval.
+            After an error the returned window is only a placeholder.
         outward: whether bounds between two samples are rounded outwards; else inwards.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
@@ -92,7 +93,10 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
 
 
 def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
-    """Return a bound in steps; None, with E311 in `sink`, if the grid lacks the step or horizon it needs."""
+    """Return a time in steps.
+
+    The result is None, with E311 in `sink`, if `grid` lacks a step or horizon that the time needs.
+    """
     if time.horizons and grid.horizon is None:
         tell(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
         return None
@@ -187,7 +191,8 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
 def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
     """Return a formula with the delays of `shift` converted from seconds to samples.
 
-    E205 and E311 are appended to `sink`; a delay with an error is replaced by one sample.
+    Findings are appended to `sink`: E205 for a delay that is no whole number of samples or too long, E311 for
+    an unknown time step or horizon. A delay with an error is replaced by one sample.
     """
 
     def leaf(num: ir.Num) -> ir.Num:

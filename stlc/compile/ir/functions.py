@@ -38,24 +38,26 @@ class Function:
         least: smallest number of arguments.
         most: largest number of arguments; None for any.
         rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
-            `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions; the
-            others: units are multiplied, divided, … like the numbers.
+            `ratio`: the arguments agree, the result has no dimensions; `sign`: arguments of any unit, a
+            result without dimensions; `mul`, `div`, `pow`, `sqrt`, `square`: units are multiplied, divided, …
+            like the numbers.
         kind: `operator`: written with a sign; `sampler`: draws random values, only in initial sets and
             events; `function`: any other.
         doc: one sentence for editors; "" for operators.
         fold: Python function that computes the value for constant arguments (exactly for `Fraction`s if
             `exact`); None for samplers.
-        array: function that builds the result from the operands by operations of a tape
-            (`stlc.compile.backends.array.tape`); None: the kernel of the same name of the array library is
-            called.
+        array: function that appends the array operations for the function to a tape
+            (`stlc.compile.backends.array.tape`), a list of such operations, and returns the result; None: the
+            kernel of the same name of the array library is called.
         numpy: name of the kernel in NumPy; "" if `NumpyOps` defines the kernel itself.
         torch: name of the kernel in torch; "" if `TorchOps` defines the kernel itself.
-        c: function from the C expressions of the arguments to the C expression of the result; that of an
-            extremum takes two arguments.
+        c: function from the C expressions of the arguments to the C expression of the result; for `min` and
+            `max`, of two arguments.
         slopes: function from the C expressions of the result and of the arguments to the C expressions of the
-            derivatives, one per argument. `SHARED` for extrema: equal operands share the derivative.
+            derivatives, one per argument. `SHARED` for `min`, `max` and `clip`: equal operands share the
+            derivative.
         of_each: for a function without `c` and `slopes`: name of the function applied to every argument, and
-            name of the one that reduces the results (`norm1` is `abs`, then `add`).
+            name of the function that reduces the results (`norm1` is `abs`, then `add`).
         bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
             ValueError, OverflowError or ZeroDivisionError where it is undefined.
         exact: whether rational arguments give a rational result.
@@ -209,7 +211,8 @@ def _function(
 def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
     """Return the entry of an operator.
 
-    Without a kernel (`numpy`), the array back ends call the method of the tape with the operator's name.
+    Without a kernel (`numpy`), the array back ends append the operation to a tape by the method of the tape
+    that has the operator's name.
     """
     flags = {"kind": "operator", "exact": True, "whole": True, **flags}
     if "numpy" not in flags:
@@ -235,7 +238,7 @@ def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
     """Return the entry of a function of one or more arguments.
 
-    Scaling all of them by a positive factor scales its result (`Function.linear`).
+    Scaling all arguments by a positive factor scales the result by that factor (`Function.linear`).
     """
     return Function(name, 1, None, "same", doc=doc, fold=fold, bounds=bounds, linear=True, **rest)
 

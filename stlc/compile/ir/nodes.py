@@ -142,7 +142,7 @@ NOW = Offsets(0, 0)
 
 
 class Operator:
-    """Base of formulas whose value follows from their operands at instants relative to now.
+    """Base of formulas whose value follows from the values of their operands at instants relative to now.
 
     Attributes:
         names: names of two dual operators: the one that takes the minimum (over its window), then the one
@@ -200,7 +200,7 @@ class Windowed(Operator):
 class Truth:
     """Formula `true` or `false`, with robustness +inf or -inf.
 
-    `simplify` removes the constants that are operands of other operators.
+    `stlc.compile.lowering.simplify` removes such constants where they are operands of other operators.
     """
 
     value: bool
@@ -209,10 +209,11 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Predicate:
-    """Predicate with robustness `sign * num`; true iff that is > 0 (`strict`) or >= 0.
+    """Predicate with robustness `sign * num`; true iff the robustness is > 0 (`strict`) or >= 0.
 
-    Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a test of time:
-    its robustness is +inf or -inf, so it decides truth but is never the margin of an enclosing formula.
+    Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a predicate on
+    clocks and timers: its robustness is +inf or -inf, so it decides truth but is never the margin of an
+    enclosing formula.
     """
 
     num: Num
@@ -262,7 +263,7 @@ class PastTemporal(Windowed):
 
 @dataclass(frozen=True, slots=True)
 class Until(Windowed):
-    """sup over t' in the window of min(right(t'), inf over [t, t'] of left); `release` is its dual."""
+    """Until: sup over t' in the window of min(right(t'), inf over [t, t'] of left); `release` is its dual."""
 
     names: ClassVar = ("release", "until")
     op: Literal["until", "release"]
@@ -279,7 +280,10 @@ class Until(Windowed):
 
 @dataclass(frozen=True, slots=True)
 class Since(Windowed):
-    """Mirror of `Until` in the past, with `left` required at both ends; `trigger` is its dual."""
+    """Since: sup over t' in the past window of min(right(t'), inf over [t', t] of left).
+
+    The dual of `since` is `trigger`.
+    """
 
     names: ClassVar = ("trigger", "since")
     back: ClassVar = True
@@ -299,10 +303,14 @@ class Since(Windowed):
 class Shift(Operator):
     """Value of `body` `steps` samples later (negative: earlier).
 
-    `outside` is the value where that sample lies outside the trace. None: undefined, like a window that
-    leaves the trace. False: used by `rise` and `fall` at the first sample. Where windows are cut at the end
-    of the trace (`truncate`), an undefined value counts as false, or as true in a `weak` node, which results
-    from a negation.
+    Attributes:
+        steps: number of samples.
+        body: formula.
+        outside: truth where that sample lies outside the trace. None: undefined, like a window that leaves
+            the trace. False: used by `rise` and `fall` at the first sample.
+        span: source location.
+        weak: whether an undefined value counts as true, since the node results from a negation, or as false;
+            only where windows are cut at the end of the trace (`truncate`).
     """
 
     steps: int

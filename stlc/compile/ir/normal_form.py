@@ -103,7 +103,7 @@ def _folded(formula: typed.Formula, flat: bool) -> ir.Formula:
 
 
 def flattened(op: Literal["and", "or"], items: Iterable[ir.Formula]) -> list[ir.Formula]:
-    """Return the distinct items of an `and` or `or`, with nested ones of the same kind expanded."""
+    """Return the distinct items of an `and` or `or`, with nested formulas of the same operator expanded."""
     nested = ((item.items if isinstance(item, ir.BoolOp) and item.op == op else (item,)) for item in items)
     return list(dict.fromkeys(chain.from_iterable(nested)))
 
@@ -118,10 +118,10 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
 
 
 def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
-    """Return the `and` or `or` of formulas, simplified where one is a constant.
+    """Return the `and` or `or` of formulas, simplified where a formula is a constant.
 
-    A constant that makes no difference is removed; one that decides the result is the result. `neutral` is
-    the value of the operator without operands: true for `and`, false for `or`.
+    A constant that does not change the result is removed; a constant that decides the result is returned.
+    `neutral` is the value of the operator without operands: true for `and`, false for `or`.
     """
     kept: list[ir.Formula] = []
     for item in items:

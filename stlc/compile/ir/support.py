@@ -19,9 +19,9 @@ V = TypeVar("V")
 
 
 class Analysis(ABC, Generic[V]):
-    """Bottom-up analysis of a formula: one method per kind of node.
+    """Bottom-up analysis of a formula, with values of any type: one method per kind of node.
 
-    Each computes the value of a node from the values of its operands; `fold` applies them.
+    Each method computes the value of a node from the values of its operands; `fold` applies the methods.
     """
 
     @abstractmethod
@@ -45,7 +45,7 @@ class Analysis(ABC, Generic[V]):
         return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
-        """Value of a `freeze`, from those of its bound numbers and of its body."""
+        """Value of a `freeze`, from the values of its bound numbers and of its body."""
         parts = (body, *bound)
         return self.over(parts, (ir.NOW,) * len(parts))
 
@@ -80,8 +80,8 @@ class Reach(NamedTuple):
 def reach(formula: ir.Formula) -> Reach:
     """Return how many samples before and after its instant a formula requires (lookback and lookahead).
 
-    Of a window to the end of the trace only the start is required. The interval of an operator such as
-    `always@[a, b]` counts from the first sample, wherever the operator stands; its end counts as lookahead.
+    A window to the end of the trace requires only its start. The interval of an operator such as `always@[a,
+    b]` counts from the first sample, wherever the operator stands; its end counts as lookahead.
     """
     past, future, clocked = fold(formula, _REQUIRED)
     return Reach(past, max(future, clocked))
@@ -95,15 +95,16 @@ def reach_of(num: ir.Num) -> Reach:
 def farthest(num: ir.Num) -> Reach:
     """Return how many samples before and after now a number reads.
 
-    Unlike `reach_of` it counts clamped reads, which repeat the first or last sample outside the trace.
+    Unlike `reach_of`, this includes signals that repeat their first or last sample outside the trace
+    (`clamped`).
     """
     return _offsets([leaf.steps for leaf in _shifts(num)])
 
 
 def history(formula: ir.Formula) -> int:
-    """Return how many samples before its instant a formula reads; 2^40 stands for all.
+    """Return how many samples before its instant a formula reads; 2^40 stands for all earlier samples.
 
-    Unlike `reach` it counts past windows in full, which are cut at the start of the trace.
+    Unlike in `reach`, past windows count in full, although they are cut at the start of the trace.
     """
     return fold(formula, _HISTORY)
 
@@ -136,7 +137,7 @@ class _Required(Analysis[_Needs]):
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
         """Return how many samples an operator requires: those of its operands, plus the offsets of the reads.
 
-        Of an unbounded window only the near end is required.
+        A window without end requires only the sample nearest to now.
         """
         past = future = clocked = 0
         for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):
@@ -150,7 +151,7 @@ class _Required(Analysis[_Needs]):
 
 @final
 class _History(Analysis[int]):
-    """Analysis of the samples before the instant that are read where the trace has them."""
+    """Analysis of the samples that a formula reads before its instant, with past windows counted in full."""
 
     def predicate(self, num: ir.Num) -> int:
         return farthest(num).past
@@ -188,7 +189,7 @@ def columns(formula: ir.Formula) -> frozenset[str]:
 def depends_on_ends(num: ir.Num) -> bool:
     """True if a number depends on where the trace begins or ends.
 
-    This is so for clamped reads, which repeat the first or last sample.
+    This is so if a signal in it repeats its first or last sample outside the trace (`clamped`).
     """
     return any(leaf.clamped for leaf in _shifts(num))
 
@@ -209,11 +210,11 @@ def uses_end(formula: ir.Formula) -> bool:
 
 
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
-    """Return an instant from which a formula is constantly +inf or -inf on an open trace, or None.
+    """Return an instant from which on a formula is constantly +inf or -inf, or None if none is known.
 
-    An open trace continues beyond its last sample, where every unknown predicate has the same bound, +inf or
-    -inf. From some instant on most formulas are then constant, so that a window far beyond a short trace
-    needs only one such instant.
+    The trace is open: it continues beyond its last sample with unknown predicates, all of which are bounded
+    by +inf, or all by -inf. From some instant on most formulas are then constant, so that a window far beyond
+    a short trace needs only one such instant.
 
     Args:
         formula: formula in negation normal form.
@@ -236,10 +237,10 @@ class _Tail(Analysis[int | None]):
         return 0
 
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
-        """Return an instant from which an operator is constant, or None.
+        """Return an instant from which on an operator is constant, or None if none is known.
 
-        From this instant on all operands are constant wherever they are read, or the window is empty; a
-        window from the start of the trace contains all known samples.
+        From this instant on all operands are constant wherever they are read, or the window is empty. A
+        window that begins at the start of the trace must contain all instants at which its operand varies.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

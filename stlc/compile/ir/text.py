@@ -58,8 +58,8 @@ def _operand(formula: ir.Formula) -> str:
 def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
     """Return the operands of a formula that its text shows.
 
-    Left out are operands of `and` and `or` that `timers.timer_test` adds to measure by how much a test of
-    time fails.
+    An operand that `timers.timer_test` adds to `and` or `or`, the finite robustness of a test of a timer, is
+    left out.
     """
     items = operands(formula)
     if not isinstance(formula, ir.BoolOp):

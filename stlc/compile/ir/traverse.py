@@ -35,7 +35,7 @@ _SORTS: Mapping[str, _Sort] = {
 
 @cache
 def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
-    """Return the fields of a node class that hold children, in order, each with the sort of its value."""
+    """Return the fields of a node class that hold children, in order: (name, sort of the value)."""
     declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
     return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
@@ -94,7 +94,7 @@ def map_children(
 
 @cache
 def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
-    """Return (name, whether it holds several) for each field of a class that holds formulas.
+    """Return the fields of a class that hold formulas: (name, whether the value is a tuple of formulas).
 
     For `Recalled`, a past operator rewritten with timers, this is only `now`.
     """
@@ -127,7 +127,7 @@ def nodes(formula: ir.Formula) -> Iterator[ir.Formula]: ...
 @overload
 def nodes(formula: typed.Formula) -> Iterator[typed.Formula]: ...
 def nodes(formula: Any) -> Iterator[Any]:
-    """Yield a formula and all its sub-formulas, except the conditions of numbers (`if`, `ind`)."""
+    """Yield a formula and all its sub-formulas; the conditions in numbers (`if`, `ind`) are left out."""
     yield formula
     for part in operands(formula):
         yield from nodes(part)
@@ -188,7 +188,7 @@ def frozen_in(num: ir.Num) -> frozenset[str]:
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """Return a number as it is `steps` samples, and in addition the time `delay`, later.
+    """Return the value of a number later, by `steps` samples and in addition by the time `delay`.
 
     Outside the trace a `clamped` number repeats the first or last sample.
     """
@@ -245,7 +245,7 @@ def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
     """Return an operator such as `always@[a, b]` with its interval relative to now (`always[a, b]`).
 
-    At the first sample both are equal.
+    At the first sample both operators are equal.
     """
     return replace(node, interval=replace(node.interval, clock="now"))
 
@@ -266,8 +266,9 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
 
     Args:
         formula: typed formula.
-        augmented: whether the formula is for training. `Recalled` nodes, past operators rewritten with
-            timers, then are state formulas, and frozen values count as values of other instants.
+        augmented: whether the formula is for training. `Recalled` nodes, which are past operators rewritten
+            with timers, then count as state formulas; formulas with frozen values do not, as these come from
+            other instants.
     """
     state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
     elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)
@@ -279,13 +280,13 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
 
 
 def mentions_horizon(formula: typed.Formula) -> bool:
-    """True if a bound of a formula is written with `T`."""
+    """True if a bound of a formula is written with the planning horizon `T`."""
     timed = (node.interval for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
     return any(end is not None and end.horizons != 0 for each in timed for end in (each.lo, each.hi))
 
 
 def timer_form(formula: typed.Formula) -> typed.Formula:
-    """Return a state formula in which the test of its timers replaces each `Recalled` node.
+    """Return a state formula with each `Recalled` node replaced by the test of its timers.
 
     A `Recalled` node is a past operator rewritten with timers.
     """

@@ -83,9 +83,14 @@ class Truth(Node):
 class Predicate(Node):
     """Predicate `num > 0` (`strict`) or `num >= 0`.
 
-    A `guard` is a test of time: it decides truth and is never the margin of an enclosing formula. `num` and
-    the unit of its margin, `unit`, are in SI; `written` is the unit of the comparison in the source. For
-    recorded traces `num` and `unit` are converted to `written` (`stlc.compile.lowering.lower`).
+    Attributes:
+        num: the number compared with 0, in SI.
+        strict: whether the comparison is `>`.
+        guard: whether the predicate is on clocks and timers: it decides truth and is never the margin of an
+            enclosing formula.
+        unit: unit of the margin, in SI.
+        written: unit of the comparison in the source, to which `num` and `unit` are converted for recorded
+            traces (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num
@@ -149,7 +154,7 @@ class Shift(Node):
 
 @dataclass(frozen=True, slots=True)
 class Edge(Node):
-    """`rise(p)` or `fall(p)`: p has just become true or false; always false at the first sample."""
+    """`rise(p)` or `fall(p)`: true where p has just become true or false; false at the first sample."""
 
     op: Literal["rise", "fall"]
     body: Formula
@@ -167,12 +172,13 @@ class Freeze(Node):
 class Recalled(Node):
     """Past operator rewritten with timers (added states that hold the time since an event).
 
-    It stands under no negation.
+    The node stands under no negation.
 
     Attributes:
-        now: state formula equivalent at one instant: timers decide its truth, without a margin.
-        along: equivalent formula with a robustness, for any part of a trace at whose first sample the timers
-            are known.
+        now: state formula that is equivalent at one instant: tests of timers decide its truth, without a
+            margin.
+        along: equivalent formula with a robustness, for a plan or any other part of a trace; it reads the
+            timers at the first sample of that part only.
     """
 
     now: Formula
@@ -216,7 +222,7 @@ class Parameter:
     """Component of a `param`: a value drawn once for every trajectory and constant along it.
 
     Attributes:
-        span: place of its name.
+        span: source location of the name of the parameter.
         column: name, unit and range of the value.
         draw: distribution, a number that contains samplers such as `uniform`, in the unit of the column.
         text: text of the distribution in the source.

@@ -26,7 +26,7 @@ from stlc.units import Unit, same_dims
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
     """Return a requirement with margins in the units of the source.
 
-    If all its predicates have the same unit, `@scale` is converted to that unit too.
+    If all predicates of the requirement have the same unit, `@scale` is converted to that unit too.
     """
     unit = _one_unit(requirement.formula)
     scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
@@ -75,8 +75,8 @@ def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Form
     """Lower a typed formula to an IR formula in negation normal form, with time in steps.
 
     The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
-    has no such operator (`stlc.compile.augment`). Findings (E301, E302, E305, E311, W304) are appended to
-    `sink`; if it then holds an error, the formula must not be used.
+    has no such operator (`stlc.compile.augment`). Findings about intervals (`to_window`) are appended to
+    `sink`; if one of them is an error, the result must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 
@@ -135,7 +135,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
-        """Lower a temporal operator as the operator named `op`: its own, or the dual if it is negated."""
+        """Lower a temporal operator as the operator `op`: its own or, if it is negated, the dual."""
         if on_clock(node):
             return ir.AtStart(self._timed(from_now(node), op), node.span)
         parts = [self.formula(part) for part in operands(node)]
