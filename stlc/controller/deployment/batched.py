@@ -1,4 +1,7 @@
-"""The worlds of all seeds as one batch; an error in a world is reported with its source location."""
+"""Worlds (true environments) of all seeds of a deployment, simulated as one batch.
+
+An error in a world's code is reported with its location in the world's file.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +36,22 @@ SURPRISE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Options of a deployment: seeds, agents per seed, number of steps, replanning period.
+    """Options of a deployment.
 
-    An agent plans at once when a signal of role `env` has changed.
+    Regardless of the replanning period, an agent replans at once when an exogenous signal (role `env` in the
+    system file) has changed.
 
-    `limit`: seconds per agent for a decision of the full guard; None: no limit. `paper_limit`: the same for
-    the paper's guard. `ceiling`: number of visited states, over all seeds, for which a search looks for a
-    satisfying plan if the followed plan fails. `margin`: name of a safety requirement -> robustness margin by
-    which a plan must satisfy it to be accepted.
+    Attributes:
+        seeds: random seeds; each has a world of its own.
+        agents: number of agents per seed.
+        steps: number of steps.
+        replan: replanning period in steps.
+        limit: time limit of a decision of the guard "full", in seconds per agent; None: no limit.
+        ceiling: number of visited states, over all seeds, whose feasibility is determined; from a state whose
+            followed plan fails, a search looks for a satisfying plan.
+        margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
+            accepted by a guard.
+        paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.
     """
 
     seeds: tuple[int, ...]
@@ -54,13 +65,13 @@ class Setting:
 
 
 class Worlds:
-    """The worlds of all seeds as one batch; a row is one agent of one seed.
+    """Worlds (true environments) of all seeds as one batch; a row is one agent of one seed.
 
     Every world gets copies of states and actions, which it may modify.
 
     Raises:
-        SystemFileError: S207, a world fails; S302, it returns states that are not finite. Both have a
-            location in the world's file.
+        SystemFileError: S207, a method of a world raises an exception or returns a wrong type or shape; S302,
+            it returns states that are not finite. Both have a location in the world's file.
     """
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
@@ -78,14 +89,16 @@ class Worlds:
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
-        """Return the initial states, (rows, n), with random parameters and timers at their initial values.
+        """Return the initial states, (rows, n).
 
-        If the system accepts only initial states from which a plan is known (`test: {starts: …}`), the world
-        draws the other ones again; `redrawn` counts them.
+        Parameters of the specification are drawn at random; timers start at their initial values. If the
+        system accepts only initial states from which a plan is known (`test: {starts: …}`), the world redraws
+        the initial states from which none is known. Sets `redrawn`, the number of redrawn initial states.
 
         Raises:
             SystemFileError: S211, a world cannot redraw the initial state of an agent.
-            RunError: R405, no plan is known from any of the drawn initial states.
+            RunError: R405, after the maximum number of draws, an agent has no initial state from which a plan
+                is known.
         """
         given = []
         for world in self.worlds:
@@ -101,7 +114,12 @@ class Worlds:
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
-        """Initial states of a seed, (agents, n), drawn again until a plan is known from each of them."""
+        """Redraw initial states `x` of a seed, (agents, n), until a plan is known from each; return all.
+
+        Raises:
+            SystemFileError: S211, the world cannot redraw an initial state.
+            RunError: R405, no plan is known after the maximum number of draws.
+        """
         known = viable if self.task.system.decl.test.starts == "savable" else solvable
         good = known(self.task, x)
         for _ in range(REDRAWN):
@@ -123,9 +141,9 @@ class Worlds:
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """Advance all worlds by step number `step`: states (rows, n), actions (rows, m) -> (rows, n).
 
-        Parameters and timers are no part of a world's states: parameters stay as they are, and timers are
-        updated from the true states. Sets `eventless`, the mask of the rows without exogenous event, in which
-        the world moved exactly as the true dynamics.
+        A world's states contain neither the parameters nor the timers of the specification: parameters stay
+        constant, and timers are updated from the true states. Sets `eventless`, (rows,): True where no
+        exogenous event occurred, that is, the world's next state equals that of the true dynamics.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -141,7 +159,9 @@ class Worlds:
         return torch.cat((moved, self.system.added_later(x)), 1)
 
     def options(self, x: Tensor) -> Tensor | None:
-        """States under each option (an alternative, such as a goal, that the world offers to its agents).
+        """Return the states that the agents would have under each option.
+
+        An option is an alternative, such as a goal, among which a world lets its agents choose.
 
         Returns:
             (rows, k, n); None if the worlds offer no options.
@@ -165,7 +185,15 @@ class Worlds:
         return given.detach().to(torch.float64)
 
     def choose(self, pick: Tensor, x: Tensor) -> Tensor:
-        """States (rows, n) after every agent has taken the option with the index in `pick`, (rows,)."""
+        """Apply to every agent the option with the index in `pick`, (rows,), and return the new states.
+
+        Args:
+            pick: (rows,) int64.
+            x: states before the choice, (rows, n); only their parameters and timers are used.
+
+        Returns:
+            (rows, n).
+        """
         given = []
         for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):
             if isinstance(world, Choosing):
@@ -174,7 +202,11 @@ class Worlds:
         return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
 
     def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
-        """Concatenate the states that `method` of each world returned, (rows, n); all must be finite."""
+        """Concatenate the states `given`, which `method` of each world returned: (rows, n).
+
+        Raises:
+            SystemFileError: S207, states of a world have a wrong type or shape; S302, they are not finite.
+        """
         found = []
         for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
             x = states_of(world, method, each, self.size)
@@ -186,7 +218,7 @@ class Worlds:
     # ------------------------------------------------------------- reports of the worlds
 
     def progress(self) -> tuple[Mapping[str, float], ...]:
-        """Progress of the task for each seed."""
+        """Progress of the task (name -> number) in the world of each seed, in the order of the seeds."""
         found = []
         for world in self.worlds:
             with blamed(world, "progress", "say its progress"):
@@ -199,7 +231,7 @@ class Worlds:
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays from which a picture of the first seed is drawn; their shapes are the same at every step."""
+        """Arrays from which the first seed's world draws a picture; shapes are the same at every step."""
         world = self.worlds[0]
         with blamed(world, "snapshot", "give a snapshot"):
             given = world.snapshot()

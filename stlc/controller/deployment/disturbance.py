@@ -57,7 +57,7 @@ class Disturbance:
         self._spread = self._errors.sensor_noise * _ranges(system)
 
     def acted(self, action: Tensor) -> Tensor:
-        """Actuator outputs for (rows, m) commands at this step."""
+        """Actuator outputs, (rows, m), for commands (rows, m), with the scenario's actuator errors."""
         given = action
         if self._errors.actuator_gain:
             given = given * self._factor.to(given) + self._offset.to(given)
@@ -67,7 +67,7 @@ class Disturbance:
         return given
 
     def truths(self, truth: System) -> list[System]:
-        """True dynamics of each seed: the system `truth` with parameter errors that are drawn per seed."""
+        """True dynamics of each seed: `truth` with its constants changed by random parameter errors."""
         off = self._errors.parameters
         loose = perturbable(truth.decl) if off else None
         if loose is None or not loose.numbers:
@@ -76,32 +76,39 @@ class Disturbance:
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets of actuator errors, (rows, m) each; either sign is equally likely."""
+        """Factors and offsets of the actuator errors, (rows, m) each; their signs are random."""
         off, angle = self._errors.actuator_gain, self._angle
         signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
-        """Random signs, 1 or -1, (rows, count), drawn for each seed from its stream number `stream`."""
+        """Random signs, 1 or -1, (rows, count); those of a seed come from its random stream `stream`."""
         shape = (self._agents, count)
         drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
-        """Standard normal numbers, (rows, count), drawn for each seed from its stream number `stream`."""
+        """Standard normal numbers, (rows, count); those of a seed come from its random stream `stream`."""
         shape = (self._agents, count)
         streams = self._streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
 
     def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:
-        """Disturbed states, (rows, n), after a step that began in `before` at time `(step - 1) dt`."""
+        """Add the scenario's disturbance to the states `x`, (rows, n), in which step number `step` has ended.
+
+        The disturbance is evaluated in the states `before`, in which the step began, at time `(step - 1) dt`.
+        The result is clipped to the states' bounds (`clamp` in the system file).
+        """
         if not self._pushes:
             return x
         added = self._drawn(self._pushes, before, step - 1)
         return self._changed(x, {name: self._scale * value for name, value in added.items()}, clamped=True)
 
     def seen(self, x: Tensor, step: int) -> Tensor:
-        """Measured states, (rows, n); timers and other columns that the specification adds have no noise."""
+        """Measured states, (rows, n): `x` with the scenario's noise.
+
+        Timers and parameters that the specification adds to the state have no noise.
+        """
         seen = x
         if self._noises:
             seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
@@ -112,7 +119,10 @@ class Disturbance:
         return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
-        """Values of the assignments `drawings` by name, (rows,) each, with each seed's own generator."""
+        """Evaluate random assignments in the states `x` at step `step`: name -> values, (rows,).
+
+        Each seed draws from its own generator.
+        """
         parts = []
         for rows, generator in zip(torch.split(x, self._agents), self._generators, strict=True):
             table = dict(zip(self._names, rows.double().unbind(1), strict=False))
@@ -134,7 +144,10 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Errors of the system's scenario as shares, and the `numbers` of its dynamics that they change."""
+    """Nonzero errors of the system's scenario: name -> share.
+
+    If `parameters` is among them, the entry `numbers` lists the constants of the dynamics that it changes.
+    """
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
@@ -148,7 +161,10 @@ def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:
 
 
 def _ranges(system: System) -> Tensor:
-    """Width of the nominal range of each state, (n,); 0 for clocks and for discrete states."""
+    """Width of each state's nominal range, (n,).
+
+    It is 0 for a state in units of time, a discrete state, and a state without a range.
+    """
     widths = [
         column.high - column.low
         if column.kind == "real"
@@ -165,7 +181,7 @@ _CONDITION = "holds"
 
 
 class _Event:
-    """Exogenous event of a system file, compiled, with its condition at the previous step."""
+    """Compiled exogenous event of a system file; stores the truth of its condition at the previous step."""
 
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
@@ -174,7 +190,10 @@ class _Event:
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:
-        """Agents for which the event fires at this step, (agents,) booleans."""
+        """Mask of the agents for which the event occurs at this step, (agents,).
+
+        Stores the truth of the condition for the next step. `columns`: name of a state -> values, (agents,).
+        """
         like = next(iter(columns.values()))
         due = self.decl.at == step if self.decl.at is not None else True
         if self.decl.every is not None:
@@ -194,11 +213,11 @@ class _Event:
 
 
 class Events:
-    """The exogenous events of a deployment, with the previous conditions that edge triggers compare.
+    """The exogenous events of a deployment, and the truth of their conditions at the previous step.
 
     Args:
         declared: events in file order; later ones see the effects of earlier ones.
-        names: names of the state's columns.
+        names: names of the states.
         dt: time step in seconds.
     """
 

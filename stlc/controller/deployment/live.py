@@ -1,4 +1,4 @@
-"""Live monitor of a deployment: robustness margins, decision sources and decision times."""
+"""Live monitor of a deployment: robustness margins of the requirements, and sources of the followed plans."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class LiveMonitor:
-    """Online robustness margins of all agents, for the requirements that `stlc check` reports.
+    """Online monitor of all agents of a deployment, for the requirements that `stlc check` judges.
 
-    `push` is cheap; margins are computed when they are read.
+    `push` only stores the states; the robustness margins are computed when `margins` is read.
 
     Args:
         task: specification and system.
@@ -44,7 +44,7 @@ class LiveMonitor:
 
     @property
     def margins(self) -> dict[str, Margin]:
-        """Robustness margin of every requirement at the latest sample."""
+        """Bounds on the robustness of every requirement, given the samples up to the latest one."""
         return self._margins.evaluate()
 
     @property
@@ -61,7 +61,7 @@ class LiveMonitor:
         return f"{name} T0={t0}" if name == "backup" else name
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Records of the latest step, one per agent: the lines that `--robustness` writes."""
+        """Yield one record per agent for the latest step, as `stlc simulate --robustness` writes them."""
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):

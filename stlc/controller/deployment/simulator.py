@@ -1,4 +1,4 @@
-"""Closed-loop simulator: worlds advance seed by seed; decisions for all seeds are made in one batch."""
+"""Closed-loop simulator: one world per seed; all agents of all seeds decide in one batch."""
 
 from __future__ import annotations
 
@@ -27,23 +27,25 @@ Frame = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class DeploymentRecording:
-    """Trajectories of `agents` agents per seed; rows are ordered by seed, then by agent.
+    """Recorded deployment. A row is one agent of one seed; rows are ordered by seed, then by agent.
 
     Attributes:
         agents: number of agents per seed.
-        states: (rows, steps + 1, n).
-        actions: (rows, steps, m).
-        source: (rows, steps), index into `stlc.controller.guard.guard.SOURCES`.
+        states: true states, (rows, steps + 1, n).
+        actions: executed actions of the followed plans, (rows, steps, m).
+        source: (rows, steps), source of the followed plan, an index into
+            `stlc.controller.guard.candidates.SOURCES`.
         t0: (rows, steps), prefix length of the backup policy, 0 for the policy's own plan.
         rho: (rows, steps), robustness of the followed plan.
         policy_rho: (rows, steps), robustness of the policy's own plan.
-        safe: (rows, steps), whether the followed plan satisfies phi_safe.
+        safe: (rows, steps), whether the followed plan satisfies the requirements tagged `@safety`.
         progress: task progress of each seed.
         units: units of the entries of `progress`.
-        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents). For a world
-            that maps planned states into its picture also `rejected` and `taken`, float32 (frames, agents,
-            horizon + 1, 2 or 3): the policy plan that a guard replaced and the followed plan; NaN without
-            intervention.
+        scene: arrays for pictures of the first seed: the world's snapshots, stacked over time, and
+            `decision`, the source of each agent's plan, (frames, agents). If the world maps planned states to
+            picture coordinates, also `rejected`, the policy's plan that a guard replaced, and `taken`, the
+            plan followed instead: float32 (frames, agents, horizon + 1, 2 or 3), NaN where no plan was
+            replaced.
         eventless: (rows, steps), whether there was no exogenous event; None if not recorded.
         options: (rows, steps, k, n), states under the options (alternatives that a world offers to its
             agents); None if there are none.
@@ -75,7 +77,8 @@ class DeploymentRecording:
 class Recorder:
     """Recorder of a deployment that stores every step at once, so that a failure loses no earlier step.
 
-    `pictured`: whether the plans that a guard replaces are recorded for pictures.
+    `agents`: number of agents per seed. `pictured`: whether the plans that a guard replaces are recorded,
+    too, for pictures.
     """
 
     agents: int
@@ -92,18 +95,23 @@ class Recorder:
     redrawn: int = 0
 
     def start(self, x: Tensor, frame: Frame) -> None:
-        """Record the initial states `x` (rows, n), ordered by seed, then by agent."""
+        """Record the initial states `x`, (rows, n), ordered by seed, then by agent, and a picture frame."""
         self.states.append(x)
         self.frames.append(frame)
 
     def step(self, decision: GuardDecision, action: Tensor, x: Tensor, frame: Frame) -> None:
-        """Record one step: `action` (rows, m), and the next states `x` (rows, n)."""
+        """Record one step: decision, actions (rows, m), next states `x` (rows, n), and a picture frame."""
         self.decisions.append(decision)
         self.actions.append(action)
         self.start(x, frame)
 
     def chosen(self, x: Tensor, options: Tensor) -> None:
-        """Record the states under all options, (rows, k, n), and those under the chosen ones, (rows, n)."""
+        """Record a choice among options: the states under all options, and those under the chosen ones.
+
+        Args:
+            x: states under the chosen options, (rows, n); they replace the latest recorded states.
+            options: states under all options, (rows, k, n).
+        """
         self.states[-1] = x
         self.options.append(options)
 
@@ -164,7 +172,7 @@ Watch = Callable[[SimulationStep], None]
 
 
 class _Pilot:
-    """The agents' current plans and their ages in steps."""
+    """Decision logic of a simulation: the rows that replan at a step, their plans, and the plans' ages."""
 
     def __init__(self, guard: Guard, setting: Setting) -> None:
         self.guard, self.replan = guard, setting.replan
@@ -176,11 +184,12 @@ class _Pilot:
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
         """Indices of the rows (one per agent and seed) that replan at this step, (k,).
 
-        Every `replan` steps these are all rows; at other steps, those whose exogenous signals have changed
-        and, with the full guard, those whose remaining plan violates a safety requirement by the model. A
-        plan that ends before the next regular planning step is checked with its last action held. The last
-        sample of a plan is not checked, because `sweep` would extrapolate from it to states that were not
-        planned.
+        Every `replan` steps all rows replan. At other steps a row replans if an exogenous signal has changed
+        in its true state `x`, or if, with the guard "full", the rest of its plan violates a safety
+        requirement, as predicted by the model from the measured state `seen`. If a plan ends before the next
+        regular replanning, its last action is held in this prediction. The last sample of a plan is not
+        checked, because a `sweep` predicate, which covers the segment to the next sample, would extrapolate
+        beyond the plan.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -189,14 +198,21 @@ class _Pilot:
         return torch.nonzero((x != self.before)[:, self.exogenous].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
-        """Index of the option that each row takes, (rows,); 0, no change, for rows that do not replan."""
+        """Index of the option (alternative offered by the world) that each row takes, (rows,).
+
+        It is 0, which changes nothing, for the rows that do not replan. `options`: states under the options,
+        (rows, k, n). `due`: indices of the rows that replan, (k,).
+        """
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
             pick[due] = self.guard.prefer(options[due], self._previous(due, options[:, 0]))
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
-        """Return decisions and actions (rows, m); the rows in `due` replan from measured states `seen`."""
+        """Let the rows `due` replan from the measured states `seen`; return decision and actions (rows, m).
+
+        The other rows continue their plans. `x`: true states, (rows, n).
+        """
         if len(due):
             new = self.guard.decide(seen[due], self._previous(due, seen))
             whole = self.decision is None or len(due) == len(x)
@@ -210,8 +226,9 @@ class _Pilot:
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
         """Remainders of the previous plans of the rows in `due`, for the measured states `seen` (rows, n).
 
-        With `replan` > 1 the policy extends the plans at their ends: if the last action were held for that
-        many steps, the previous plan might violate the specification and would never be retained.
+        If `replan` > 1, the policy supplies the actions after the end of each plan. If instead the last
+        action were held for `replan` steps, the previous plan might violate the specification and would never
+        be retained. None at the first step.
         """
         if self.decision is None:
             return None
@@ -225,9 +242,10 @@ def simulate(
     """Simulate new worlds, one per seed, and record them in `recorder`; `watch` is called at every step.
 
     Raises:
-        SystemFileError: S207, a world fails; S211, it cannot redraw an initial state; S302, its states are
+        SystemFileError: S207, a method of a world raises an exception or returns a wrong type or shape; S211,
+            a world cannot redraw an initial state; S302, its states are not finite.
+        RunError: R405, for an agent, no initial state is drawn from which a plan is known; R402, an action is
             not finite.
-        RunError: R405, no plan is known from any drawn initial state; R402, an action is not finite.
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
@@ -260,9 +278,12 @@ def simulate(
 def _replaced(
     worlds: Worlds, guard: Guard, decision: GuardDecision, seen: Tensor, due: Tensor
 ) -> dict[str, NDArray[np.float32]] | None:
-    """Picture coordinates of the first seed's plans that a guard just replaced, and of the new ones.
+    """Picture coordinates of the first seed's plans that the guard replaced at this step.
 
-    None without a guard, and if the world does not map planned states to picture coordinates.
+    Returns:
+        `rejected`: the policy's plans, and `taken`: the plans followed instead, (agents, T + 1, 2 or 3) each;
+        NaN for agents whose plan was not replaced. None without a guard, and if the world does not map
+        planned states to picture coordinates.
     """
     if guard.backup is None or not worlds.charting:
         return None
@@ -281,7 +302,11 @@ def _replaced(
 
 
 def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None:
-    """Raise RunError (R402) where an action (rows, m) to be executed is not finite."""
+    """Check that the actions to be executed, (rows, m), are finite.
+
+    Raises:
+        RunError: R402, an action is not finite. The message contains the state of the first such row.
+    """
     broken = torch.nonzero(~torch.isfinite(action).all(1)).squeeze(1).tolist()
     if not broken:
         return

@@ -1,4 +1,4 @@
-"""Errors of a world as findings with a location in its file: S207, or S302 for non-finite states."""
+"""Errors of a world with a location in its file: S207 (wrong behaviour), S302 (non-finite states)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def blamed(world: object, method: str, what: str) -> Iterator[None]:
-    """Context in which an exception of `method` of a world or its class becomes S207: it cannot do `what`."""
+    """Context that converts an exception of a world's code into error S207: it cannot do `what`.
+
+    Args:
+        world: the world, or its class if the constructor is called.
+        method: name of the method that is called in the context.
+        what: verb phrase for the message.
+    """
     try:
         yield
     except StlcError:
@@ -46,7 +52,7 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
         The states, (agents, n) float64.
 
     Raises:
-        SystemFileError: S207, they are not.
+        SystemFileError: S207, `given` is not a tensor or has another shape.
     """
     if not isinstance(given, torch.Tensor):
         raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
@@ -57,9 +63,12 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
 
 
 def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str], when: str) -> None:
-    """Raise SystemFileError (S302) where states (agents, n) hold NaN or infinity.
+    """Check that the states `x`, (agents, n), which `method` of a world returned, are finite.
 
-    `names`: names of the columns. `when`: the instant as a text for the message.
+    `names`: names of the states. `when`: the instant as a text for the message.
+
+    Raises:
+        SystemFileError: S302, a state is NaN or infinite.
     """
     bad = ~torch.isfinite(x)
     if not bool(bad.any()):
@@ -70,10 +79,12 @@ def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str],
 
 
 def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
-    """Arrays of the snapshot `given`, checked to have the names and shapes of the snapshot `before`.
+    """Convert the snapshot `given` to arrays, and compare their names and shapes with the previous snapshot.
+
+    `before`: the previous snapshot; None for the first one.
 
     Raises:
-        SystemFileError: S207, they have not.
+        SystemFileError: S207, an array does not contain numbers, or names or shapes differ from `before`.
     """
     with blamed(world, "snapshot", "give a snapshot"):
         scene = {str(name): np.asarray(value) for name, value in given.items()}
@@ -90,7 +101,7 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
 
 
 def wrong(world: object, method: str, what: str) -> SystemFileError:
-    """Return error S207 for `method` of a world; `what` says which requirement it does not meet."""
+    """Return error S207 for `method` of a world; `what` completes the message "`method` of the world …"."""
     message = f"`{method}` of the world {what}"
     return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
 

@@ -32,12 +32,13 @@ if TYPE_CHECKING:
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
-    """Traces of all agents of all seeds, with the decisions about their plans.
+    """Trace file's content for a deployment: one trace per agent and seed, with the decisions about plans.
 
-    Extras of shape (traces, steps): `action.NAME` for every control; `decision` (0 policy, 1 backup, 2
-    safest, 3 polished); `t0`, prefix length of the backup; `plan_rho`, robustness of the followed plan;
-    `policy_rho`, robustness of the policy's plan; `foreseen`, 1 if the true step equals that of the model.
-    Extras of shape (traces,): `seed`, `agent`.
+    The trace has further arrays of shape (traces, steps): `action.NAME`, the actuator command, for every
+    control; `decision`, the source of the followed plan (0 policy, 1 backup, 2 safest, 3 polished); `t0`, its
+    prefix length if it is a plan of the backup policy; `plan_rho`, its robustness; `policy_rho`, robustness
+    of the policy's plan; `foreseen`, 1 if the true next state equals that of the model. Arrays of shape
+    (traces,): `seed`, `agent`.
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
@@ -62,7 +63,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Recorded actions as commands to the actuators, (rows, steps, m)."""
+    """Actuator commands, (rows, steps, m), that correspond to the recorded actions of plans."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -78,8 +79,8 @@ def save_trace_of(
 ) -> list[Path]:
     """Write the trace of a deployment into the run folder, and to the path `also`; return the paths.
 
-    `rules` (the specification of closed-loop runs) are stored in the trace, so that a later check uses the
-    same.
+    `rules`: specification of closed-loop runs; it is stored in the trace and used when the trace is checked
+    later.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -94,7 +95,9 @@ def save_trace_of(
 def save_unguarded(
     run: Run, recording: DeploymentRecording | None, setting: Setting, rules: Rules | None = None
 ) -> None:
-    """Write the first seed's trajectories without guard; None: remove those of an older deployment.
+    """Write the trace and the snapshots of the first seed of a deployment without guard into the run folder.
+
+    If `recording` is None, delete these files of an earlier deployment.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -140,17 +143,21 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Constants of a specification that the run, its scenario or the deployment changes: name -> text."""
+    """Constants of the specification text `spec` that are overridden for the run: name -> value as a text.
+
+    Overrides come from training, the scenario, or the command line of the deployment.
+    """
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()
     return {name: text for name, text in changed if name in own and name not in run.task.system.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
-    """Write snapshots, stacked over time, as `.npz`; arrays of Python objects are refused.
+    """Write snapshots, stacked over time, as `.npz`.
 
     Raises:
         MissingError: R201, the file cannot be written.
+        ValueError: an array contains Python objects.
     """
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **scene)

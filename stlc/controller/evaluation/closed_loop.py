@@ -6,7 +6,8 @@ from random seeds that neither training nor `stlc simulate` uses by default, and
 simulate` judges them.
 
 All guards are simulated from the same initial states. A more expensive guard is simulated only if a cheaper
-one leaves failures; the remaining time is spent on more runs of the guards that may still be the best.
+one leaves failures; what remains of the time limit is spent on more runs of the guards that may still be the
+best.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Share:
 
     @property
     def share(self) -> float:
-        """Share of runs that satisfy the mission."""
+        """Share of the runs that satisfy the mission."""
         return self.satisfied / self.runs
 
     @property
@@ -88,12 +89,15 @@ class Share:
         return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
-        """True if this share exceeds the other by more than `NEAR`, in few runs with high probability."""
+        """True if this share exceeds the other by more than `NEAR`.
+
+        With fewer than `LEAST` runs, this must hold with a probability of at least `SURE`.
+        """
         better = self.share > other.share + NEAR
         return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
     def summary(self) -> dict[str, object]:
-        """Entry for JSON documents."""
+        """The counts and shares under one guard as a JSON object."""
         safe = None if self.safe is None else self.safe / self.runs
         return {
             "guard": self.guard,
@@ -116,7 +120,7 @@ class ClosedLoop:
         shares: result of each simulated guard, the cheapest first; empty if no run was completed.
         steps: length of a run in steps.
         judge: name of the specification that judges the runs; None if it is that of the plans.
-        why: error message if no run was possible.
+        why: message of the error that prevented every run; empty if there was none.
     """
 
     shares: tuple[Share, ...]
@@ -126,7 +130,11 @@ class ClosedLoop:
 
     @property
     def recommended(self) -> Share | None:
-        """The cheapest guard about as good as the best; a guard with few runs must be clearly better."""
+        """The cheapest guard whose share of satisfying runs is at most `NEAR` below that of the best guard.
+
+        A more expensive guard with few runs is preferred only if it is better with high probability (see
+        `Share.better_than`). None if there are no runs.
+        """
         best: Share | None = None
         for share in self.shares:
             if best is None or share.better_than(best):
@@ -134,7 +142,7 @@ class ClosedLoop:
         return best
 
     def summary(self) -> dict[str, object]:
-        """Entry for JSON documents."""
+        """The recommended guard and the results of all guards as a JSON object."""
         best = self.recommended
         return {
             "recommended": None if best is None else best.guard,
@@ -149,7 +157,10 @@ class ClosedLoop:
 
 
 def _superiority(first: Share, second: Share, by: float) -> float:
-    """Probability that the first share exceeds the second by more than `by`, for uniform priors."""
+    """Probability that the true share of `first` exceeds that of `second` by more than `by`.
+
+    The prior distributions of both shares are uniform.
+    """
     grid = np.linspace(0.0, 1.0, 2001)
     mass = []
     for share in (first, second):
@@ -165,10 +176,15 @@ class _LateError(Exception):
 
 @dataclass(slots=True)
 class _Known:
-    """Known runs under one guard: (seed, agent) -> whether the mission, and whether safety, is satisfied.
+    """Results of the runs already simulated under one guard.
 
-    `cost`: measured seconds per seed; 0 before the first seed. `agents`: agents per seed. `given_up`: whether
-    simulating a seed takes too long.
+    Attributes:
+        agents: number of agents per seed in further simulations.
+        found: (seed, agent) -> whether the run satisfies the mission, and whether its safety requirements
+            (None if there are none).
+        seeds: number of simulated seeds.
+        cost: measured seconds per seed; 0 before the first seed.
+        given_up: whether the guard is simulated no more, because a seed takes too long.
     """
 
     agents: int
@@ -191,13 +207,13 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
 
     Args:
         run: trained run.
-        left: remaining seconds; simulation stops once it is 0.
+        left: function that returns the remaining seconds; simulation stops once they are 0.
         most: maximum number of runs of each guard.
         seed: first seed; further seeds are the integers after it.
 
     Returns:
-        The completed runs; `why` of the result says if the world fails, or if the rules do not fit the
-        system.
+        Results of the completed runs. If the world fails, or the rules (specification of closed-loop runs) do
+        not fit the system, there are none, and `why` contains the message.
     """
     test = run.task.system.decl.test
     try:
@@ -210,11 +226,11 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
 
 
 def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
-    """Simulate at least `runs` runs under one guard, without time limit, with `stlc simulate`'s seeds.
+    """Simulate at least `runs` runs under one guard, without time limit, from the seeds of `stlc simulate`.
 
     Raises:
-        SystemFileError: the world fails.
-        SpecError: the rules do not fit the system.
+        SystemFileError: a method of the world raises an exception or returns wrong values.
+        SpecError: the rules (specification of closed-loop runs) do not fit the system.
     """
     trial = _Trial(run, rules_of(run), lambda: 1e9, runs, seed)
     agents = trial.test.agents
@@ -236,12 +252,16 @@ class _Trial:
         self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
 
     def simulate(self) -> None:
-        """Simulate seeds until every share is known well enough or the time is over."""
+        """Simulate seeds until the time limit, or until all relevant shares are known precisely."""
         while (mode := self._next()) is not None:
             self._more(mode)
 
     def _next(self) -> Mode | None:
-        """Guard to simulate next: of those that may be the best, the one with the widest interval."""
+        """Guard to simulate next; None to stop.
+
+        First, each guard by increasing cost, up to one that satisfies all runs; then, of those whose share
+        may still be the best, the one with the widest confidence interval.
+        """
         if self.left() <= 0.0:
             return None
         for mode in GUARDS:
@@ -263,7 +283,11 @@ class _Trial:
         return None if wide[mode] <= 2.0 * NARROW else mode
 
     def _more(self, mode: Mode) -> None:
-        """Simulate further seeds under the guard `mode`: as many as before, if the time permits."""
+        """Simulate further seeds under the guard `mode` and store their results.
+
+        Their number is that of the seeds before (at least 1), reduced if the remaining time does not suffice.
+        If the first seed takes too long, the number of agents is reduced.
+        """
         known = self.known[mode]
         count = 1
         if known.seeds:
@@ -289,10 +313,10 @@ class _Trial:
         known.seeds += count
 
     def _simulated(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
-        """Simulate the seeds under the guard `mode` and return the recording.
+        """Simulate `seeds` with `agents` agents each under the guard `mode` and return the recording.
 
         Raises:
-            _LateError: this takes more than `share` of the remaining time.
+            _LateError: the simulation takes more than the share `share` of the remaining time.
         """
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
@@ -310,7 +334,10 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Masks of runs that satisfy the mission, and of those that satisfy its `@safety` requirements."""
+        """Masks of the runs that satisfy the mission, and of those that satisfy its safety requirements.
+
+        Both are (rows,). The second is None if no requirement is tagged `@safety`.
+        """
         rows = len(recording.states)
         if self.rules is None:
             executed = judge_executed(self.task, recording, viable=np.ones(rows, dtype=bool))
@@ -323,7 +350,7 @@ class _Trial:
         return obeying(found, rows), safe
 
     def shares(self) -> tuple[Share, ...]:
-        """Result per guard."""
+        """Counts of the runs under each simulated guard, the cheapest guard first."""
         free = self.known["none"].found
         shares = []
         for mode, known in self.known.items():

@@ -34,7 +34,7 @@ LATENCY_SECONDS = 5.0
 
 @dataclass(frozen=True, slots=True)
 class DecisionLatency:
-    """Seconds per decision for a single agent, over visited states."""
+    """Time of a decision for a single agent in seconds: median and 99 % quantile over visited states."""
 
     median: float
     p99: float
@@ -43,7 +43,13 @@ class DecisionLatency:
 
 @dataclass(frozen=True, slots=True)
 class Unsafe:
-    """Agent with an unsafe trajectory: position of its seed, its number, and whether it is viable."""
+    """Agent with an unsafe trajectory.
+
+    Attributes:
+        seed: index of its seed among the seeds of the deployment.
+        agent: index of the agent in its seed.
+        viable: whether a safe plan from its initial state is known.
+    """
 
     seed: int
     agent: int
@@ -55,16 +61,16 @@ class Deployment:
     """Results of one guard over all seeds.
 
     Attributes:
-        guard: name of the guard.
+        guard: name of the guard: "none", "paper" or "full".
         recording: trajectories and decisions.
         metrics: name -> mean over seeds with its confidence interval; see `metrics.METRICS`. Further entries:
             `holds.NAME`, the share of start instants at which requirement NAME holds, and the world's
             progress.
-        decisions: share of decisions by source; the backup's plans are counted by prefix length ("backup
-            T0=1").
+        decisions: source of the followed plan -> share of the decisions; "backup T0=1" counts the plans of
+            the backup policy with one prefix length.
         latency: time of one decision.
         unsafe: the agents with an unsafe trajectory.
-        runs: verdicts of the rules for closed-loop runs.
+        runs: verdicts on the closed-loop runs.
     """
 
     guard: Mode
@@ -77,7 +83,7 @@ class Deployment:
 
 
 class InterruptedDeploymentError(Exception):
-    """Error that ends a deployment early; it carries the recording of the steps before."""
+    """Error that ends a deployment early; `recording`: the steps before it, None if there are none."""
 
     def __init__(self, recording: DeploymentRecording | None) -> None:
         super().__init__("the deployment ended early")
@@ -95,7 +101,7 @@ def deploy(
 ) -> Deployment:
     """Simulate a policy in the world of its system under a guard; `watch` is called at every step.
 
-    `rules`: specification that judges the closed-loop runs.
+    `rules`: specification that judges the closed-loop runs; None: the specification of the plans does.
 
     Raises:
         InterruptedDeploymentError: the deployment ended early; `__cause__` is the SystemFileError or RunError
@@ -120,8 +126,12 @@ def judged(
 ) -> Deployment:
     """Evaluate a recorded deployment under a guard.
 
-    `ceiling`: number of states to search, see `feasible_states`. Without `rules`, a run is judged by the
-    specification of the plans from every start instant.
+    Args:
+        guard: the guard that was deployed; the latency of its decisions is measured.
+        recording: the recorded deployment.
+        ceiling: number of visited states whose feasibility is determined; see `feasible_states`.
+        rules: specification that judges the closed-loop runs. If None, the specification of the plans judges
+            them from every start instant.
     """
     executed = judge_executed(guard.task, recording)
     runs = (
