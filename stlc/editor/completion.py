@@ -1,7 +1,7 @@
-"""Completion at a cursor: words and names that the grammar accepts there.
+"""Proposals to complete the word at a cursor: the words and names that the grammar accepts there.
 
-The parser reads the declaration up to the cursor and returns the terminals that may follow. If it fails
-before the cursor, all names, functions and keywords are offered.
+The parser reads the declaration up to the cursor and returns the terminals that may follow. If it finds a
+syntax error before the cursor, all names, functions and keywords are proposed.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Offer:
         text: text inserted in place of the partial word.
         kind: kind of the symbol or word, such as `Keyword`.
         detail: one line shown beside the text.
-        doc: Markdown shown when the proposal is selected.
+        doc: description in Markdown, shown when the proposal is selected.
         order: sort key; proposals with smaller numbers come first.
     """
 
@@ -76,14 +76,14 @@ class Offer:
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """The proposals at a cursor, and the offset at which the partial word that they replace starts."""
+    """The proposals at a cursor, and the offset (`start`) of the partial word that a proposal replaces."""
 
     start: int
     offers: tuple[Offer, ...]
 
 
 def complete(document: Document, offset: int) -> Completion:
-    """Return the completion at `offset`; the text after the cursor is ignored."""
+    """Return the proposals for the cursor at `offset`; the text after the cursor is ignored."""
     text = document.source.text[:offset]
     if _SILENT.fullmatch(text[text.rfind("\n") + 1 :]):
         return Completion(offset, ())
@@ -109,13 +109,18 @@ def complete(document: Document, offset: int) -> Completion:
 
 
 def _piece_start(text: str) -> int:
-    """Return the offset at which the last declaration of a text starts."""
+    """Return the offset at which the last declaration of a text starts, to parse only that declaration."""
     starts = declaration_starts(text)
     return starts[bisect_right(starts, len(text)) - 1]
 
 
 def _units_at(piece: str, text: str) -> str | None:
-    """Return the part of a unit typed so far inside `[…]`; None if the cursor is not in a unit."""
+    """Return the part of a unit typed before the cursor inside `[…]`; None if the cursor is not in a unit.
+
+    Args:
+        piece: text of the declaration up to the word under the cursor.
+        text: text of the file up to the cursor.
+    """
     head, bracket, tail = piece.rpartition("[")
     written = _UNIT_PREFIX.search(text)
     assert written is not None
@@ -129,7 +134,10 @@ def _units_at(piece: str, text: str) -> str | None:
 
 
 def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
-    """Yield proposals for the terminals `accepted`, which the parser accepts next."""
+    """Yield proposals for the terminals `accepted`, one of which the parser accepts at the cursor.
+
+    `piece` is the text of the declaration up to the word under the cursor.
+    """
     yield from _keywords(accepted)
     if "UNIT" in accepted:
         yield from _units()
@@ -157,7 +165,7 @@ def _preferred() -> set[str]:
 
 
 def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
-    """Yield proposals for those accepted terminals that are keywords."""
+    """Yield proposals for the keywords among the terminals `accepted`."""
     for terminal in accepted:
         plain = terminal[1:].lower() if terminal.startswith("_") else ""
         for word in _TERMINALS.get(terminal, (plain,) if plain in _PLAIN_WORDS else ()):
@@ -165,7 +173,10 @@ def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:
-    """Yield proposals for the names in scope that can stand in an expression, the innermost scope first."""
+    """Yield proposals for the names that an expression at `offset` can contain.
+
+    Arguments and bound variables come first, then declared names, then built-in constants.
+    """
     for symbol in inside(document.spec, offset):
         yield Offer(own_name(symbol.name), "Reference", about(document, symbol), order=1)
     for symbol in document.names.values.values():
@@ -179,7 +190,11 @@ def _functions() -> Iterator[Offer]:
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
-    """Yield proposals where only a name can stand: types, or states not yet declared as signals."""
+    """Yield proposals at a place where no number can stand.
+
+    After a colon or arrow they are types; in a signal declaration they are the states of the system that are
+    not yet declared.
+    """
     words = [lexeme.text for lexeme in lexemes(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):
         yield from (Offer(name, "Class", text) for name, text in TYPES.items())
@@ -194,7 +209,7 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
 
 
 def _shared(document: Document, alias: str) -> Iterator[Offer]:
-    """Yield proposals for the text after `alias.`, the declarations of an imported module."""
+    """Yield proposals for the declarations of the imported module `alias`, which can follow `alias.`."""
     for module in document.modules:
         if module.alias == alias:
             for item in shared(module):

@@ -1,4 +1,4 @@
-"""Analysis of a specification that is open in an editor: findings, symbols, resolved names and formulas."""
+"""Analysis of a specification that is open in an editor: findings, symbols, and the meaning of names."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Finding:
     Attributes:
         diagnostic: the diagnostic as on the command line.
         span: location in the edited text.
-        mild: whether it prevents training but not monitoring.
+        mild: whether it is an error that prevents training but not monitoring; it is shown as a warning.
     """
 
     diagnostic: Diagnostic
@@ -64,9 +64,9 @@ class Document:
     Attributes:
         source: the text, with the path of its file.
         spec: syntax tree of the declarations without syntax errors.
-        unread: diagnostics of the declarations with syntax errors.
+        unread: errors of the declarations that could not be parsed.
         system: declaration of the system that the text names, or None.
-        missing: diagnostics of that system if it cannot be loaded.
+        missing: errors because of which the system could not be loaded; empty if it was loaded.
     """
 
     source: Source
@@ -82,7 +82,7 @@ class Document:
 
     @property
     def grid(self) -> Grid:
-        """Time step and horizon of the system; both None without a system."""
+        """Time step (s) and horizon (steps) of the system; both are None without a system."""
         return Grid() if self.system is None else Grid(self.system.dt, self.system.horizon)
 
     @cached_property
@@ -101,7 +101,7 @@ class Document:
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings of `stlc lint`, in text order."""
+        """Findings of `stlc lint`, and errors of the system file, in text order."""
         found = [self._about_system(self.missing)] if self.missing else []
         within = None if self.system is None else Surroundings(self.system.interface(), self.grid)
         linted = self.unread or lint(self.source, within=within)
@@ -111,7 +111,11 @@ class Document:
         return tuple(sorted(found, key=lambda one: one.span.start))
 
     def _place(self, finding: Diagnostic) -> Finding:
-        """Locate a diagnostic in this text; one in another file is placed where this text names that file."""
+        """Locate a diagnostic in this text.
+
+        A diagnostic of another file is placed where this text names the system, else at the start of the
+        text.
+        """
         span = finding.span
         if span is not None and span.source.name == self.source.name:
             return Finding(finding, self.source.span(span.start, span.end))
@@ -179,7 +183,7 @@ _INK = re.compile(r"[^\r\n]")
 def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
     """Parse a text; return the tree of all declarations without syntax errors, and diagnostics of the others.
 
-    Source locations in the tree refer to `source`, or to a text of the same length with blanks.
+    Source locations in the tree are valid for `source`: declarations with errors are blanked, not cut out.
     """
     try:
         return parse(source), ()
@@ -222,14 +226,15 @@ _OUTWARD = ("always", "historically", "release")
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The part of a specification that can be resolved.
+    """Result of resolving names in a specification, as far as that is possible despite errors.
 
     Attributes:
         scope: table of the names in the file.
         columns: name of a declared signal or parameter -> its scalar columns, with unit and range.
-        formulas: requirements, assumptions, and definitions without arguments that are formulas, by name.
-        grid: time step and horizon of the system; both None without a system.
-        interface: what the specification can refer to in the system, or None.
+        formulas: name of a requirement, of an assumption or of a definition without arguments -> its formula.
+        grid: time step (s) and horizon (steps) of the system; both are None without a system.
+        interface: states, parameters and functions of the system, to which the specification can refer, or
+            None.
     """
 
     scope: Scope
@@ -239,7 +244,7 @@ class Meaning:
     interface: Interface | None = field(default=None, repr=False)
 
     def value(self, name: str) -> Value | None:
-        """Return the value of a signal, constant, region or definition without arguments, or None."""
+        """Return the value of a signal, constant, region or definition without arguments, else None."""
         entry = self.scope.entries.get(name)
         if isinstance(entry, Known):
             return entry.value
@@ -252,7 +257,10 @@ class Meaning:
             return None
 
     def steps(self, name: str) -> int | None:
-        """Return how many steps ahead a formula reads; None if the time step is unknown."""
+        """Return the lookahead of a formula: how many samples after its instant its value requires.
+
+        It is None if there is no formula of that name, or if the time step is unknown.
+        """
         formula = self.formulas.get(name)
         if formula is None:
             return None
@@ -263,9 +271,10 @@ class Meaning:
         return reach(simplify(lowered)).future
 
     def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
-        """Return the interval of a temporal operator written at `span`.
+        """Return the interval of the temporal operator that is written at `span`, and its window in steps.
 
-        With it comes its window in steps; None if the time step is unknown.
+        The window is None if the time step is unknown; the result is None if no such operator could be
+        resolved.
         """
         for formula in self.formulas.values():
             for node in nodes(formula):
@@ -282,9 +291,9 @@ class Meaning:
 def understand(
     spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
 ) -> Meaning:
-    """Resolve as much of a specification as possible.
+    """Resolve the names of a specification as far as possible.
 
-    Errors are not reported here, as the compiler reports them.
+    Errors are skipped without a message, because the compiler reports them.
     """
     scope = Scope(temporal=True, time_unit=spec.time_unit)
     file = declared(spec, modules, interface, {}, scope)
@@ -303,7 +312,10 @@ def _ranged(
 
 
 def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
-    """Return the formulas of a specification by name; a requirement hides a definition of the same name."""
+    """Return the formulas of a specification by name.
+
+    If a requirement and a definition have the same name, it is the formula of the requirement.
+    """
     found: dict[str, typed.Formula] = {}
     for item in spec.items:
         if isinstance(item, ast.Def):
@@ -324,10 +336,10 @@ def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
 
 @dataclass(frozen=True, slots=True)
 class Borrowed:
-    """A use of an imported name, `module.name`: the part after the dot.
+    """A place in the text that names a declaration of an imported module, as `module.name`.
 
     Attributes:
-        span: location of that part in the text.
+        span: location of the part after the dot.
         module: the imported module.
         item: declaration of the name in the module; None if the module has no such name.
     """
@@ -363,10 +375,11 @@ def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Bor
 
 
 def definition(document: Document, offset: int) -> tuple[Span, ...]:
-    """Return the source locations that "go to definition" leads to from the cursor.
+    """Return the source locations to which "go to definition" leads from the cursor at `offset`.
 
-    A name leads to its declaration; the declaration of a signal, parameter or constant to its entry in the
-    system file; `system "file"` to that file; and `module.name` to the declaration in the module.
+    A name leads to its declaration; a declared signal, parameter or constant to its entry in the system file;
+    `system "file"` to that file; and `module.name` to the declaration in the module. The result is empty if
+    the cursor is at none of these.
     """
     place = document.spec.system_span
     if place is not None and place.start <= offset <= place.end:
@@ -393,7 +406,7 @@ def system_place(document: Document, symbol: Symbol) -> Span | None:
 
 
 def outline(document: Document) -> tuple[tuple[Symbol, Span], ...]:
-    """Return the declarations of a file in order, each with the source location of its whole text."""
+    """Return the declarations of a file in order, as pairs (symbol, location of the whole declaration)."""
     names = document.names
     found = [
         (one.symbol, one.symbol.item.span)

@@ -27,7 +27,7 @@ _ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
 
 
 def hover(document: Document, offset: int) -> tuple[Span, str] | None:
-    """Return the source location of the word under the cursor and its hover text in Markdown, or None."""
+    """Return (location, hover text in Markdown) for the word under the cursor; None without such a text."""
     found = document.names.at(offset)
     if found is not None:
         return found.span, about(document, found.symbol)
@@ -45,9 +45,9 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
 
 
 def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
-    """Return the lexeme (word, number or sign) at an offset, and the text of the lexeme before it.
+    """Return the lexeme (word, number or sign) at an offset, and the text of the lexeme before it, or "".
 
-    Between two adjacent lexemes, a word or number takes precedence over a sign.
+    At the boundary of two lexemes, a word or number takes precedence over a sign.
     """
     found, before, last = None, "", ""
     for lexeme in lexemes(text):
@@ -64,7 +64,10 @@ def _is_temporal(lexeme: Lexeme) -> bool:
 
 
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
-    """Return the source location from the word under the cursor to the end of the operator's interval."""
+    """Return the source location that the hover text of a temporal operator refers to.
+
+    It extends from the word under the cursor to the end of the operator's interval, if that is written.
+    """
     word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
     if node.interval is None:
         return document.source.span(*word)
@@ -101,7 +104,7 @@ def duration(steps: int, grid: Grid) -> str:
 
 
 def about(document: Document, symbol: Symbol) -> str:
-    """Return the hover text of a symbol: its declaration, its `##` comment, and a summary."""
+    """Return the hover text of a symbol: its declaration, its sort, unit and range, and its `##` comment."""
     item = symbol.item
     parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
@@ -111,7 +114,7 @@ def about(document: Document, symbol: Symbol) -> str:
 
 
 def _code(item: ast.Item) -> str:
-    """Return a declaration as a fenced Markdown code block, which back quotes in names cannot end."""
+    """Return a declaration as a fenced Markdown code block; back quotes in names do not end the block."""
     return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
 
 
@@ -248,7 +251,7 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
 
 
 def _seconds(time: typed.Time, grid: Grid) -> str:
-    """Return a bound of an interval in seconds, exactly."""
+    """Return an end of an interval as text in seconds; "" if the time step or horizon needed is unknown."""
     if grid.dt is None or (time.horizons and grid.horizon is None):
         return ""
     seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))

@@ -1,4 +1,4 @@
-"""Renaming of a symbol at all its occurrences, so that every other name keeps its meaning."""
+"""Renaming of a symbol at all places where it is named; the meaning of all other names is unchanged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAME = re.compile(r"[^\W\d]\w*")
 
 
 class RenameError(Exception):
-    """Raised, with the reason, if a name cannot be changed."""
+    """Error: a symbol cannot be renamed, for the reason in the message."""
 
 
 _FROM_ELSEWHERE = ("module", "extern", "param")
@@ -26,7 +26,10 @@ _FROM_ELSEWHERE = ("module", "extern", "param")
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """Return the occurrence at `offset` if its symbol can be renamed, else None."""
+    """Return the symbol at `offset` and its place, if the symbol can be renamed; else None.
+
+    Imported modules, external functions and parameters cannot, because other files may refer to them by name.
+    """
     found = document.names.at(offset)
     return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
 
@@ -61,7 +64,10 @@ def _line(document: Document) -> int:
 
 
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
-    """Return the edit that adds `from "old"` to a renamed signal's declaration; none for other symbols."""
+    """Return the edit that adds `from "old"` to the declaration of a renamed signal; [] for other symbols.
+
+    Raises RenameError if the signal shares its declaration with others.
+    """
     if not isinstance(item, ast.Signal) or item.column is not None:
         return []
     together = [other.name for other in document.spec.items if other.span == item.span]
@@ -83,11 +89,14 @@ def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> Non
 
 
 def _bindings(names: SymbolNames) -> list[int]:
-    """Return, for every occurrence in text order, the index of the first one of the same symbol."""
+    """Return, for every occurrence of a symbol, the index of the first occurrence of the same symbol.
+
+    Two texts with equal results name the same symbols at the same places.
+    """
     first: dict[Span, int] = {}
     return [first.setdefault(one.symbol.span, index) for index, one in enumerate(names.occurrences)]
 
 
 def _declared(names: SymbolNames) -> tuple[int, int, int]:
-    """Count the distinct declared values, types and rules."""
+    """Return the numbers of distinct names of values, of types, and of requirements or assumptions."""
     return len(names.values), len(names.types), len(names.rules)

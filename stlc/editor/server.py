@@ -1,4 +1,4 @@
-"""The language server: requests of an editor, answered from `Document`."""
+"""The language server: answers requests of an editor from the analysis of the open text (`Document`)."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _BREAK = re.compile(r"\r\n|\r|\n")
 class Layout:
     """Conversion between offsets in a text and positions (line, column) of the language server protocol.
 
-    A position beyond the end of a line or of the text means that end. Lines end at CR, LF or CRLF, as the
-    protocol says; the library pygls also ends them at Unicode separators.
+    A position beyond the end of a line or of the text is converted to that end. Lines end at CR, LF or CRLF,
+    as the protocol says; the library pygls also ends them at Unicode separators.
     """
 
     def __init__(self, text: str, codec: PositionCodec) -> None:
-        """Find the lines of `text`; `codec` counts columns in the encoding that the editor uses."""
+        """Find the lines of `text`; `codec` counts columns in units of the encoding that the editor uses."""
         breaks = list(_BREAK.finditer(text))
         self.text = text
         self._units = codec.client_num_units
@@ -47,7 +47,10 @@ class Layout:
         return lsp.Position(row, self._units(self.text[self._starts[row] : min(offset, self._ends[row])]))
 
     def offset(self, place: lsp.Position) -> int:
-        """Return the offset of a position; one within a multi-unit character means its start."""
+        """Return the offset of the character at a position, also if the position lies within the character.
+
+        In UTF-16, for instance, some characters count as two columns.
+        """
         if place.line >= len(self._starts):
             return len(self.text)
         left = place.character
@@ -59,7 +62,7 @@ class Layout:
 
 
 class Server(LanguageServer):
-    """Language server; it holds all open specifications and analyses each once per change."""
+    """Language server that stores an analysis of every open specification, made anew after each change."""
 
     def __init__(self) -> None:
         super().__init__("stlc", __version__, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)
@@ -95,19 +98,19 @@ class Server(LanguageServer):
         return Layout(document.source.text, self.workspace.position_codec).offset(position)
 
     def range(self, span: Span) -> lsp.Range:
-        """Convert a source location to an LSP range."""
+        """Convert a source location to a range (start and end) of the language server protocol (LSP)."""
         layout = Layout(span.source.text, self.workspace.position_codec)
         return lsp.Range(layout.place(span.start), layout.place(span.end))
 
     def location(self, span: Span) -> lsp.Location:
-        """Convert a source location to an LSP location; an unsaved text keeps its URI."""
+        """Convert a source location to an LSP location (URI and range); an unsaved text keeps its URI."""
         name = span.source.name
         if "://" not in name and not name.startswith("untitled:"):
             name = uris.from_fs_path(str(Path(name).resolve())) or name
         return lsp.Location(name, self.range(span))
 
     def diagnostic(self, finding: Finding) -> lsp.Diagnostic:
-        """Convert a finding to an LSP diagnostic, with its secondary locations and advice."""
+        """Convert a finding to an LSP diagnostic, with its advice and its further locations in the text."""
         inner = finding.diagnostic
         warns = finding.mild or inner.severity == "warning"
         return lsp.Diagnostic(
@@ -124,7 +127,7 @@ class Server(LanguageServer):
 
 
 def _lines(finding: Diagnostic) -> list[str]:
-    """Return the message and advice of a diagnostic, line by line."""
+    """Return the lines of a diagnostic's text: its message, then advice and notes."""
     head = f"{finding.message}: {finding.label}" if finding.label else finding.message
     advice = [f"help: {line}" for line in finding.help]
     fix = [] if finding.fix is None or not finding.fix.text else [f"fix: {finding.fix.text}"]
@@ -255,7 +258,7 @@ def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[ls
 
 
 def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeAction]:
-    """Return the automatic repairs of the findings in a range, as LSP code actions."""
+    """Return the automatic repairs of the findings in a range of the text, as LSP code actions."""
     document = server.document(params)
     first, last = (server.offset(document, place) for place in (params.range.start, params.range.end))
     actions = []

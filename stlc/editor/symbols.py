@@ -35,13 +35,13 @@ def _kind(item: ast.Item) -> Kind:
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A declared name of a specification, or one bound by a quantifier or argument list.
+    """A name that a specification declares, or that a quantifier, `freeze` or an argument list binds.
 
     Attributes:
         name: the name without backticks.
         kind: kind of the declaration, such as `signal`.
         span: source location of the name in its declaration.
-        item: the declaration, or the one that contains it; None for an imported module and for a variable.
+        item: the declaration that declares or contains the name; None for an imported module or a variable.
     """
 
     name: str
@@ -117,7 +117,7 @@ def names_of(spec: ast.Spec) -> SymbolNames:
 
 
 def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
-    """Return the arguments and bound variables that are in scope at `offset`, the innermost last."""
+    """Return the arguments and bound variables in scope at `offset`, those of outer expressions first."""
     found: list[Symbol] = []
     for item in spec.items:
         if item.span.start <= offset <= item.span.end:
@@ -139,14 +139,14 @@ def _symbol(lexeme: Lexeme, kind: Kind, near: Span, item: ast.Item | None = None
 
 
 def _words(span: Span, start: int | None = None, end: int | None = None) -> list[Lexeme]:
-    """Return the words in a part of a text, from `start` to `end` (by default the whole span)."""
+    """Return the words in a source location, or in the part of it from offset `start` to offset `end`."""
     first = span.start if start is None else start
     last = span.end if end is None else end
     return [one for one in lexemes(span.source.text, first, last) if one.kind in ("word", "quoted")]
 
 
 def _module(module: ast.Import) -> Symbol:
-    """Return the symbol of an imported module: its alias, or else its file name."""
+    """Return the symbol of an imported module, whose name is its alias, or else its file name."""
     words = _words(module.span)
     if module.alias is None and module.is_file:
         name = module.target.replace("\\", "/").rpartition("/")[2].removesuffix(".stl").removesuffix(".stlc")
@@ -212,7 +212,10 @@ def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
 
 
 def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
-    """Yield the occurrences of symbols within a part of a declaration; built-in names are left out."""
+    """Yield the occurrences of symbols in a part of a declaration; built-in names are left out.
+
+    `scope` maps the names that can be used there to their symbols.
+    """
     match node:
         case ast.Name(span, name, quoted):
             if name in scope and (quoted or name not in ("T", "end", "dt")):

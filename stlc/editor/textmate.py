@@ -74,7 +74,11 @@ _COMMENT = r"(?:#|//).*$"
 
 
 def _declarations() -> list[dict[str, Any]]:
-    """Patterns for keyword and name of a declaration; requirements have a TextMate scope of their own."""
+    """Patterns for the keyword and the name of a declaration.
+
+    The names of requirements and assumptions get a different TextMate scope (class for colouring) than
+    others.
+    """
     rules = ("require", "assume")
     callables = ("def", "region", "enum")
     rest = [word for word in DECLARATIONS if word not in (*rules, *callables, "extern", "import")]
@@ -95,7 +99,10 @@ def _declarations() -> list[dict[str, Any]]:
 
 
 def _pragmas() -> list[dict[str, Any]]:
-    """Patterns for `spec name`, `system "file"` and `time s`: keywords only at the start of a line."""
+    """Patterns for the lines `spec name`, `system "file"` and `time s`.
+
+    Their first words are keywords only at the start of a line.
+    """
     head = rf"^\s*({_any(PRAGMAS)})\s+"
     return [
         _captures(rf"{head}({_NAME})", {"1": "keyword.control.pragma", "2": "entity.name.type"}),

@@ -1,1 +1,1 @@
-"""Linter: findings in valid specifications, such as unclear, unused or unusual parts."""
+"""Linter of specifications: errors, and warnings about unclear, unused or unusual parts."""

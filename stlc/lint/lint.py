@@ -24,7 +24,7 @@ ROUNDS = 20
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """Result of automatic repairs.
+    """Text after automatic repairs, and the findings that remain.
 
     Attributes:
         source: the text after the repairs.
@@ -38,9 +38,10 @@ class Fixed:
 
 
 def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
-    """Repair a text in rounds until no finding with an automatic repair remains.
+    """Repair a text in rounds until no finding with an automatic repair remains; return the repaired text.
 
-    A round that would introduce new errors is undone. Of overlapping repairs, one is left to the next round.
+    In a round all repairs that do not overlap are applied; of two overlapping ones, the second waits for the
+    next round. A round that would introduce new errors is undone and ends the repairs.
 
     Args:
         source: the text.
@@ -79,7 +80,7 @@ def _apart(repairs: Iterable[Fix]) -> list[Fix]:
 
 
 def edited(text: str, edits: Iterable[Edit]) -> str:
-    """Apply non-overlapping edits to a text."""
+    """Return the text after non-overlapping edits, pairs of a source location and its replacement."""
     for start, end, new in sorted(((span.start, span.end, new) for span, new in edits), reverse=True):
         text = text[:start] + new + text[end:]
     return text
@@ -90,8 +91,9 @@ class Selection:
     """Choice of the warnings to report; errors are always reported.
 
     Attributes:
-        select: prefixes of the codes to report; empty for those active by default, "ALL" for every code.
-        ignore: prefixes of the codes not to report; takes precedence over `select`.
+        select: codes to report, or their beginnings, such as "W1"; "ALL" for every code. If it is empty, the
+            warnings active by default are reported.
+        ignore: codes not to report, or their beginnings; it takes precedence over `select`.
     """
 
     select: tuple[str, ...] = ()
@@ -117,7 +119,10 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The system (interface, time grid) and the purpose that a specification is linted for."""
+    """The system for which a specification is linted: its interface and time grid, and the purpose.
+
+    The purpose states what the specification is compiled for, such as "train".
+    """
 
     interface: Interface
     grid: Grid
@@ -150,7 +155,7 @@ def lint(
 
 
 def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
-    """Return the findings of the compiler."""
+    """Return the findings of the compiler; without a system only names, types and units are checked."""
     warnings: list[Diagnostic] = []
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
@@ -162,6 +167,6 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
-    """Sort key of a finding: those in the text itself come first, by position, then those in other files."""
+    """Return a sort key: findings in the text `source` come first, by position, then those in other files."""
     own = finding.span is not None and finding.span.source is source
     return not own, finding.span.start if own and finding.span else 0

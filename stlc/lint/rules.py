@@ -80,7 +80,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """Return the spelling in this language of another tool's word or sign; None to keep it."""
+    """Return the spelling of another tool's word or sign in this language; None to keep the lexeme."""
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":
@@ -91,7 +91,7 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if the word that replaces a sign would run into the word or number after it."""
+    """True if the word that replaces a sign would form one word with the word or number after it."""
     return following.start == item.end and following.kind in ("word", "number")
 
 
@@ -154,7 +154,7 @@ Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 
 @dataclass(frozen=True, slots=True)
 class LintRule:
-    """A lint rule.
+    """A lint rule: a check of the syntax tree that yields warnings of one code.
 
     Attributes:
         check: function that returns the findings in a specification without syntax errors.

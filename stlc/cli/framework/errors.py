@@ -28,13 +28,16 @@ _EXTRAS |= {"pygls": "lsp", "lsprotocol": "lsp"}
 
 
 class BugError(StlcError):
-    """An internal error; see the crash report."""
+    """An internal error of stlc; a crash report is written for it."""
 
     exit_code = INTERNAL_ERROR
 
 
 def report(error: BaseException, argv: Sequence[str]) -> int:
-    """Report `error` to the user and return its exit code."""
+    """Print an error as a message or as a JSON document, and return the exit code of the program.
+
+    An error that stlc does not know is reported as a bug, with a crash report. A closed pipe gives 0.
+    """
     match error:
         case SystemExit() if isinstance(error.__context__, BrokenPipeError):
             return 0  # the reader closed the pipe
@@ -55,7 +58,7 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
 
 
 def _stopped(code: int, argv: Sequence[str]) -> int:
-    """Exit of an interrupted command: no message, but a JSON document if one was requested."""
+    """Return the exit code of a stopped command; print a JSON document if one was requested, else nothing."""
     if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
         emit_json(_schema(argv), ok=False, exit_code=code)
     return code
@@ -69,14 +72,20 @@ def wants_json(argv: Sequence[str]) -> bool:
 
 
 def _schema(argv: Sequence[str]) -> str:
-    """Name of the command's schema; `stlc/1`, the frame without a result, if it has none."""
+    """Name of the JSON Schema of a command's output, such as `check/1`.
+
+    A command without a result has `stlc/1`, the schema of the keys that all commands share.
+    """
     from stlc.cli.framework.documents import RESULTS
 
     return f"{argv[0]}/1" if argv and argv[0] in RESULTS else "stlc/1"
 
 
 def _known(error: BaseException) -> StlcError | None:
-    """`error` as an StlcError; None if it is an internal error."""
+    """Return the StlcError that describes an error of another library or of the system.
+
+    An StlcError is returned unchanged. None means that the error is a bug of stlc.
+    """
     match error:
         case StlcError():
             return error
@@ -108,7 +117,10 @@ def _missing_package(name: str) -> StlcError:
 
 
 def _usage(error: BaseException) -> Diagnostic:
-    """The diagnostic of a typer error. Its error classes are not public, their methods are."""
+    """Return the diagnostic U101 for an error in the command line that typer reports.
+
+    The error classes of typer are not public, so the error is recognised by its methods.
+    """
     message = str(error.format_message()).strip().rstrip(".")  # type: ignore[attr-defined]
     message = message.replace(": Value error, ", ": ")  # pydantic's prefix of messages of validators
     context = getattr(error, "ctx", None)

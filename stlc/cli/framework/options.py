@@ -81,7 +81,7 @@ PlannerOptionsOption = Annotated[
 
 
 def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> PlannerChoice:
-    """The planner of `--method`, with `--option` and `--budget`. Raises UsageError (U101)."""
+    """Planner named by `--method`, with the values of `--option` and `--budget`. Raises UsageError (U101)."""
     from stlc.controller.training.config import PlannerChoice
 
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")
@@ -98,7 +98,9 @@ def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
 
 
 def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: str) -> dict[str, str]:
-    """Parse the values of a repeated option: name before `=` -> text after it.
+    """Parse the values `NAME=VALUE` of a repeated option into a mapping NAME -> VALUE.
+
+    `option`, `form` and `example` are named in error messages.
 
     Raises:
         UsageError: U101, a value is not of the form, or a name is given twice.
@@ -119,10 +121,10 @@ STDIN = "-"
 
 
 def spec_files(names: Sequence[str]) -> tuple[str, ...]:
-    """The specification files, in order and without duplicates; a folder stands for all files below it.
+    """Paths of specification files, in order and without duplicates; a folder stands for all files below it.
 
     Raises:
-        UsageError: U102, a folder without a specification; U101, nothing is named.
+        UsageError: U102, a folder contains no specification; U101, `names` is empty.
     """
     if not names:
         raise usage("which file?", "a .stl file, a folder, or - for a pipe")
@@ -143,7 +145,7 @@ def _below(name: str) -> Iterator[str]:
 
 
 def _shown(path: Path, folder: Path) -> bool:
-    """True if no folder or file name in the path below `folder` begins with a dot."""
+    """True if no file or folder name on the way from `folder` to `path` begins with a dot."""
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
@@ -154,10 +156,10 @@ _RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")
 
 
 def parse_seconds(text: str) -> float:
-    """A duration such as `60s`, `5min`, `1.5 h`, in seconds; a bare number is seconds.
+    """Parse a duration such as `60s`, `5min` or `1.5 h`; return it in seconds. A bare number is in seconds.
 
     Raises:
-        UsageError: U101, it is not a duration.
+        UsageError: U101, the text is not a duration.
     """
     from stlc.units import parse_unit
 
@@ -193,10 +195,10 @@ def parse_clock(text: str) -> Clock:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds such as `0..2`, `3`, or `0..2,7`, in that order, without duplicates.
+    """Parse a list of seeds such as `0..2`, `3` or `0..2,7`; return them in order, without duplicates.
 
     Raises:
-        UsageError: U101, it is not such a list.
+        UsageError: U101, the text is not such a list.
     """
     seeds: dict[int, None] = {}
     for part in text.split(","):

@@ -38,14 +38,18 @@ QUIET: ContextVar[bool] = ContextVar("stlc_quiet", default=False)
 def emit(text: str, *, styled: bool = False) -> None:
     """Write `text` and a line break to the standard output.
 
-    Control characters other than line breaks and tabs are replaced on a terminal. A `styled` text may contain
-    colour codes; the caller has made names from files in it harmless with `stlc.escape.visible`.
+    On a terminal, control characters other than line breaks and tabs are replaced. A `styled` text may
+    contain colour codes; then its caller must have applied `stlc.escape.visible` to all names that come from
+    files.
     """
     _write(sys.stdout, screen(text, styled=styled))
 
 
 def say(text: str, *, styled: bool = False) -> None:
-    """Write a line to the standard error; a `styled` text may have several, with colours, as for `emit`."""
+    """Write a line to the standard error, unless `--quiet` was given.
+
+    A `styled` text may consist of several lines and contain colour codes, as in `emit`.
+    """
     if not QUIET.get():
         _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
 
@@ -62,10 +66,10 @@ def emit_json(
 
     Args:
         schema: name and major number, such as "check/1".
-        ok: whether the answer is yes.
+        ok: whether the command succeeded and its answer is positive, such as "satisfied".
         exit_code: exit code of the command.
         diagnostics: errors and warnings.
-        result: record of the command; non-finite numbers become texts.
+        result: record of the command; numbers that are not finite are written as texts.
     """
     from stlc.cli.framework.render import to_json
     from stlc.version import __version__
@@ -87,7 +91,7 @@ class Answer(Generic[R]):
 
     Attributes:
         result: record printed with `--json`.
-        show: function that prints the text.
+        show: function that prints the outcome as text.
         code: exit code.
         diagnostics: errors and warnings in the JSON document.
     """
@@ -108,7 +112,7 @@ class Answer(Generic[R]):
 
 
 def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
-    """Render findings on the standard error."""
+    """Print findings to the standard error, as text with the source lines that they concern."""
     from stlc.cli.framework.render import render_text
 
     if diagnostics:
@@ -118,7 +122,7 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
 
 @contextmanager
 def noticing() -> Iterator[None]:
-    """Show notices about the machine (`stlc.diagnostics.notice`), each once."""
+    """Context in which warnings about the machine (`stlc.diagnostics.Notice`) are printed, each only once."""
     shown: set[str] = set()
     others = warnings.showwarning
 
@@ -136,7 +140,11 @@ def noticing() -> Iterator[None]:
 
 
 def wants_color(stream: TextIO) -> bool:
-    """True if colour may be written to `stream`: by `--color`, then `NO_COLOR`, then being a terminal."""
+    """True if colour codes may be written to `stream`.
+
+    `--color always` or `never` decides; else there is no colour if `NO_COLOR` is set, or if `stream` is no
+    terminal.
+    """
     mode = COLOR.get()
     if mode != "auto":
         return mode == "always"
@@ -146,9 +154,9 @@ def wants_color(stream: TextIO) -> bool:
 
 
 def console(*, stderr: bool = False, width: int | None = None) -> Console:
-    """A rich console for results (or, with `stderr`, for messages), without markup.
+    """Return a rich console for results (or, with `stderr`, for messages), without markup.
 
-    A pipe or file gets 120 columns, so that a table does not depend on the window.
+    If the output is a pipe or a file, lines have 120 columns, whatever the width of the terminal window.
     """
     from rich.console import Console
 
@@ -169,7 +177,10 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
-    """Columns of text, two blanks apart; numbers, and margins with a unit, are right-aligned."""
+    """Lay out rows of cells as a text table with two blanks between columns.
+
+    Numbers, and margins with a unit, are right-aligned.
+    """
     lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
     if not lines:
         return ""
@@ -193,7 +204,7 @@ def _cell(text: str, width: int) -> str:
 
 
 class Pulse:
-    """Heartbeat of a silent command: its current activity and the elapsed time.
+    """Progress message of a command that prints nothing for a while: current activity and elapsed time.
 
     On a terminal, it is a line that appears after `IN_TERMINAL` seconds without output and is removed before
     the next output; elsewhere, a new line is written every `IN_LOG` seconds.
@@ -209,7 +220,7 @@ class Pulse:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """Show the heartbeat while a command runs, unless nested or quiet."""
+        """Context in which the progress message is shown; no effect within another one or with `--quiet`."""
         stream = sys.stderr
         if self._doing or QUIET.get() or stream is None:
             yield
@@ -227,7 +238,7 @@ class Pulse:
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Context that sets the activity shown by the heartbeat; "" for waiting, without a heartbeat."""
+        """Context that sets the activity named in the progress message; while it is "", none is shown."""
         self._doing.append((what, time.monotonic()))
         self.note()
         try:
@@ -236,12 +247,12 @@ class Pulse:
             self._doing.pop()
 
     def now(self, what: str) -> None:
-        """Change the text of the current activity, whose time continues."""
+        """Change the name of the current activity; its elapsed time continues."""
         if self._doing:
             self._doing[-1] = what, self._doing[-1][1]
 
     def note(self) -> None:
-        """Register that output follows, and remove the heartbeat's line from the terminal."""
+        """Prepare for output: remove the progress message from the terminal and restart its delay."""
         with self._lock:
             self._last = time.monotonic()
             if self._shown:
@@ -270,13 +281,13 @@ PULSE = Pulse()
 
 
 class _Noted:
-    """Stream that tells the heartbeat about its output."""
+    """Output stream that removes the progress message of `PULSE` before it writes."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write to the stream."""
+        """Remove the progress message, then write a text to the stream; return the number of characters."""
         PULSE.note()
         return self._stream.write(text)
 
@@ -299,7 +310,7 @@ def _write(stream: TextIO | None, text: str) -> None:
 
 @contextmanager
 def tolerate_closed(stream: TextIO) -> Iterator[None]:
-    """Tolerate a closed pipe: afterwards output to `stream` is dropped."""
+    """Context in which a closed pipe is no error: all later output to `stream` is dropped."""
     try:
         yield
     except BrokenPipeError:

@@ -1,8 +1,8 @@
-"""Programs: a package of commands, one lazily imported module each, and the error boundary.
+"""Command-line programs: a program is a package with one module per command, each imported only when needed.
 
 `stlc` and `python -m benchmarks` are programs. A new command is a new module in the package of commands, with
-one function marked with `command`, or a `GROUP` of functions. Modules import little at the top, so that
-`--help` stays fast.
+one function marked with `command`, or a group of subcommands named `GROUP`. Modules import little at the top,
+so that `--help` stays fast.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _MARKED: dict[str, tuple[str, ...]] = {}
 
 
 def command(*examples: str) -> Callable[[F], F]:
-    """Mark the function of a module as the command, with example command lines.
+    """Mark the function of a module that is its command; `examples` are command lines for the help text.
 
-    The docstring is the help text: its first paragraph is the summary, the others follow the examples.
-    Dataclass parameters are option groups; see `flat`.
+    The first paragraph of the function's docstring is the summary of the help text; the other paragraphs
+    follow the examples. Each field of a dataclass parameter becomes an option; see `flat`.
     """
 
     def mark(function: F) -> F:
@@ -51,14 +51,20 @@ def command(*examples: str) -> Callable[[F], F]:
 
 
 def group(sentence: str, *examples: str, default: Callable[..., None] | None = None) -> typer.Typer:
-    """A group of commands; without a command `default` is called, or the help shown."""
+    """Return a group of commands, such as `stlc runs`, whose help begins with `sentence`.
+
+    If no subcommand is given, `default` is called; without a default the help is shown.
+    """
     made = typer.Typer(help=describe(sentence, *examples), invoke_without_command=True, rich_markup_mode=None)
     made.callback()(default or only_help)
     return made
 
 
 def subcommand(made: typer.Typer, name: str, *examples: str) -> Callable[[F], F]:
-    """Add a function to a group; its docstring is the help, as for `command`."""
+    """Return a decorator that adds a function as subcommand `name` to the group `made`.
+
+    The function's docstring is the help text, as for `command`.
+    """
 
     def add(function: F) -> F:
         made.command(name, help=_help(function, examples))(flat(function))
@@ -68,7 +74,7 @@ def subcommand(made: typer.Typer, name: str, *examples: str) -> Callable[[F], F]
 
 
 def describe(sentence: str, *examples: str, note: str = "") -> str:
-    """The help of a command: a sentence, example command lines, then notes."""
+    """Return the help text of a command: a sentence, example command lines, then notes."""
     shown = "\b\nExample:\n" if len(examples) == 1 else "\b\nExamples:\n"
     lines = "\n".join(f"  {example}" for example in examples)
     return "\n\n".join(part for part in (sentence, shown + lines if examples else "", note) if part)
@@ -80,18 +86,21 @@ def _help(function: Callable[..., Any], examples: Sequence[str]) -> str:
 
 
 def only_help(context: typer.Context) -> None:
-    """Default of a group without a command: print its help, exit with 2, as for `stlc` alone."""
+    """Print the help of a group that was called without a subcommand, and exit with code 2.
+
+    This is also what `stlc` without a command does.
+    """
     if context.invoked_subcommand is None:
         emit(context.get_help())
         raise typer.Exit(2)
 
 
 def flat(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The callback of a command: a function with option groups flattened, and its `Answer` printed.
+    """Return the function that typer calls for a command; it prints the `Answer` and returns the exit code.
 
-    Each field of a dataclass parameter becomes an option; the defaults are the fields of the parameter's
-    default value. A function declared to return an `Answer` gets the option `--json`, whose value is passed
-    on if the function has a parameter `json`. The callback returns the exit code.
+    Each field of a dataclass parameter becomes an option, whose default is the value of the field in the
+    parameter's default. A function declared to return an `Answer` gets the option `--json`, whose value is
+    passed on if the function has a parameter `json`.
     """
     signature = inspect.signature(function, eval_str=True)
     groups: dict[str, Any] = {
@@ -134,14 +143,14 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A command-line program.
+    """A command-line program whose commands are the modules of a package.
 
     Attributes:
-        name: as it is typed.
+        name: name of the program, as it is typed.
         help: help text of the program.
-        package: package that holds the commands.
-        order: order of commands in the help; others follow by name.
-        moved: former commands -> their replacements.
+        package: dotted name of the package of commands.
+        order: names of commands in the order of the help text; other commands follow in alphabetical order.
+        moved: name of a former command -> command line that replaces it.
     """
 
     name: str
@@ -151,12 +160,12 @@ class Program:
     moved: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> list[str]:
-        """All commands."""
+        """Return the names of all commands, in the order of the help text."""
         found = [each.name for each in pkgutil.iter_modules(import_module(self.package).__path__)]
         return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
 
     def made(self, only: str = "") -> typer.Typer:
-        """The typer program with one command, or with all if there is none of that name."""
+        """Return the typer application with the command `only`, or with all if there is no such one."""
         names = self.names()
         app = typer.Typer(
             name=self.name,
@@ -172,7 +181,7 @@ class Program:
         return app
 
     def parser(self, only: str = "") -> Any:
-        """The cached parser of one command, or of the program; see `name_values`."""
+        """Return the parser of the command `only`, or of the whole program; it is built once and cached."""
         key = (self.package, only if only in self.names() else "")
         if key not in _PARSERS:
             _PARSERS[key] = typer.main.get_command(self.made(only))
@@ -192,7 +201,8 @@ class Program:
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run a command line and return its exit code.
 
-        The one place where an exception becomes a message and an exit code; see `stlc.cli.framework.errors`.
+        All exceptions of commands are caught here and become a message and an exit code; see
+        `stlc.cli.framework.errors`.
 
         Args:
             argv: the arguments without the program's name; by default those of the process.
@@ -242,7 +252,10 @@ def _global_options(
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into options of the program, which may stand anywhere, and the rest."""
+    """Split arguments into the options of the program, such as `--quiet`, and the rest.
+
+    Options of the program may stand anywhere before `--`.
+    """
     front: list[str] = []
     rest: list[str] = []
     queue = list(arguments)
@@ -270,9 +283,10 @@ def _flush() -> None:
 
 @contextmanager
 def _stoppable() -> Iterator[list[int]]:
-    """Let Ctrl-C and SIGTERM unwind a running command, so that its `finally` blocks run.
+    """Context in which Ctrl-C and SIGTERM raise an exception, so that the `finally` blocks of a command run.
 
-    Yields the list of exit codes of received signals: interrupted C code may raise other exceptions.
+    Yields a list to which the exit code of each received signal is appended: interrupted C code may replace
+    the exception by another one, so the list tells that there was a signal.
     """
     stopped: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -304,7 +318,7 @@ _METAVARS |= {"integer": "N", "integer range": "N", "float range": "X", "text": 
 
 
 def _params(command: Any) -> Iterator[Any]:
-    """The parameters of a command and of those below it."""
+    """Yield the parameters of a command and of all its subcommands."""
     queue = [command]
     while queue:
         entry = queue.pop()
@@ -314,7 +328,7 @@ def _params(command: Any) -> Iterator[Any]:
 
 
 def name_values(command: Any) -> None:
-    """Set missing metavars of options, so that help texts show no Python types."""
+    """Set the placeholders (metavars) of options that have none, so that help texts show no Python types."""
     for param in _params(command):
         if hasattr(param, "display_type_rich") and param.param_type_name == "argument":
             param.display_type_rich = lambda **_: ""  # the metavar suffices
@@ -334,14 +348,20 @@ _SLOT = "_runtime_param"
 
 
 def spare_adapters(command: Any) -> None:
-    """Skip pydantic adapters for parameters of a command and its subcommands that need no conversion."""
+    """Replace typer's slow converters of parameters by ones that pass on values that need no conversion.
+
+    The parameters of subcommands are included.
+    """
     for param in _params(command):
         if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
             setattr(param, _SLOT, _AsGiven())
 
 
 def _help_option(command: Any) -> list[Any]:
-    """The option `--help`, which a command creates on first use and caches."""
+    """The option `--help` of a command as a list; empty if it has none.
+
+    The command creates the option on first use; it is then cached.
+    """
     if not hasattr(command, "get_help_option"):
         return []
     option = command.get_help_option(typer.Context(command, help_option_names=list(HELP_NAMES)))
@@ -349,10 +369,10 @@ def _help_option(command: Any) -> list[Any]:
 
 
 class _AsGiven:
-    """Lazy substitute for typer's converter of one parameter."""
+    """Substitute for typer's converter of one parameter, which is built only if a value needs conversion."""
 
     def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
-        """The converted value."""
+        """Return the value of a parameter, converted to its annotated type."""
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None

@@ -44,7 +44,7 @@ class _Paint:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """A place to underline; the primary one comes first."""
+    """A place in the source to underline; the primary mark shows the location of the finding itself."""
 
     span: Span
     text: str
@@ -52,7 +52,7 @@ class _Mark:
 
 
 def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
-    """All findings as text, with an empty line between them and a line break at the end."""
+    """Findings as text, with an empty line between two findings and a line break at the end."""
     paint = _Paint(color)
     blocks = ["\n".join(_block(diagnostic, paint)) for diagnostic in diagnostics]
     return "\n\n".join(blocks) + "\n" if blocks else ""
@@ -67,7 +67,11 @@ def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
 def render_place(
     place: Label, labels: Iterable[Label], advice: Iterable[tuple[str, str]], *, color: bool
 ) -> str:
-    """A place without a finding, in the same layout: carets, dashes, and (word, line) pairs below."""
+    """Text that shows a place in the source in the layout of a finding, without a headline.
+
+    The place is underlined with `^`, the places of `labels` with `-`; the (word, text) pairs of `advice`
+    follow.
+    """
     marks = [_Mark(place.span, place.text, primary=True)]
     marks += [_Mark(label.span, label.text, primary=False) for label in labels]
     return "\n".join(_body(marks, advice, _Paint(color), "error")) + "\n"
@@ -104,7 +108,10 @@ def _marks(diagnostic: Diagnostic) -> list[_Mark]:
 
 
 def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
-    """The snippets of all marked sources; that of the primary mark comes first."""
+    """Yield the lines of the source excerpts, one excerpt per file; that of the primary mark comes first.
+
+    `width` is the number of digits of the greatest line number.
+    """
     margin = " " * width
     for index, source in enumerate(dict.fromkeys(mark.span.source for mark in marks)):
         own = [mark for mark in marks if mark.span.source is source]
@@ -133,7 +140,7 @@ def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: _Paint, se
 
 
 class _Row:
-    """One displayed source line: tabs expanded, control characters visible, truncated if very long."""
+    """One source line as displayed: tabs expanded, control characters visible, truncated if very long."""
 
     def __init__(self, source: Source, number: int, marks: Sequence[_Mark]) -> None:
         self.marks = marks
@@ -151,17 +158,17 @@ class _Row:
             self.text += "…"
 
     def column(self, offset: int) -> int:
-        """Display column of a character."""
+        """Display column of the character at `offset` in the source, or of the nearest one displayed."""
         return self._columns[min(max(offset - self._first, 0), len(self._columns) - 1)]
 
     def underline(self, mark: _Mark) -> str:
-        """The carets or dashes under a mark; at least one, and only within this line."""
+        """The carets or dashes under a mark: at least one, and none beyond the end of this line."""
         length = self.column(mark.span.end) - self.column(mark.span.start)
         return ("^" if mark.primary else "-") * max(length, 1)
 
 
 def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
-    """Display column of every character (and of the end), and the printed line."""
+    """Return the display column of every character of a line and of its end, and the line as printed."""
     columns: list[int] = []
     shown: list[str] = []
     column = indent
@@ -184,9 +191,10 @@ def _width(char: str) -> int:
 
 
 def to_json(diagnostic: Diagnostic) -> dict[str, Any]:
-    """A finding as JSON values: `{code, severity, message, file, range, labels, help, note, fix}`.
+    """A finding as JSON values: `{code, severity, message, file, range, label, labels, help, note, fix}`.
 
-    Lines and columns count from 1, the end is exclusive; `file`, `range` and `fix` may be None.
+    Lines and columns count from 1, and the end of a range is exclusive; `file`, `range` and `fix` may be
+    None.
     """
     span, fix = diagnostic.span, diagnostic.fix
     edits = [] if fix is None else [{**_place(at), "replacement": text} for at, text in fix.edits]

@@ -19,7 +19,7 @@ _ODD = re.compile(r"[\s\"\\=]")
 
 
 def as_tree(spec: ast.Spec) -> str:
-    """One node a line, children indented below it."""
+    """Text with one line per node of a syntax tree; children are indented below their parent."""
     lines: list[str] = []
     stack: list[tuple[int, ast.Node]] = [(0, spec)]
     while stack:
@@ -30,7 +30,7 @@ def as_tree(spec: ast.Spec) -> str:
 
 
 def _facts(node: ast.Node) -> Iterator[str]:
-    """Attributes of a node, without its children."""
+    """Yield the attributes of a node as texts, without its children."""
     for name, value in _own(node):
         if name == "clock" and value == "now":
             continue
@@ -69,7 +69,7 @@ def _short(value: object) -> str:
 
 
 def as_values(node: ast.Node) -> SyntaxTree:
-    """The record of a syntax tree; further keys are the fields of the node."""
+    """JSON record of a syntax tree: class, line and column of the node, and its fields."""
     values: Any = {"node": type(node).__name__, "line": node.span.line, "column": node.span.column}
     for part in fields(node):
         if part.name not in _HIDDEN:

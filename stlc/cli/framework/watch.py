@@ -1,4 +1,4 @@
-"""Repetition of a command whenever a file changes."""
+"""Repeated execution of a command whenever a file changes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Modification stamp of a file; a missing file counts as empty."""
+    """Modification time (ns) and size of a file, to detect changes; (0, 0) if the file is missing."""
     try:
         status = path.stat()
     except OSError:

@@ -1,1 +1,1 @@
-"""`stlc simulate`."""
+"""Output of `stlc simulate`: its text, its progress and its live view."""

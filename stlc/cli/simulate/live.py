@@ -1,4 +1,7 @@
-"""The live view of a deployment: margins as bars, agents, decision sources; ten lines without a terminal."""
+"""Live view of a deployment: margins as bars, agents, and which part of the guard decided.
+
+Without a terminal it is ten lines of text.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +40,13 @@ FIRST = ("agent", "decided by", "plan", "least margin")
 
 
 class LiveView:
-    """Shows a deployment: redrawn in place on a terminal, ten lines elsewhere.
+    """Display of a running deployment: redrawn in place on a terminal, else ten lines of text in total.
 
     Args:
-        monitor: live monitor of the deployment.
+        monitor: source of the margins and decisions.
         title: name of the deployment.
-        console: for messages.
-        clock: function that returns seconds.
+        console: console to which the view is written.
+        clock: function that returns the time in seconds, to limit the rate of redrawing.
     """
 
     def __init__(
@@ -92,7 +95,7 @@ class LiveView:
     # ------------------------------------------------------------------------- text
 
     def line(self) -> str:
-        """The present state on one line."""
+        """Present state of the deployment on one line: step, guard decisions, least margin, violations."""
         worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
         name, agent = worst[0], int(worst[1].high.argmin())
         violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
@@ -105,7 +108,7 @@ class LiveView:
         return "  " + "   ".join(parts)
 
     def panel(self) -> Group:
-        """The present state as shown on the terminal."""
+        """The present state of the deployment as drawn on the terminal."""
         width, height = self.console.size
         lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
         lines += self._bars(width)
@@ -136,7 +139,10 @@ class LiveView:
         return f"agent {agent}" + (f", seed {self.monitor.setting.seeds[seed]}" if several else "")
 
     def _bars(self, width: int) -> list[Text]:
-        """A line for each requirement: the margin of the worst agent; bars shrink before names do."""
+        """Lines with the least margin of each requirement over all agents, one line per requirement.
+
+        In a narrow terminal the bars become shorter before the names are cut.
+        """
         margins = self.monitor.margins
         units = {rule.name: margin_unit(rule.typed.formula) for rule in self.monitor.task.rules}
         texts = {name: self._texts(margin, units.get(name, "")) for name, margin in margins.items()}
@@ -156,7 +162,7 @@ class LiveView:
         return found
 
     def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
-        """Texts of a requirement: least margin with unit, its agent, and number of violations."""
+        """Texts on a requirement: its least margin with the unit, the agent that has it, the violations."""
         row = int(margin.high.argmin())
         open_ = margin.low[row] < margin.high[row]
         count = int((margin.violated > 0).sum())
@@ -164,7 +170,10 @@ class LiveView:
         return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
-        """A bar to the left (negative) or right of the middle, scaled by the largest margin until now."""
+        """Bar for a margin: to the left of the middle if negative, else to the right.
+
+        A full bar (`half` characters) is the largest margin of the requirement until now.
+        """
         full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
         finite = abs(value) if np.isfinite(value) else 0.0
         scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)
@@ -176,7 +185,10 @@ class LiveView:
         return empty * half + middle + filled[0] + filled[1]
 
     def _agents(self, width: int, most: int) -> list[Text]:
-        """A line for each agent of the first seed; only the worst ones if not all fit."""
+        """Lines with the state of each agent of the first seed, one line per agent.
+
+        If there are more than `most` agents, those with the least margins are shown.
+        """
         monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
         agents = range(monitor.setting.agents)
@@ -199,7 +211,7 @@ class LiveView:
 
 
 def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
-    """A table with as many whole columns as fit, and `…` for omitted ones."""
+    """Text table with as many columns as fit into `width` characters; `…` stands for omitted columns."""
     for count in range(len(header), len(FIRST), -1):
         more = ["…"] if count < len(header) else []
         text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])
@@ -209,7 +221,7 @@ def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
 
 
 def _shown(column: Column, value: float) -> str:
-    """A state as text: the label of an enum, yes or no, a number."""
+    """Value of a state as text: the label of an enum, "yes" or "no", or a number."""
     for label, number in column.labels:
         if number == value:
             return label
@@ -219,12 +231,12 @@ def _shown(column: Column, value: float) -> str:
 
 
 def _signed(value: float) -> str:
-    """A margin with its sign; rounding errors around zero are zero."""
+    """Text of a margin with its sign; a margin within rounding errors of zero is "0"."""
     return "0" if abs(value) <= TOLERANCE else signed(value)
 
 
 def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
-    """The least margin of each agent over all requirements."""
+    """Upper bound on the least margin of each agent over all requirements, (agents of all seeds,)."""
     least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
     return least
 

@@ -28,9 +28,10 @@ COMPARED = ("obeyed every rule", "plan accuracy")
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
-    """The metrics as lines of text: drives (closed-loop runs) first; with `windows` also plans and starts.
+    """Lines of text that show the results of a simulation.
 
-    If no specification for drives is declared, plans and starts are always shown, because drives are then
+    Results on drives (closed-loop runs) come first; with `windows`, results on plans and start instants
+    follow. If the system names no specification for drives, these are always shown, because drives are then
     judged like plans.
     """
     from stlc.cli.framework.output import table
@@ -66,14 +67,17 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """A line that says how initial states were selected, if they were."""
+    """Yield a line on the selection of initial states, if only some of the sampled ones were used."""
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:
-    """Verdict on the drives (closed-loop runs), and the agents for which no better drive is known."""
+    """Lines with the verdict on the drives (closed-loop runs), and with the number of lost ones.
+
+    A drive is lost if no satisfying plan was known at its start, or after an exogenous event.
+    """
     from stlc.view.words import obeyed_sentence, viable_sentence
 
     yield f"  {obeyed_sentence(document)}"
@@ -88,14 +92,17 @@ def _drives(document: Record) -> Iterator[str]:
 
 
 def _rules(document: Record) -> Iterator[tuple[str, ...]]:
-    """Number of drives that obeyed each rule, a column per guard."""
+    """Rows (name of a rule, one cell per guard): number of drives (closed-loop runs) that obeyed the rule."""
     guards = [guard["drives"] for guard in document["guards"].values()]
     for name in guards[-1]["rules"]:
         yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
 
 
 def _broken(drives: Record) -> Iterator[str]:
-    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` for the first runs, viable ones first."""
+    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` on the first drives that broke a rule.
+
+    Viable drives come first: those for which a satisfying plan was known.
+    """
     from stlc.view.words import cause_words
 
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
@@ -117,7 +124,7 @@ def _foreseen(foreseen: Record | None) -> Iterator[str]:
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
-    """Errors that the scenario gives the model, a line for each kind."""
+    """Lines on the model errors that the scenario introduces, one line per kind of error."""
     for name, what in ERRORS.items():
         if name in errors:
             numbers = errors.get("numbers", []) if name == "parameters" else []
@@ -127,7 +134,11 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
 
 
 def compared(document: Record) -> Iterator[str]:
-    """All scenarios in one table: drives that obeyed every rule, overall and among viable ones."""
+    """Lines of a table that compares all scenarios, one row per scenario.
+
+    For each guard it shows the number of viable drives (a satisfying plan was known) that obeyed every rule,
+    and the accuracy of plans.
+    """
     from stlc.cli.framework.output import table
 
     guards = list(document["guards"])
@@ -144,14 +155,25 @@ def compared(document: Record) -> Iterator[str]:
 
 
 def _both(guard: Record) -> list[str]:
-    """The cells of a guard: share of drives that obeyed among those not lost, and accuracy of plans."""
+    """Cells for one guard in the comparison of scenarios.
+
+    The first is the number of drives that obeyed every rule, of those that were not lost; the second is the
+    share of plans that satisfy the specification.
+    """
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
     return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
 
 
 def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:
-    """Paths of the results; the last line is the next command, with the system if judging needs it."""
+    """Lines with the paths of the results; the last line is the command to run next.
+
+    Args:
+        trace: path of the recorded trace.
+        drawn: kind of picture -> path.
+        record: file of `--record`, if given.
+        system: system file that the next command names; None if it is not needed.
+    """
     from stlc.files import find_trace
 
     yield ""
@@ -170,7 +192,10 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 
 
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
-    """Shares of plans and starts; those of safety if any requirement is tagged `@safety`."""
+    """Rows with the shares of satisfying plans and start instants, one column per guard.
+
+    Shares of safe plans and starts are included if `safe`: if a requirement has the tag `@safety`.
+    """
     from stlc.controller.evaluation.metrics import METRICS
 
     for metric in METRICS.values():
@@ -180,7 +205,7 @@ def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
 
 
 def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
-    """Metrics reported by the world."""
+    """Rows with the metrics that the world reports, such as a mean speed, one column per guard."""
     from stlc.controller.evaluation.metrics import is_progress
 
     first = next(iter(guards.values()))
@@ -207,7 +232,11 @@ def _number(metric: Record, unit: str, digits: int) -> str:
 
 
 def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
-    """Text on unsafe agents: `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`."""
+    """Text on the agents that were not driven safely.
+
+    An example is `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`; an agent is viable if
+    a safe plan from its start is known.
+    """
     if not unsafe:
         return f"all {agents} agents were driven safely"
     lost = [each for each in unsafe if each["savable"]]
@@ -231,7 +260,11 @@ def _listed(agents: Sequence[Record]) -> str:
 
 
 def _acted(decisions: Mapping[str, float]) -> str:
-    """Text on the interventions: `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
+    """Text on how often the guard intervened, and by which means.
+
+    An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`; T0 is the length in
+    steps of the prefix that the backup policy puts before the policy's plan.
+    """
     total = 1.0 - decisions["policy"]
     if total <= 0.0:
         return "0 % of decisions"
@@ -242,5 +275,5 @@ def _acted(decisions: Mapping[str, float]) -> str:
 
 
 def _part(share: float) -> str:
-    """A percentage; only 0 is shown as 0 %, and only 1 as 100 %."""
+    """Text of a share in percent; only 0 is shown as 0 %, and only 1 as 100 %."""
     return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

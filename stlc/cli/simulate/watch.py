@@ -1,4 +1,4 @@
-"""Output of a running deployment: a progress bar, the live view, and margins as JSON lines."""
+"""Output while a deployment runs: a progress bar, the live view, and margins as JSON lines."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ STANDARD_OUTPUT = "-"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """Live output options of a deployment.
+    """Options for the output while a deployment runs.
 
     Attributes:
         title: name of the deployment.
         live: whether the live view is shown.
-        margins: file of JSON lines, or `-` for the standard output; None: not written.
+        margins: file to which margins are written as JSON lines; `-` is the standard output; None: no file.
     """
 
     title: str
@@ -36,7 +36,7 @@ class Watching:
 
     @contextmanager
     def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
-        """The callback for the steps of a deployment."""
+        """Context that yields the function which updates the output after every step of the deployment."""
         if not self.live and self.margins is None:
             with _bar(self.title) as watch:
                 yield watch
@@ -75,14 +75,14 @@ def _present(monitor: LiveMonitor) -> SimulationStep:
 
 
 def require_writable(where: str | None) -> None:
-    """Create the file for JSON lines. Raises MissingError (R201) if that fails."""
+    """Create the file for JSON lines, before the deployment. Raises MissingError (R201) if that fails."""
     if where is not None and where != STANDARD_OUTPUT:
         _opened(where).close()
 
 
 @contextmanager
 def _lines(where: str) -> Iterator[TextIO]:
-    """A file opened for writing, which is flushed after every line."""
+    """Context that yields the stream for JSON lines: the file `where`, or the standard output for `-`."""
     if where == STANDARD_OUTPUT:
         yield sys.stdout
         return
@@ -96,7 +96,7 @@ def _opened(where: str) -> TextIO:
 
 
 def _write(monitor: LiveMonitor, stream: TextIO) -> None:
-    """Write one JSON object per agent, a line each."""
+    """Write the present margins to a stream, as one JSON object and line per agent."""
     from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps
 
@@ -107,7 +107,7 @@ def _write(monitor: LiveMonitor, stream: TextIO) -> None:
 
 @contextmanager
 def _bar(title: str) -> Iterator[Watch]:
-    """A progress bar on the standard error, if that is a terminal."""
+    """Context with a progress bar on the standard error, if a terminal; yields its update function."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from stlc.cli.framework.output import console

@@ -1,1 +1,1 @@
-"""`stlc train`."""
+"""Output of `stlc train`: the panel, the final screen, several runs at once."""

@@ -25,11 +25,11 @@ ENDED = 70
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One of several training runs.
+    """One training run of several: its specification and its seed.
 
     Attributes:
         spec: file of the specification.
-        seed: seed of the run; None for that of the system file.
+        seed: seed of the run; None: the seed in the system file.
     """
 
     spec: Path
@@ -44,12 +44,12 @@ class Many:
         specs: files of the specifications.
         system: system file of `--system`, or None; allowed for a single specification only.
         config: training options that all runs share.
-        launch: folder and name of the runs.
-        seeds: seeds for each specification; None for that of its system file.
-        jobs: number of processes at a time.
-        cluster: address of a Ray cluster to train on.
+        launch: folder, name and overrides of the runs.
+        seeds: seeds with which each specification is trained for; None is the seed in the system file.
+        jobs: number of runs at a time, each in its own process.
+        cluster: address of the Ray cluster to train on; None for this machine.
         log: value of `--log`.
-        pictures: whether reports are drawn.
+        pictures: whether a report with pictures is written for each run.
     """
 
     specs: Sequence[Path]
@@ -64,16 +64,16 @@ class Many:
 
     @property
     def parts(self) -> list[Part]:
-        """The runs, in order."""
+        """The runs in order: all seeds of the first specification, then those of the next."""
         return [Part(spec, seed) for spec in self.specs for seed in self.seeds]
 
     def name(self, part: Part) -> str:
-        """Label of a run among the others."""
+        """Name of a run in messages: specification, seed, or both, whichever tells it from the other runs."""
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
     def job(self, part: Part) -> Job:
-        """The command line of one run."""
+        """Job of one run: the arguments of `stlc train` and, on a cluster, the files that it reads."""
         from stlc.controller.parallel.jobs import Job
 
         config, launch = self.config, self.launch
@@ -113,7 +113,10 @@ class Many:
 
 
 def train_many(many: Many) -> Answer[TrainedRuns]:
-    """Train all runs; the text is a table, the exit code the greatest of all runs."""
+    """Train all runs in processes of their own and return their records.
+
+    The text printed is a table; the exit code is the greatest of all runs.
+    """
     from stlc.controller.parallel import executor
 
     cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
@@ -151,7 +154,7 @@ def _line(ended: JobResult) -> str:
 
 
 def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
-    """A line for every run, and one for the mean of each specification."""
+    """Text table with a row for every run, and for each specification a row with the mean of its runs."""
     rows: list[tuple[str, ...]] = []
     for spec, group in groupby(records, key=lambda record: record["spec"]):
         own = list(group)
@@ -179,7 +182,7 @@ def _share(accuracy: float, feasible: float) -> str:
 
 
 def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
-    """The row of means, if several runs succeeded."""
+    """Row with the means over the runs that succeeded, as a list; empty if fewer than two succeeded."""
     finished = [record for record in records if record.get("accuracy") is not None]
     if len(finished) < 2:
         return []

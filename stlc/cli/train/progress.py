@@ -23,7 +23,10 @@ SPARK_WIDTH = 16
 
 
 def sparkline(values: list[float], *, width: int = SPARK_WIDTH, blocks: str = BLOCKS) -> str:
-    """A sparkline of `values` in at most `width` blocks, scaled between minimum and maximum."""
+    """Return a small bar chart of `values` in one line of at most `width` block characters.
+
+    The values are scaled between their minimum and maximum.
+    """
     if not values:
         return ""
     count = min(width, len(values))
@@ -37,7 +40,7 @@ def sparkline(values: list[float], *, width: int = SPARK_WIDTH, blocks: str = BL
 
 
 def clock_text(seconds: float) -> str:
-    """A duration as `mm:ss`, or `h:mm:ss` from an hour on."""
+    """Text of a duration: `mm:ss`, or `h:mm:ss` for an hour or more."""
     whole = max(0, round(seconds))
     hours, rest = divmod(whole, 3600)
     minutes, secs = divmod(rest, 60)
@@ -50,11 +53,11 @@ def percent(value: float) -> str:
 
 
 class Progress:
-    """Shows a training run: in place on a terminal, one line every 25 s elsewhere.
+    """Display of a training run: a panel redrawn in place on a terminal, elsewhere one line every 25 s.
 
-    Rows are those of `train.jsonl`; a row may have only some of the keys, such as `step` alone, and the other
-    values stay as they are. Call `start`, then `update` for every row, then `finish`; after an interruption,
-    `stop` restores the terminal.
+    Call `start`, then `update` for every row of `train.jsonl`, then `finish`; after an interruption, `stop`
+    restores the terminal. A row may contain only some of the keys, such as `step` alone; the other values
+    stay as they are.
     """
 
     def __init__(
@@ -104,13 +107,13 @@ class Progress:
             self._print(self._title)
 
     def chosen(self, engine: Mapping[str, Any]) -> None:
-        """Show the options that the training resolved."""
+        """Print the options that the training selected, such as the batch size, and the back ends it uses."""
         self._print(f"  engine          {engine_text(engine)}")
         if "by_torch" in engine:
             self._print(f"  computed by     {native_text(engine['by_torch'])}")
 
     def update(self, row: Mapping[str, Any]) -> None:
-        """Update from a row of `train.jsonl`, or a part of one."""
+        """Update the display by a row of `train.jsonl`, which may contain only some of the keys."""
         self._row.update({key: value for key, value in row.items() if value is not None})
         if row.get("accuracy") is not None:
             self._accuracies.append(float(row["accuracy"]))
@@ -120,20 +123,20 @@ class Progress:
             self._print(self._line())
 
     def stop(self) -> None:
-        """Close the panel; safe to call twice."""
+        """Close the panel and restore the terminal; a second call has no effect."""
         if self._live is not None:
             live, self._live = self._live, None
             live.stop()
 
     def finish(self, lines: Iterable[str], *, to: Console | None = None) -> None:
-        """Close the panel and print the final screen, to `to` if given."""
+        """Close the panel and print the final lines, to the console `to` if given, else to its own."""
         self.stop()
         for line in lines:
             (to or self.console).print(_emphasised(self._plain(line)), soft_wrap=True)
 
     @property
     def spark(self) -> str:
-        """The sparkline of the accuracy."""
+        """Bar chart in one line of the accuracy at all validations until now."""
         return sparkline(self._accuracies, blocks=self._blocks)
 
     # ------------------------------------------------------------------ text
@@ -183,14 +186,14 @@ class Progress:
         return "  " + "   ".join(part for part in parts if part)
 
     def _accuracy_line(self, width: int) -> str:
-        """The accuracy and its sparkline, which shrinks in a narrow terminal."""
+        """Line with the accuracy and its bar chart, which is narrower in a narrow terminal."""
         figures = "     ".join(self._accuracy_parts())
         room = min(SPARK_WIDTH, width - len(figures) - 22)
         spark = sparkline(self._accuracies, width=room, blocks=self._blocks) if room >= 4 else ""
         return f"  plan accuracy   {spark}  {figures}" if spark else f"  plan accuracy   {figures}"
 
     def panel(self) -> Group:
-        """The present panel."""
+        """The panel as it is drawn at present."""
         width = self.console.width
         lines = [*_spread(self._title, f"{self._counter()}   {self._time_left()}".rstrip(), width)]
         lines.append(self._accuracy_line(width))
@@ -207,13 +210,13 @@ class Progress:
 
 
 def _spread(left: str, right: str, width: int) -> tuple[str, ...]:
-    """`left` and `right` at the two ends of a line, or on two lines where one is too short."""
+    """Return one line with `left` and `right` at its two ends; two lines if they do not fit into `width`."""
     gap = width - len(left) - len(right)
     return (left + " " * gap + right,) if gap >= 3 else (left, "  " + right)
 
 
 def _packed(cells: list[str], width: int) -> list[str]:
-    """`cells` side by side on as few lines of `width` as hold them."""
+    """Return as few lines as possible, of at most `width` characters, with the `cells` side by side."""
     lines: list[str] = []
     for cell in cells:
         if lines and len(lines[-1]) + 3 + len(cell) <= width:
@@ -224,7 +227,7 @@ def _packed(cells: list[str], width: int) -> list[str]:
 
 
 def engine_text(engine: Mapping[str, Any]) -> str:
-    """The resolved options on one line: method, network, batch, learning rate and margin."""
+    """Text of the options that the training selected: method, network, batch, learning rate and margin."""
     network = "x".join(map(str, engine["hidden"]))
     if "environments" in engine:  # one control a step, learned from rewards
         parts = (
@@ -251,7 +254,10 @@ def engine_text(engine: Mapping[str, Any]) -> str:
 
 
 def native_text(by_torch: Mapping[str, str]) -> str:
-    """Parts of the training that run as generated C, and the reasons for torch in the others."""
+    """Text on which parts of the training run as generated C, and why the others are computed by torch.
+
+    `by_torch` maps the name of a part to the reason for torch; "" means C.
+    """
     native = [part for part, reason in by_torch.items() if not reason]
     reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
     lines = [f"{', '.join(native)}: C"] if native else []
@@ -269,14 +275,14 @@ def final_screen(
     unsolved: str = "",
     picture: str = "",
 ) -> list[str]:
-    """The final lines of a training run; with a verdict the last one is the next command.
+    """Lines printed at the end of a training; with a verdict, the last one is the command to run next.
 
     Args:
         result: record of the finished training.
-        spark: sparkline of the accuracy.
-        region: failure region of the worst requirement, in words.
-        unsolved: starts for which no plan is known, in words.
-        picture: path of a picture of the region.
+        spark: bar chart of the accuracy in one line.
+        region: set of initial states in which the worst requirement fails, in words.
+        unsolved: initial states from which no satisfying plan is known, in words.
+        picture: path of a picture of the failures.
     """
     low, high = result["interval"]
     rows = [("closed loop", line) for line in driven_lines(result)]

@@ -1,4 +1,4 @@
-"""Terminal interface of a training: the panel, Ctrl-C, pictures, the final screen."""
+"""Terminal interface of a training: its panel, Ctrl-C, its pictures and its final lines."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ FAILURES = "failures.png"
 
 @dataclass(slots=True)
 class Session:
-    """Progress display of a training as a context manager; Ctrl-C or SIGTERM saves and stops.
+    """Progress display of a training, as a context manager that also handles Ctrl-C and SIGTERM.
 
-    During training steps the first signal requests the stop and a second one stops at once; at other times
-    the first one does.
+    During training steps, the first signal ends the training after the present step, with a checkpoint, and a
+    second one stops it at once; outside of the steps the first signal stops it at once.
 
     Attributes:
         folder: folder of the run.
         outcome: result of the training, once finished.
-        progress: the panel.
-        logger: opener of an additional logger, if any.
-        writes: whether this process writes the run's folder; the first of several ranks does.
+        progress: display of the progress.
+        logger: function that opens an additional logger, if any.
+        writes: whether this process writes the run's folder; of several processes only the first one does.
     """
 
     folder: RunDir
@@ -64,12 +64,15 @@ class Session:
 
     @property
     def watch(self) -> Watch:
-        """The callbacks of the training."""
+        """The functions that the training calls, such as after every row of results or to ask for a stop."""
         stop = lambda: bool(self._signals)  # noqa: E731
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
-        """Predicted delay in seconds at the end of training, estimated from the time of imports."""
+        """Predicted time in seconds by which the run would exceed `budget`, for work beside the training.
+
+        It is estimated from the time that the imports took.
+        """
         return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
 
     @contextmanager
@@ -118,7 +121,7 @@ class Session:
         self._forced.close()
 
     def _ended(self, _code: int = INTERRUPTED) -> None:
-        """Set the status of a run that is killed to "interrupted"; its last checkpoint remains."""
+        """Record the status "interrupted" for a run that is killed; its last checkpoint remains."""
         with suppress(StlcError):
             self.folder.finish("interrupted")
         self._say_interrupted()
@@ -135,7 +138,7 @@ class Session:
             raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
 
     def conclude(self, *, pictures: bool) -> Answer[TrainedRun]:
-        """Draw pictures; return the record and the final screen of the finished training.
+        """Draw the pictures of the finished training and return its record, with the final lines as text.
 
         Raises:
             typer.Exit: this process does not write the run's folder.
@@ -171,10 +174,9 @@ class Session:
 
 
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
-    """The commands that the final screen suggests.
+    """The commands that the final lines suggest, for a run trained by `ranks` processes.
 
-    They name the run by the shortest name that finds it: the newest run needs none, others below `runs` no
-    path.
+    They contain the shortest name of the run: none for the newest run, no path for a run below `runs`.
     """
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
@@ -184,7 +186,7 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
 
 
 def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: bool) -> list[str]:
-    """The final screen, with the failure region of the held-out starts."""
+    """The final lines, with the region of held-out initial states in which the worst requirement fails."""
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
     folder = outcome.run.dir
@@ -203,7 +205,7 @@ def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: 
 
 
 def draw_report(folder: RunDir) -> None:
-    """Draw the report, or print how to install matplotlib if it is missing."""
+    """Write the report of a run with its pictures, or print how to install matplotlib if it is missing."""
     from stlc.view import available
 
     if not available():
