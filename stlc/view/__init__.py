@@ -19,7 +19,7 @@ def available() -> bool:
 
 
 def require_drawing() -> None:
-    """Raise MissingError (R301) if pictures cannot be drawn."""
+    """Raise MissingError (R301) if matplotlib or Pillow is not installed."""
     missing = _missing()
     if missing:
         verb = "is" if len(missing) == 1 else "are"

@@ -49,7 +49,8 @@ class Animation:
             canvas.
         alt: description in words.
         moment: index of the instant shown in a still picture.
-        draws: whether the returned function renders the canvas itself; otherwise it only updates artists.
+        draws: whether the function that `begin` returns renders the canvas itself; otherwise it only updates
+            artists.
     """
 
     frames: int
@@ -107,16 +108,16 @@ class VectorAnimation:
 
 
 def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Map from each colour to its replacement in the dark scheme.
+    """Return `dark`, the map from each colour to its replacement in the dark scheme, if it can be applied.
 
-    It is empty if an animation contains images, or colours that `dark` does not list.
+    Empty if an animation contains images, or colours that `dark` does not list.
     """
     known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}
 
 
 def clear_artists(axes: Axes) -> None:
-    """Remove all artists; much faster than clearing the axes."""
+    """Remove all artists from `axes`; much faster than clearing the axes."""
     for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.images):
         artist.remove()
     axes.dataLim.set_points(np.array([[np.inf, np.inf], [-np.inf, -np.inf]]))
@@ -136,7 +137,7 @@ def save_animation(
     max_frames: int = MAX_FRAMES,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write an animation as a GIF and as a video; every instant is drawn once.
+    """Write an animation as a GIF and, if `mp4` is given, as a video; every instant is drawn once.
 
     Args:
         animation: the animation.
@@ -163,7 +164,7 @@ def save_animation(
 
 
 def save_still(animation: Animation, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
-    """Write instant `at` of `animation` (default: its `moment`) as PNG or WebP."""
+    """Write instant `at` of `animation` (default: its `moment`) as PNG or WebP to `path`; return `path`."""
     write_atomic(path, still_bytes(animation, "webp" if path.suffix == ".webp" else "png", at=at, dpi=dpi))
     return path
 
@@ -209,7 +210,10 @@ NARROWEST = 160  # pixels
 
 
 def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> bytes:
-    """Encode pictures as a GIF, reduced in width until it has at most `max_bytes`."""
+    """Encode pictures as a GIF; reduce its width until it has at most `max_bytes`, or `NARROWEST` pixels.
+
+    Each picture is shown for `milliseconds`.
+    """
     data = encoded(pictures, milliseconds)
     while len(data) > max_bytes and pictures[0].width > NARROWEST:
         factor = max(0.6, 0.95 * (max_bytes / len(data)) ** 0.5)
@@ -220,7 +224,10 @@ def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> byt
 
 
 def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
-    """Encode pictures as a GIF that repeats forever; the palette is computed from a few of the pictures."""
+    """Encode pictures, each shown for `milliseconds`, as a GIF that repeats forever.
+
+    The palette is computed from a few of the pictures.
+    """
     from PIL import Image
 
     many = min(SAMPLED, len(pictures))

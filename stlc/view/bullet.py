@@ -44,7 +44,11 @@ def available() -> bool:
 
 
 def stage_drawing(stage: Stage) -> Draw:
-    """Return the function that draws frame `index` of a scene: all robots rendered side by side."""
+    """Return a function `draw(axes, scene, index)` that renders the robots of a 3D scene side by side.
+
+    Args:
+        stage: joint angles of the robots, and the balls (goals and obstacles) around each of them.
+    """
     renderer = Renderer(stage, "picture")
 
     def draw(axes: Any, scene: Scene, index: int) -> None:
@@ -61,7 +65,12 @@ def stage_drawing(stage: Stage) -> Draw:
 
 
 def show(stage: Stage, scene: Scene, dt: float) -> None:
-    """Play a scene in PyBullet's window, in real time, until it ends.
+    """Play a 3D scene in PyBullet's window, in real time, until it ends or the window is closed.
+
+    Args:
+        stage: joint angles of the robots, and the balls (goals and obstacles) around each of them.
+        scene: recorded arrays (frames, …), among them the sources of decisions.
+        dt: seconds between frames.
 
     Raises:
         MissingError: R301, PyBullet is not installed; R302, there is no display.
@@ -81,7 +90,7 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
 
 
 def require_window() -> None:
-    """Raise MissingError R301 without PyBullet, R302 without a display."""
+    """Raise MissingError: R301 if PyBullet is not installed, R302 if there is no display."""
     if not available():
         message = "a window needs pybullet, which is not installed"
         raise MissingError(Diagnostic("R301", message, help=(ADVICE,)))
@@ -91,7 +100,10 @@ def require_window() -> None:
 
 
 class Renderer:
-    """PyBullet simulation that shows the robots of a stage, and the balls that belong to them, along x."""
+    """PyBullet simulation of the robots of a 3D scene, in a row along x, each with its balls.
+
+    The balls are goals and obstacles of a robot.
+    """
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
         with _silenced():
@@ -122,7 +134,11 @@ class Renderer:
                 self.client.disconnect()
 
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
-        """Show frame `index`; each robot is coloured by `who`, the source of its decision, (robots,)."""
+        """Show frame `index`.
+
+        `who` (robots,) is the source of each robot's decision (0: the policy, else a stage of the guard),
+        which determines its colour.
+        """
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
             angles = self.stage.joints[index, robot, :, None].tolist()
@@ -136,7 +152,10 @@ class Renderer:
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
 
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Render frame `index` as (height, width, 3); transparent balls are blended here, not by PyBullet."""
+        """Render frame `index` as an RGB image (height, width, 3); `who` is as in `turn`.
+
+        Transparent balls are blended here, not by PyBullet.
+        """
         self.turn(index, who)
         whole = self._rendered()
         for body in (body for bodies in self.balls for body in bodies):
@@ -155,7 +174,7 @@ class Renderer:
         return robots
 
     def _disc(self, place: NDArray[np.float64]) -> int:
-        """Add the disc on which a robot stands; returns its PyBullet number."""
+        """Add the disc on which a robot stands, centred at `place` in metres; return its PyBullet index."""
         radius = 0.28 * self.stage.reach
         shape = self.client.createVisualShape(self.client.GEOM_CYLINDER, radius=radius, length=0.01)
         return int(self.client.createMultiBody(0, -1, shape, (place - (0, 0, 0.006)).tolist()))
@@ -173,7 +192,10 @@ class Renderer:
         return int(self.client.createMultiBody(0, -1, shape))
 
     def _colour(self, robot: int, source: int) -> None:
-        """Colour the disc by the source of the decision; if the guard intervened, colour the robot, too."""
+        """Colour a robot's disc by `source`, the source of its decision.
+
+        If the guard intervened, the robot gets the same colour, else white.
+        """
         self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
         body = _WHITE if source == 0 else _rgba(DECIDED[source])
         for link in self.links:
@@ -249,7 +271,7 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 
 
 def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
-    """Return the path of a robot description with visual geometry: `urdf` itself, or else a copy in `folder`.
+    """Return the path of a robot description with visual geometry: `urdf` itself if it has any, else a copy.
 
     Args:
         urdf: path of the robot description (URDF); it may contain the kinematics only.

@@ -18,7 +18,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def draw_curves(rows: Rows) -> Picture | None:
-    """Draw learning curves from the rows of `train.jsonl`; None before the first measurement."""
+    """Draw learning curves from the rows of `train.jsonl`; None before the second measured accuracy."""
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None

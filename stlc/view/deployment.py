@@ -32,7 +32,10 @@ def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
 
 
 def deployment_section(contents: RunContents) -> Section | None:
-    """Section with tables of metrics (one column per guard), sources of decisions, and decision times."""
+    """Section with tables of metrics (one column per guard), sources of decisions, and decision times.
+
+    None without closed-loop results.
+    """
     guards = _guards(contents)
     if not guards:
         return None
@@ -50,7 +53,7 @@ def deployment_section(contents: RunContents) -> Section | None:
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
-    """A table with one column per guard; None if there are no rows."""
+    """Headed table of the given rows with one column per guard; None if there are no rows."""
     if not rows:
         return None
     header = ["", *(guard_words(name).title for name in guards)]
@@ -89,7 +92,10 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: shares of runs that satisfy all rules, of viable runs that do, and per rule."""
+    """Table rows: share of closed-loop runs that satisfy all rules, the same of viable runs, and per rule.
+
+    A run is viable unless no satisfying plan is known from its start or after an exogenous event.
+    """
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
     if not known:
@@ -112,7 +118,7 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _broken(simulation: Record | None) -> Html | None:
-    """Table of the closed-loop runs that violated a rule although a guard was active."""
+    """Table of the closed-loop runs under the last guard listed that violated a rule; None without them."""
     each = list(drives_of(simulation).values())
     broken = each[-1]["broken"] if each else []
     if not broken:

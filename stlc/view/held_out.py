@@ -62,7 +62,7 @@ class HeldOut:
 
     @property
     def unsearched(self) -> int:
-        """Number of starts from which the policy's plan fails and no other plan was searched."""
+        """Number of starts from which the policy's plan fails and no other plan was searched for."""
         return 0 if self.searched is None else int((~self.searched).sum())
 
     @property
@@ -72,7 +72,7 @@ class HeldOut:
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Number of starts from which the plans fail, and for how many a satisfying plan is known."""
+        """Number of starts from which the plans fail, and number of these with a known satisfying plan."""
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
@@ -101,7 +101,7 @@ class Weakness:
         requirement: index of the requirement.
         failing: share of all starts from which the requirement fails.
         conditions: the region is the conjunction of these conditions.
-        inside: share of the starts in the region that fail.
+        inside: share of failing starts among those in the region.
         covered: share of the failing starts that lie in the region.
         axes: indices of the two states that separate failing from satisfied starts best.
     """
@@ -135,7 +135,10 @@ def load_held_out(path: Path) -> HeldOut | None:
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """Return the region in which `requirement` (default: the worst) fails; None if it never fails."""
+    """Return the region in which a requirement fails; None if it never fails.
+
+    `requirement` is its index; by default it is the one that is violated from the most starts.
+    """
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
@@ -153,9 +156,10 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
-    """Return the best conjunction of a beam search.
+    """Return the conjunction of conditions that a beam search finds to describe the failing starts best.
 
-    A condition is added only if the score grows by at least the factor `LEAST_GAIN`.
+    The score is the F-score. A condition is added only if the score grows by at least the factor
+    `LEAST_GAIN`.
     """
     best: tuple[Condition, ...] = ()
     best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
@@ -187,10 +191,15 @@ def _f_score(region: Mask, failing: Mask) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """Values that occur frequently in one column of initial states; `continuous` if it has many other values.
+    """Values that occur frequently in one column of the initial states.
 
     A continuous state may have frequent values, too: a timer that starts at 0, a value that means "nothing
     there".
+
+    Attributes:
+        common: the frequent values; of a column that is not continuous, all values.
+        continuous: whether the column has many distinct values.
+        span: difference between the largest and the smallest value of the column.
     """
 
     common: tuple[float, ...]
@@ -220,7 +229,10 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
 
 
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """Indices of the two states to draw: those in the region's inequalities, then the best separating."""
+    """Indices of the two states to draw: first those that inequalities of the region compare.
+
+    The others follow in the order in which they separate failing from satisfied starts.
+    """
     used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
     focus = _region(x0, [each for each in conditions if each.op == "="])
     many = [c for c in every if len(np.unique(x0[focus, c])) > FEW_VALUES] or every
@@ -269,7 +281,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a failure region: share of failures in it, and its share of all failures."""
+    """Clause on a failure region: share of failures among its starts, and its share of all failures."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -302,7 +314,9 @@ def unsolved_text(held: HeldOut) -> str:
 def draw_failures(
     held: HeldOut, signature: Signature | None = None, units: Mapping[str, str] | None = None
 ) -> Picture | None:
-    """Draw the worst requirement's robustness over the two most separating states; None if nothing fails.
+    """Draw the robustness of the requirement that fails most over the two states that separate failures best.
+
+    Returns None if nothing fails.
 
     Args:
         held: starts and robustness of their plans.

@@ -84,7 +84,7 @@ def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") ->
 
 
 def facts(pairs: Iterable[tuple[str, Child]]) -> Html:
-    """Names and values in two columns."""
+    """HTML list of (name, value) pairs in two columns; pairs with an empty value are left out."""
     return classed("dl", "facts", [Html(el("dt", name) + el("dd", value)) for name, value in pairs if value])
 
 
@@ -117,7 +117,7 @@ class Section:
 def page(
     title: str, head: Child, sections: Sequence[Section], foot: Child, script: Html | None = None
 ) -> str:
-    """The HTML page.
+    """HTML text of a self-contained page.
 
     Args:
         title: title of the browser's tab.

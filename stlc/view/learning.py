@@ -45,9 +45,10 @@ class Curve:
     Attributes:
         state: `short`: too few search rounds for an extrapolation; `flat`: twice the steps would change
             little; `rising`.
-        times: factor by which the number of steps must grow until the curve reaches the share `TRAINED` at
-            its present slope; curves flatten, so the square of the factor is the upper end of the forecast.
-            None if it exceeds `MOST_TIMES` or if the curve is not rising.
+        times: factor by which the number of steps must grow until the policy solves the share `TRAINED` of
+            the feasible starts, at the present slope of the curve. Curves flatten, so the square of the
+            factor is the upper end of the forecast. None if it exceeds `MOST_TIMES` or if the curve is not
+            rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -103,9 +104,13 @@ class Commands:
 
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
-        """Return the commands for the run named `run`; for the `newest` run, `simulate` omits the name.
+        """Return the commands for the run named `run`.
 
-        `guard` is the recommended guard: `none`, `paper` or `full`.
+        Args:
+            run: name of the run.
+            newest: whether it is the newest run, whose name `simulate` omits.
+            start: program that the training command calls.
+            guard: the recommended guard: `none`, `paper` or `full`.
         """
         run = shell((operand(run),))
         simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))
@@ -123,7 +128,8 @@ def recommended(record: Mapping[str, Any]) -> str:
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
     """Lines on the closed-loop results of a run: one per guard, best first, and the recommendation.
 
-    Empty if there are no closed-loop results in the record; the reason if no simulation was possible.
+    Empty if `result` contains no closed-loop results. If no simulation was possible, the only line states the
+    reason.
     """
     found = result.get("closed_loop")
     if not isinstance(found, Mapping):
@@ -157,7 +163,10 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """Line on the closed-loop runs that a guard gains and loses, compared with no guard."""
+    """Line on the closed-loop runs that a guard gains and loses, compared with no guard.
+
+    "" if no run was compared.
+    """
     if not each.get("compared"):
         return ""
     return (
@@ -245,11 +254,16 @@ def learning_of(
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
-    """Extrapolate the accuracy of plans towards `feasible` from a training's rows and its final `accuracy`.
+    """Extrapolate the learning curve of plan accuracy beyond a training.
 
     A line is fitted to the log-odds of success over the logarithm of the step, without the first quarter of
     the steps, and continued from the final accuracy. The forecast is rough, as the learning rate decays at
     the end of every training.
+
+    Args:
+        rows: lines of `train.jsonl`.
+        accuracy: final share of starts from which the policy's plan satisfies the specification.
+        feasible: share of starts from which a satisfying plan is known, which the accuracy cannot exceed.
     """
     pairs = [
         (float(row["step"]), float(row["accuracy"]) / feasible)

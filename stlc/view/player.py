@@ -46,7 +46,7 @@ class _Track:
 
 
 def player_section(contents: RunContents) -> Section | None:
-    """The animation of the latest closed-loop run; None if none was recorded."""
+    """Section with the animation of the latest closed-loop run; None if no run was recorded."""
     panels = run_panels(contents.run)
     if not panels:
         return None
@@ -67,7 +67,7 @@ def player_section(contents: RunContents) -> Section | None:
 
 
 def script() -> Html:
-    """The page's script; it loads nothing else."""
+    """JavaScript of the page (`player.js`) as markup; it loads no other file."""
     return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
 
 
@@ -98,7 +98,10 @@ def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], co
 
 
 def _still(contents: RunContents) -> Html | None:
-    """The still picture of the animation, drawn if its file is missing."""
+    """The still picture of the animation, drawn anew if its file is missing or out of date.
+
+    None if no run was recorded.
+    """
     path = contents.run.path / STILL
     if current(contents.run) and path.is_file():
         kind, content = "png", path.read_bytes()
@@ -220,7 +223,10 @@ def _svg(parts: Iterable[Html]) -> Html:
 
 
 def _up(values: Floats, limits: tuple[float, float]) -> Floats:
-    """Vertical coordinates of values in a strip chart with these limits, measured from its upper edge."""
+    """Vertical coordinates of values in a strip chart, measured from its upper edge.
+
+    `limits` are the values at the lower and upper edge; values beyond them are moved to the edge.
+    """
     low, high = limits
     return np.asarray(_HIGH - _HIGH * (np.clip(values, low, high) - low) / ((high - low) or 1.0))
 
@@ -300,7 +306,7 @@ def _data(
     tracks: Sequence[Sequence[_Track]],
     shown: range,
 ) -> Html:
-    """Data of the animations as JSON, escaped for a `<script>` element."""
+    """Data of the animations at the frames `shown` as JSON, escaped for a `<script>` element."""
     dt = panels[0].dt
     document: dict[str, Any] = {
         "times": [round(index * dt, 9) for index in shown],

@@ -55,7 +55,7 @@ def recorded_section(contents: RunContents) -> Section | None:
 
 
 def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
-    """Verdicts by the separate specification for closed-loop runs in the trace; None if there is none."""
+    """Verdicts on the trace by its separate specification for closed-loop runs; None if it stores none."""
     if not trace.meta.judge_text:
         return None
     try:

@@ -58,7 +58,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class RegionMap:
-    """Data of a map.
+    """Paths of a trace and regions of its specification, as drawn in a map.
 
     Attributes:
         trace: the recorded trace.
@@ -114,7 +114,10 @@ def draw_map(region_map: RegionMap) -> Picture:
 
 
 def map_animation(region_map: RegionMap, *, title: str = "") -> Animation:
-    """Animation of the map: a region is filled while it is active, and agents leave fading trails."""
+    """Animation of the map: a region is filled while it is active, and agents leave fading trails.
+
+    A region is active while a requirement refers to it.
+    """
 
     def begin(figure: Figure) -> Callable[[int], None]:
         plot, rows = _layout(figure, region_map)
@@ -237,7 +240,11 @@ def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None:
-    """Draw the share of traces in a region over time, and shade the times at which the region is active."""
+    """Draw the share of traces in a region over time, and shade the times at which the region is active.
+
+    A region is active while a requirement refers to it. If one visit is enough, a dashed line shows the share
+    of traces that have visited it.
+    """
     color, times = region_map.color(region), region_map.trace.times
     for low, high in region.windows:
         axes.axvspan(
@@ -303,7 +310,8 @@ class Use:
         requirement: name of the requirement.
         negative: whether the region is to be avoided: it occurs under an odd number of negations.
         visit: whether one visit is enough: the region occurs under an `eventually` or the like.
-        window: time in which the occurrence counts, in seconds of the trace's time; None: always.
+        window: (first, last) time at which the occurrence counts, in seconds since the start of the trace;
+            None: always.
     """
 
     requirement: str
@@ -319,7 +327,7 @@ class MapRegion:
     Attributes:
         name: name as declared, or the expression of the region.
         uses: occurrences of the region in the specification.
-        monitor: evaluates whether a point is in the region.
+        monitor: evaluates whether points are in the region, and their distance to its border.
     """
 
     name: str
@@ -344,12 +352,15 @@ class MapRegion:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Time intervals in which the region is active; empty if it is always active."""
+        """Time intervals in which the region is active: a requirement refers to it.
+
+        In seconds since the start of the trace; empty if the region is always active.
+        """
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
     def active(self, seconds: Any) -> Mask:
-        """True for those times, in seconds of the trace's time, at which the region is active."""
+        """True for those times, in seconds since the start of the trace, at which the region is active."""
         windows = self.windows or ((-np.inf, np.inf),)
         return np.asarray(np.any([(low <= seconds) & (seconds <= high) for low, high in windows], axis=0))
 
@@ -372,7 +383,7 @@ class Plane:
     regions: tuple[MapRegion, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
-        """Limits of the map along both axes: they contain all paths, and the regions near them."""
+        """Limits of the map along both axes: they contain nearly all of the paths, and the regions nearby."""
         ends = []
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
@@ -398,7 +409,18 @@ class Plane:
         *,
         count: int = GRID,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Signed distance to a region's border on a grid: coordinates along both axes, and values (y, x)."""
+        """Evaluate the signed distance to a region's border on a grid.
+
+        Args:
+            region: the region.
+            like: trace that declares the signals on the axes.
+            window: limits of the grid along both axes.
+            count: number of grid points along each axis.
+
+        Returns:
+            Horizontal coordinates (count,), vertical coordinates (count,), and distances (vertical,
+                horizontal), positive inside.
+        """
         (left, right), (low, high) = window
         xs, ys = np.linspace(left, right, count), np.linspace(low, high, count)
         across, up = np.meshgrid(xs, ys)
@@ -460,7 +482,7 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 
 
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Yield every predicate of a requirement, with its polarity and the time in which it counts."""
+    """Yield every predicate of a requirement, with its polarity and the time interval in which it counts."""
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()
@@ -486,10 +508,10 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """The occurrence inside a temporal operator, with the operator's window in seconds of the trace's time.
+    """Return the occurrence inside a temporal operator, restricted to the window of the operator.
 
-    It is unchanged if the window has no fixed place in time, since the operator is evaluated at many
-    instants.
+    If the operator is evaluated at many instants, its window has no fixed place in time, and the occurrence
+    is returned unchanged.
     """
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)

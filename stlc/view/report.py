@@ -112,7 +112,7 @@ def render_report(contents: RunContents, sections: list[Section]) -> str:
 def headline(contents: RunContents) -> Html:
     """Result of the run in one sentence, with advice.
 
-    If closed-loop runs were simulated, these count; otherwise the policy's plans.
+    The result is that of the closed-loop runs if any were simulated, otherwise that of the policy's plans.
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
     obeyed, viable = obeyed_sentence(simulation), viable_sentence(simulation)
@@ -298,7 +298,10 @@ _TITLES = {
 
 
 def failures_section(contents: RunContents) -> Section | None:
-    """Section on the region of initial states from which the policy's plans fail; None without failures."""
+    """Section on the region of initial states from which the policy's plans fail.
+
+    If no plan fails, the section says so. None without held-out initial states.
+    """
     if contents.held_out is None:
         return None
     picture = draw_failures(contents.held_out, contents.signature, contents.units)
@@ -378,7 +381,7 @@ def _simulate(contents: RunContents) -> list[str]:
 
 
 def texts_section(contents: RunContents) -> Section | None:
-    """Section with the texts of specification and system; the files derived from them are collapsed."""
+    """Section with the texts of specification, system and derived files; all but the first are collapsed."""
     if not contents.texts:
         return None
     blocks = []

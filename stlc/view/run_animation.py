@@ -1,6 +1,7 @@
 """Animation of a closed-loop run: the drawing of its world (simulated environment), a map, or signals.
 
-The map shows the regions of the specification; signals are the last resort.
+The map shows the paths over the regions of the specification. Signals are drawn if there is neither a world
+nor a region.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ PANEL = 5.8
 
 @dataclass(frozen=True, slots=True)
 class AnimationFiles:
-    """The files of an animation; the video is None without ffmpeg."""
+    """Paths of the files of an animation; the video `mp4` is None if ffmpeg is not installed."""
 
     gif: Path
     mp4: Path | None
@@ -104,7 +105,7 @@ def animate(
 
 
 def current(run: RunDir) -> bool:
-    """True if the animation in the folder shows the latest closed-loop run."""
+    """True if the animation file in the run's folder is at least as new as the recorded closed-loop run."""
     gif = run.path / f"{animation_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
     return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
@@ -115,7 +116,8 @@ class RecordedScene:
     """A recorded scene with the world (simulated environment) that draws it.
 
     Attributes:
-        scene: recorded values stacked to (frames, …), and `violated` (frames, agents) if verdicts are known.
+        scene: name -> values recorded, (frames, …); `violated` (frames, agents) is added if verdicts are
+            known.
         world: draws the scene.
         dt: seconds between frames.
         judged: verdicts on the agents; None if they cannot be evaluated.
@@ -130,7 +132,7 @@ class RecordedScene:
 
     @property
     def stage(self) -> Stage | None:
-        """The 3D stage on which PyBullet draws the robots; None if the world has none."""
+        """Robots and the balls around them (3D scene) to be drawn by PyBullet; None if the world has none."""
         return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
 
     @property
@@ -145,7 +147,7 @@ class RecordedScene:
 
     @property
     def strip(self) -> Strip | None:
-        """Strip charts below the scene; None if neither margins nor decisions are known."""
+        """Strip charts below the scene; None if margins or decisions are unknown."""
         decisions = self.scene.get("decision")
         if self.judged is None or decisions is None:
             return None
@@ -153,10 +155,10 @@ class RecordedScene:
 
 
 def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None:
-    """The recorded scene of the run's latest closed-loop simulation.
+    """Return the recorded scene of the run's latest closed-loop simulation.
 
-    None if nothing was recorded, or if its world (simulated environment) cannot be loaded. With `guarded`
-    False, the simulation of the same seed without the guard, if it was recorded.
+    If `guarded` is False, it is the scene of the simulation of the same seed without the guard. Returns None
+    if the scene was not recorded, or if its world (simulated environment) cannot be loaded.
     """
     from stlc.controller.world import world_type
     from stlc.dynamics.declaration.load import load_system_decl
@@ -218,11 +220,11 @@ class RunPanel:
         dt: seconds between frames.
         t0: time of the first frame in seconds.
         keys: legend entries.
-        strip: strip charts.
+        strip: strip charts; None if there is nothing to show in them.
         events: violations.
         names: names of the agents.
         requirements: names of the evaluated requirements.
-        vector_frames: returns the drawing commands of the given frames.
+        vector_frames: function from a range of frames to their drawing commands.
     """
 
     title: str
@@ -248,8 +250,8 @@ WITHOUT, WITH = "without the guard", "with the guard"
 def run_panels(run: RunDir) -> list[RunPanel]:
     """Panels for a page on the latest closed-loop simulation: its first seed without and with the guard.
 
-    There is one panel if no simulation without the guard was recorded, or if there is no world (simulated
-    environment) to draw; it then shows the trace. The list is empty without a recording.
+    There is only one panel if no simulation without the guard was recorded. If there is no world (simulated
+    environment) to draw the scene, the only panel shows the trace. The list is empty without a recording.
     """
     found, other = recorded_scene(run), recorded_scene(run, guarded=False)
     try:

@@ -54,7 +54,7 @@ class SceneOptions:
     """Parameters of a scene's animation.
 
     Attributes:
-        draw: function that draws a frame on axes.
+        draw: function that draws a frame of a scene on axes: `draw(axes, scene, index)`.
         dt: seconds between frames.
         title: title of the picture.
         keys: further legend entries: label -> colour.
@@ -70,7 +70,13 @@ class SceneOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """Layout in inches from the lower left; a rectangle is (left, bottom, width, height)."""
+    """Layout of a scene's animation, in inches; a rectangle is (left, bottom, width, height).
+
+    Attributes:
+        size: width and height of the picture.
+        scene: rectangle of the scene.
+        rows: rectangles of the strip charts.
+    """
 
     size: tuple[float, float]
     scene: tuple[float, float, float, float]
@@ -78,7 +84,7 @@ class _Plan:
 
 
 def frames_of(scene: Scene) -> int:
-    """Number of instants."""
+    """Number of frames of a scene, a mapping from names to recorded arrays (frames, …)."""
     return min(len(values) for values in scene.values())
 
 
@@ -119,7 +125,10 @@ def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
 
 
 def _moment(scene: Scene, frames: int) -> int:
-    """Frame with most interventions, first and last sixth excluded; the middle one without interventions."""
+    """Index of the frame with most interventions of the guard, without the first and last sixth of frames.
+
+    Without interventions it is that of the middle frame.
+    """
     middle = frames // 2
     low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)
     acted = (scene["decision"][low:high] > 0).sum(1) if "decision" in scene else np.zeros(0)
@@ -130,7 +139,7 @@ def _moment(scene: Scene, frames: int) -> int:
 
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
-    """Aspect ratio (height / width) of the picture that `draw` makes of a scene."""
+    """Aspect ratio (height / width) of the picture that `draw` makes of a scene, limited to 0.15 to 1.6."""
     with picture_style():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)

@@ -70,7 +70,7 @@ def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def acted_in(trace: Trace) -> NDArray[np.int64] | None:
-    """Number of interventions of the guard, (traces,); None if decisions were not recorded."""
+    """Number of interventions of the guard in each trace, (traces,); None if decisions were not recorded."""
     decisions = decisions_of(trace)
     return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
 
@@ -79,7 +79,10 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def margin_limits(rho: Floats) -> tuple[float, float]:
-    """Vertical limits of a robustness plot, with 0 inside; large margins are cut off to show violations."""
+    """Lower and upper limit of a robustness plot, with 0 inside; large margins are cut off.
+
+    Violations thus remain visible beside large margins.
+    """
     finite = rho[np.isfinite(rho)]
     if not len(finite):
         return -1.0, 1.0
@@ -132,10 +135,10 @@ class Choice:
 def choose_traces(
     least: Floats, names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
 ) -> tuple[Choice, ...]:
-    """Choose the traces to draw: the least robust one, and the one with most interventions.
+    """Choose the traces to draw: the least robust one, and the one with most interventions of the guard.
 
-    If there are no interventions, the second trace is one of median robustness; one trace if both are the
-    same.
+    If there are no interventions, the second trace is one of median robustness. If both are the same trace,
+    it is returned once.
 
     Args:
         least: robustness per trace, (traces,); NaN if unknown.
@@ -194,7 +197,7 @@ def left_out(trace: Trace) -> list[str]:
 
 
 def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
-    """Kind and name of each panel: numeric signals, discrete signals, decisions, requirements."""
+    """(kind, name) of each panel: numeric signals, discrete signals, decisions, requirements."""
     columns = trace.signature.columns
     rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
     if len(rows) > MOST_LINES:
@@ -225,7 +228,10 @@ def _wrapped(title: str) -> str:
 
 
 def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, index: int) -> None:
-    """Draw a panel of trace `index`; interventions of the guard are shaded behind numbers and margins."""
+    """Draw one panel of trace `index`: signal, decisions or robustness, as `kind` says.
+
+    Interventions of the guard are shaded behind numeric signals and robustness.
+    """
     match kind:
         case "line":
             axes.plot(trace.times, _broken(trace.data[name][index]), color=INK, lw=1.1)
@@ -249,7 +255,10 @@ def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, 
 
 
 def _broken(values: Floats) -> Floats:
-    """A signal with NaN at jumps (such as a reset), where no line is drawn; a step function is unchanged."""
+    """Return a signal with NaN at its jumps (such as resets), so that no line is drawn across them.
+
+    A signal that changes mainly by large steps is returned unchanged.
+    """
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
     span = float(np.ptp(values))
@@ -303,14 +312,14 @@ class Strip:
 
     @property
     def rows(self) -> list[str]:
-        """Names of the requirements with a strip chart, which are those with the least margins."""
+        """Names of the at most `MOST_ROWS` requirements with the least margins, which get a strip chart."""
         known = [name for name, rho in self.margins.items() if np.isfinite(rho).any()]
         least = sorted(known, key=lambda name: float(np.nanmin(finite(self.margins[name]))))[:MOST_ROWS]
         return [name for name in known if name in least]
 
     @property
     def height(self) -> int:
-        """Number of strip charts."""
+        """Number of strip charts, including the chart of interventions."""
         return len(self.rows) + bool(self.acted.any())
 
     @property
@@ -332,10 +341,10 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class FrameUpdate:
-    """Artists that change from frame to frame.
+    """Artists that change from frame to frame, and their update.
 
     Attributes:
-        turn: function that updates the artists to a frame, by index.
+        turn: function that updates the artists to the frame of a given index.
         artists: the artists.
     """
 
@@ -400,7 +409,7 @@ def _titled(axes: Axes, name: str) -> Text:
 
 
 def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
-    """Cover the times after the present frame, with a line at the present time; return the update."""
+    """Cover the times after the present frame, and draw a line at the present time; return the update."""
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))

@@ -104,7 +104,10 @@ _RC: Any = {
 
 @contextmanager
 def picture_style() -> Iterator[None]:
-    """Apply matplotlib's settings for pictures within the block."""
+    """Apply matplotlib's settings for pictures within the block.
+
+    Raises MissingError (R301) if matplotlib or Pillow is not installed.
+    """
     require_drawing()
     import matplotlib as mpl
 
@@ -167,7 +170,7 @@ class Picture:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
-        """Write the figure on a white background to `path`."""
+        """Write the figure on a white background to `path` as PNG; return `path`."""
         with picture_style(), atomic_path(path) as beside:
             self._lay_out()
             self.figure.savefig(beside, format="png", dpi=dpi, facecolor=PAPER)

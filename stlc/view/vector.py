@@ -136,7 +136,7 @@ class CommandRenderer(RendererBase):
         self._enter(("t", *at, s, size, _color(gc.get_rgb(), gc), align, round(-angle), int(bold)))
 
     def get_text_width_height_descent(self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
-        """Width, height and descent of a text in dots, as on a canvas."""
+        """Width, height and descent of a text in dots, as measured by matplotlib's Agg renderer."""
         wide, high, deep = self._letters.get_text_width_height_descent(s, prop, ismath)
         return float(wide), float(high), float(deep)
 

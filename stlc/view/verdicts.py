@@ -1,4 +1,4 @@
-"""Verdicts on recorded closed-loop runs by their own specification: robustness margins and violations."""
+"""Verdicts on recorded closed-loop runs by the specification in the trace: margins and violations."""
 
 from __future__ import annotations
 
@@ -135,7 +135,14 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
 
 
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
-    """Strip charts of the agents' margins and of the sources of the decisions, (frames, agents)."""
+    """Strip charts of the agents' margins, and of the sources of decisions.
+
+    Where possible, the margins are those of agents for which the world behaves as the model.
+
+    Args:
+        judged: verdicts on the agents.
+        decisions: source of each decision, (frames, agents); None if not recorded.
+    """
     rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
     times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
     if judged.consistent is not None:
@@ -159,7 +166,7 @@ def model_consistent(trace: Trace, agents: int) -> Mask | None:
 
 
 def least(rho: Floats, counts: Mask | bool = True) -> Floats:
-    """Least robustness over the agents that count: (agents, samples) -> (samples,); NaN if none is known."""
+    """Least robustness over the agents with `counts`: (agents, samples) -> (samples,); NaN if unknown."""
     known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
     return np.where(np.isfinite(known), known, np.nan)
 

@@ -96,7 +96,10 @@ def count(many: int, what: str) -> str:
 
 
 def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
-    """Guard -> results of its closed-loop runs, from `eval/simulate.json`; empty if the file is too old."""
+    """Guard -> results of its drives (closed-loop runs of one agent with one seed).
+
+    They come from `eval/simulate.json`; empty if the file is too old.
+    """
     guards = (simulation or {}).get("guards")
     each = guards.items() if isinstance(guards, Mapping) else ()
     found = {name: guard.get("drives") for name, guard in each if isinstance(guard, Mapping)}
@@ -132,7 +135,10 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Sentence on drives lost since no satisfying plan was known, and on the others; "" if none was lost."""
+    """Sentence on lost drives, for which no satisfying plan was known, and on the other drives.
+
+    A drive is the closed-loop run of one agent with one seed. "" if no drive was lost.
+    """
     each = list(drives_of(simulation).values())
     if not each or not each[-1]["lost"]:
         return ""
@@ -151,7 +157,10 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
-    """Reason for which a drive violated a rule, from an entry of `broken`; "" if unknown."""
+    """Text: the reason for which a drive (closed-loop run of one agent) violated a rule; "" if unknown.
+
+    `broken` is an entry of the list `broken` in `eval/simulate.json`.
+    """
     cause = broken.get("cause") or {"why": "start" if broken["lost"] else ""}
     if cause["why"] in ("start", ""):
         return "lost from its start" if cause["why"] else ""
