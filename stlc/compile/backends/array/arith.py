@@ -1,8 +1,8 @@
 """Numeric expressions (`ir.Num`) as programs over any array library.
 
-A program is built once and called often. It records its operations on a tape
-(`stlc.compile.backends.array.tape`), one per treatment of conditions, bound to the array library; a call
-executes the tape from top to bottom.
+A program is built once and called often. Its operations are recorded on a tape, a list of operations
+(`stlc.compile.backends.array.tape`), with one tape for exact conditions (0 or 1) and one for soft ones. The
+operations are then bound to the functions of an array library; a call executes them in order.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ class ArrayProgram:
         constants: signals whose value is known when the program is built (`dt`, constants of a system).
         externs: functions of the system that `ir.Extern` names.
 
-    A call takes a dictionary of arrays that broadcast, one for each name in `columns` (shifted signals under
-    the keys of `shifted`), and returns one array per output; a constant output takes the shape of the first
-    array in the dictionary. Common sub-expressions are computed once.
+    A call takes a dictionary with one array for each name in the attribute `columns`; the arrays must
+    broadcast. A signal that is read some samples earlier or later is a separate entry, under its key in
+    `shifted`. The call returns one array per output; a constant output has the shape of the first array in
+    the dictionary. Common sub-expressions are computed once.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class ArrayProgram:
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
-        """Return all outputs; `switch` determines how conditions become numbers (None: exactly 0 or 1)."""
+        """Return all outputs by name; `switch` turns conditions into numbers (None: exactly 0 or 1)."""
         switch = switch or Hard()
         like = _first(env)
         key = (ops.name, switch, ops.kind(like))
@@ -74,7 +75,7 @@ class ArrayProgram:
             return bound.run(env, ops)
 
     def operations(self, *, exact: bool = True) -> int:
-        """Number of array operations per call, with exact (0 or 1) or with soft conditions."""
+        """Number of array operations per call, with exact conditions (0 or 1) or with soft ones."""
         tape, outputs = self._tape(exact=exact)
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
@@ -131,7 +132,11 @@ class ArrayProgram:
 
 @dataclass(frozen=True, slots=True)
 class _Bound:
-    """Tape bound to the functions of an array library; `registers` holds the intermediate results."""
+    """Tape (list of operations) bound to the functions of an array library, ready to run.
+
+    `registers` is the initial memory of a run, with the constants in place. `arrays` and `numbers` are the
+    outputs: register of an array, and value of a constant output.
+    """
 
     inputs: list[tuple[str, int]]
     code: list[tuple[Callable[..., Any], tuple[int, ...], int]]
@@ -159,7 +164,7 @@ def _first(env: Mapping[str, Array]) -> Array:
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
-    """Numbers of the registers that the outputs depend on, in order."""
+    """Numbers of the registers on which the outputs depend, in ascending order."""
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
     while stack:
@@ -173,8 +178,8 @@ def _needed(tape: GradientTape, outputs: Any) -> list[int]:
 class _TapeWriter(NumberEvaluator[Operand]):
     """Writer of expressions and state formulas (formulas without temporal operators) to a tape.
 
-    If `exact`, a condition is a mask; otherwise a margin, which the switch converts to a weight between 0 and
-    1.
+    If `exact`, a condition is written as a mask of booleans; otherwise as its margin, which the switch
+    converts to a weight between 0 and 1.
     """
 
     def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
@@ -225,7 +230,10 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
 
     def _truth(self, cond: ir.Formula) -> int | bool:
-        """Mask of a state formula (one without temporal operators); `>` and `>=` are distinguished."""
+        """Register of the mask where a state formula is true, or its truth value if that is constant.
+
+        A state formula has no temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
+        """
         match cond:
             case ir.Truth(value):
                 return value
@@ -248,7 +256,12 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """Soft weight of a state formula's margin; corrected by its mask if it contains both `>` and `>=`."""
+        """Register of the soft weight, between 0 and 1, of a state formula, or the weight if it is constant.
+
+        The weight follows from the margin of the formula. If the formula contains both `>` and `>=`, the
+        margin does not determine the truth at 0, so the weight is adjusted by the exact truth
+        (`Switch.settle`).
+        """
         kinds = _strictness(cond)
         margin = self.margin(cond)
         truth = self._truth(cond) if len(kinds) > 1 else None
@@ -275,7 +288,9 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 
 
 def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
-    """Return the inputs of `program` at the instants `run`, `(count, batch)` each; at least one input.
+    """Return the arrays that `program` reads at the instants `run`, by name, `(count, batch)` each.
+
+    For a program that reads no signal an arbitrary signal is returned, whose shape its constant outputs take.
 
     Args:
         program: program whose inputs are read; all samples that it needs at these instants must exist.
@@ -299,7 +314,10 @@ def _rows(column: Array, start: int, count: int) -> Array:
 
 
 def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """Return a shifted signal; a clamped one repeats its first and last sample outside the trace."""
+    """Values of a signal at the instants `run`, shifted in time by the steps of `at`: `(count, batch)`.
+
+    Outside the trace the first or the last sample is repeated.
+    """
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
     if not before and not after:

@@ -1,7 +1,8 @@
 """Evaluation of `freeze`: a formula that refers to signal values at the instant at which it is evaluated.
 
-Each instant binds its own values, so instants become an axis: signals `(time, batch)` are copied to
-`(time, instants * batch)`. If the body reads a bounded neighbourhood of the instant, only that is copied.
+The values bound by `freeze` differ from instant to instant, so instants become part of the batch axis:
+signals `(time, batch)` are copied to `(time, instants * batch)`. If the body reads only samples within a
+bounded distance of the instant, only these are copied.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ class Freezer:
     """Evaluator of `freeze` formulas on one trace.
 
     Attributes:
-        domain: length of the trace and treatment of its end.
+        domain: length of the trace, and treatment of instants beyond its last sample.
         env: signals of the trace, and values bound by enclosing `freeze` formulas.
         ops: array library of `env`.
-        judge: function that evaluates formulas.
+        judge: function that evaluates a formula on given signals at given instants.
     """
 
     domain: TraceDomain
@@ -61,9 +62,10 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Yield values at instants at which some bound value is undefined.
+        """Yield the robustness at instants at which a bound value is undefined, in chunks.
 
-        Predicates that read an undefined value are unknown, or false if windows are clipped to the trace.
+        A predicate that reads an undefined value is unknown if the trace is open (continues beyond its last
+        sample), and false otherwise.
         """
         for missing, instants in groupby(
             range(run.start, run.start + run.count), partial(self._undefined, node)
@@ -79,7 +81,7 @@ class Freezer:
                 yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
     def _undefined(self, node: ir.Freeze, instant: int) -> frozenset[str]:
-        """Names of the bound values that are undefined at an instant: they read samples outside the trace."""
+        """Names of the bound values that are undefined at `instant`: they read samples outside the trace."""
         domain, run = self.domain, spanning(instant, 1)
         return frozenset(
             name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
@@ -99,7 +101,11 @@ class Freezer:
             yield from self._whole(node, IndexRange(last + 1, run.last), back, ahead)
 
     def _near(self, node: ir.Freeze, run: IndexRange, back: int, ahead: int) -> Iterator[Array]:
-        """Evaluate instants whose neighbourhood lies within the trace, on copies of the neighbourhood."""
+        """Yield the robustness at the instants `run`, in chunks, from a copy of each instant's neighbourhood.
+
+        The neighbourhood, from `back` samples before the instant to `ahead` after it, must lie within the
+        trace.
+        """
         length = back + ahead + 1
         domain = replace(self.domain, samples=length, stop=None)
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
@@ -110,7 +116,11 @@ class Freezer:
             yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
     def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
-        """Evaluate arbitrary instants, each on its own copy of the trace around it."""
+        """Yield the robustness at the instants `run`, in chunks; neighbourhoods may end outside the trace.
+
+        Each instant of a chunk is evaluated on its own copy of the samples from `back` before the first to
+        `ahead` after the last instant of the chunk.
+        """
         ops, batch = self.ops, self._batch
         for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
             start = max(chunk.start - back, 0)
@@ -129,7 +139,7 @@ class Freezer:
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
     def _bound_values(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
-        """Bound values of each instant in `run`, repeated along time: `(length, count * batch)`."""
+        """Values bound at each instant in `run`, by name, repeated along time: `(length, count * batch)`."""
         program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
         blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
@@ -137,7 +147,10 @@ class Freezer:
         return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
 
     def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
-        """Signals, and values bound by enclosing `freeze` formulas, that the body reads; at least one."""
+        """Signals, and values bound by enclosing `freeze` formulas, that the body reads, by name.
+
+        If the body reads none, the result is an arbitrary signal, for its shape.
+        """
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
@@ -157,7 +170,7 @@ def _combined_reach(node: ir.Freeze, domain: TraceDomain) -> Reach:
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
-    """Numbers of samples before and after its instant that a formula reads; inf: all."""
+    """Numbers of samples that a formula reads before and after its instant; inf for all samples."""
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(depends_on_ends, numbers(body))):
@@ -167,9 +180,10 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Number of instants to evaluate at once: c of them need c (c + width) values, `most` at most.
+    """Number of instants to evaluate at once: the greatest that needs no more than `most` values, at least 1.
 
-    A window of infinite width needs c * samples values. At least one instant is evaluated.
+    For c instants c (c + width) values are needed: each instant has a copy of c + width samples. If `width`
+    is infinite, each has a copy of all samples of the trace.
     """
     if math.isinf(width):
         return max(most // samples, 1)
@@ -182,7 +196,7 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 
 
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
-    """Replace predicates that read one of the undefined values `names` by constants."""
+    """Return `body` with each predicate that reads an undefined value, one of `names`, made constant."""
     match body:
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:

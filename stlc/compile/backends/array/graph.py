@@ -52,16 +52,16 @@ def evaluate(
         semantics: definition of min and max; None is `Exact()`.
         start: first instant.
         count: number of instants.
-        end: treatment of instants beyond the last sample.
-        stop: number of samples that the trace will have in the end, if `end` is "lower" or "upper"; None:
-            unbounded windows end with the last known sample.
+        end: treatment of instants beyond the last sample (`stlc.compile.schedule.schedule.Boundary`).
+        stop: final number of samples of a trace that continues (`end` "lower" or "upper"), where unbounded
+            windows end; None: they end with the last known sample.
 
     Returns:
         For each formula an array `(count, batch)`.
 
     Raises:
         ValueError: a window extends beyond the trace, and `end` is "strict".
-        TraceError: E306, bounds over all continuations need too many instants beyond the trace.
+        TraceError: E306, a lower or upper bound needs values at too many instants beyond the trace.
     """
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, end, windows, stop)
@@ -77,12 +77,13 @@ def evaluate_parts(
     end: Boundary,
     stop: int | None = None,
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
-    """Yield the exact robustness of a formula and of its sub-formulas at the instants that it needs.
+    """Yield the exact robustness of a formula at `instants`, and of its sub-formulas where it reads them.
 
     If `end` is "lower" or "upper", instants may lie beyond the last sample; for `stop` see `evaluate`.
 
     Yields:
-        Formula, instants and values `(instants, batch)`, operands first; nothing from inside a `freeze`.
+        Formula, instants and values `(instants, batch)`, operands before the formula that reads them; nothing
+        from inside a `freeze`.
     """
     windows = Windows(Exact(), ops)
     plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
@@ -99,7 +100,11 @@ def _domain(
 
 @lru_cache(maxsize=512)
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the cached evaluation plan for traces of one length. Raises ValueError as `evaluate`."""
+    """Return the cached plan that evaluates `formulas` at the instants `run` of traces of one length.
+
+    Raises:
+        ValueError: an instant, or a window if `domain.end` is "strict", lies beyond the trace.
+    """
     samples = domain.samples
     if run.start < 0 or (run.last >= samples and not domain.open):
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
@@ -118,7 +123,10 @@ def robustness_signal(
     semantics: Semantics | None = None,
     end: Boundary = "strict",
 ) -> Array:
-    """Return the robustness at every sample, `(time, batch)`; NaN if undefined under `end` "strict"."""
+    """Return the robustness at every sample, `(time, batch)`.
+
+    With `end` "strict", it is NaN where the formula needs samples beyond the trace.
+    """
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, "truncate" if end == "strict" else end, windows)
     samples = domain.samples
@@ -132,14 +140,18 @@ def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list
     """Execute an evaluation plan; returns the values of its formulas, `(count, batch)` each.
 
     Raises:
-        TraceError: E306, bounds over all continuations need too many instants beyond the trace.
+        TraceError: E306, a lower or upper bound needs values at too many instants beyond the trace.
     """
     values = _checked(plan, env, windows)
     return [values[root] for root in plan.schedule.roots]
 
 
 def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps. Raises TraceError (E306) above `MAX_BEYOND` or `MAX_VALUES`."""
+    """Return the values of all steps of a plan, `(count, batch)` each.
+
+    Raises:
+        TraceError: E306, more than `MAX_BEYOND` instants, or `MAX_VALUES` values, lie beyond the trace.
+    """
     batch = math.prod(next(iter(env.values())).shape[1:])
     if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * batch > MAX_VALUES):
         raise TraceError(_too_far(plan))
@@ -161,10 +173,10 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
 
 
 class Weighed(Protocol):
-    """Protocol of a requirement with a weight, as `stlc.compile.pipeline.CompiledRequirement` has it."""
+    """Requirement with its weight, such as `stlc.compile.pipeline.CompiledRequirement`."""
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """Formula with times in steps, simplified by the laws that hold in the semantics."""
+        """Formula with times in steps, simplified by the laws of min and max that hold in `semantics`."""
 
     @property
     def weight(self) -> float:
@@ -184,7 +196,8 @@ class RobustnessGraph:
         semantics: definition of min and max, or a name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
-    `smoothing` replaces the semantics by log-sum-exp with scale k, for one call.
+    The argument `smoothing` of a method replaces the semantics in that call by log-sum-exp with scale k =
+    `smoothing`.
 
     Raises:
         UsageError: U101, an unknown semantics, or `smoothing` for a semantics without a scale.
@@ -199,21 +212,21 @@ class RobustnessGraph:
         self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
-        """Overall robustness, `(batch,)`: minimum over the requirements of `weight * rho / scale`."""
+        """Overall robustness, `(batch,)`: minimum of `weight * rho / scale` over the requirements."""
         env, ops = self._columns(x)
         return self.columns(env, ops=ops, smoothing=smoothing)
 
     def per_requirement(self, x: Array, smoothing: float | None = None) -> Array:
-        """Robustness of each requirement without weight and scale, `(batch, rules)`."""
+        """Robustness of each requirement on trajectories `x`, without weight and scale: `(batch, rules)`."""
         env, ops = self._columns(x)
         return self.per_requirement_columns(env, ops=ops, smoothing=smoothing)
 
     def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
-        """Overall robustness from the signals that the requirements read, `(time, batch)` by name."""
+        """Overall robustness, `(batch,)`, from signals: name -> `(time, batch)`."""
         return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
 
     def overall(self, each: Array, smoothing: float | None = None) -> Array:
-        """Overall robustness from each requirement's, (batch, rules) -> (batch,); +inf without any."""
+        """Overall robustness from that of each requirement: (batch, rules) -> (batch,); +inf for no rules."""
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
@@ -226,7 +239,7 @@ class RobustnessGraph:
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None
     ) -> Array:
-        """Robustness of each requirement from signals `(time, batch)` by name: `(batch, rules)`."""
+        """Robustness of each requirement, `(batch, rules)`, from signals: name -> `(time, batch)`."""
         rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
         if not rows:
             like = next(iter(env.values()))

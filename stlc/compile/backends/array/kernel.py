@@ -61,10 +61,11 @@ class WindowKernel:
     traces: int
 
     def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Compute values from operands; with `back`, gradients of the operands from gradients of the values.
+        """Compute extrema or `until` from the operands; with `back`, gradients of the operands.
 
         Args:
-            arrays: operands and values; with `back` also gradients of the values and of the operands.
+            arrays: operands, then values; with `back` operands, gradients of the values, then gradients of
+                the operands. The last array, or with `back` the last `operands` arrays, are written.
             operands: 1 for extrema, 2 for `until` and `release`.
             back: whether to compute gradients.
 
@@ -83,10 +84,10 @@ class WindowKernel:
 
 
 def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sliding) -> WindowKernel | None:
-    """Return the kernel for operands `(time, batch)` of a dtype; None if there is none.
+    """Return the kernel for operands `(time, batch)` of a dtype; None if it cannot be used.
 
-    Working memory grows with the width of the windows; None if it exceeds both `_ROOM` and the size of an
-    operand.
+    It cannot be used for other dtypes than float32 and float64, if it cannot be compiled, or if its working
+    memory, which grows with the width of the windows, exceeds both `_ROOM` and the size of an operand.
     """
     if dtype not in _TYPES:
         return None

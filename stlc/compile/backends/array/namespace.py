@@ -28,10 +28,10 @@ Mask: TypeAlias = Any
 @final
 @dataclass(frozen=True, slots=True)
 class Sliding:
-    """Layout of `count` windows of `width` rows over an array of `rows` rows; window `j` starts at row `j`.
+    """Layout of sliding windows: `count` windows of `width` rows over an array of `rows` rows.
 
-    There is at least one window, and at most one per row. A window ends with the last row of the array at the
-    latest.
+    Window `j` starts at row `j`, and ends with the last row of the array at the latest. There is at least one
+    window, and at most one per row.
     """
 
     rows: int

@@ -113,12 +113,12 @@ class NumpyOps:
         return choose(*items) if len(items) == 2 else reduce(choose, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema over sliding windows by the C kernel, for wide batches; else None."""
+        """Exact extrema over sliding windows by the C kernel; None if NumPy is faster or no kernel fits."""
         wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
         return _by_kernel((x,), pick, window) if wide else None
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` and `release` by the C kernel, for wide batches or long windows; else None."""
+        """Exact `until` or `release` by the C kernel; None if NumPy is faster or no kernel fits."""
         wide = left.ndim == 2 and (left.shape[1] >= _WIDE or window.width >= _LONG)
         return _by_kernel((left, right), pick, window) if wide else None
 

@@ -1,7 +1,7 @@
-"""Execution of an evaluation schedule over arrays.
+"""Execution of an evaluation schedule (`stlc.compile.schedule.schedule`: a list of steps) over arrays.
 
-Predicates at the same instants are computed by one program, every other step by one function. Values are
-`(count, batch)`. Functions are built once per semantics and array library, and cached.
+The predicates at the same instants are computed by one program, every other step by one function. The values
+of a step are `(count, batch)`. Functions are built once per semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _ENDLESS = 1 << 60
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Predicates computed by one program at the same instants, which lie within the trace."""
+    """Program that computes several predicates at the same instants, which lie within the trace."""
 
     run: IndexRange
     program: ArrayProgram
@@ -76,9 +76,10 @@ class ArrayPlan:
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
-        predicates: step number -> source of its values; a predicate that is defined nowhere has none.
-        beyond: total number of values beyond the last sample.
-        runners: functions by semantics and array library, built on first use.
+        predicates: step number -> source of the predicate's values; absent if it is defined at none of its
+            instants.
+        beyond: number of instants beyond the last sample, summed over all steps.
+        runners: (semantics, array library) -> function of each step, built on first use.
     """
 
     schedule: Schedule
@@ -89,7 +90,7 @@ class ArrayPlan:
 
 
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the evaluation plan for formulas at the instants `run`."""
+    """Return the plan that evaluates `formulas` at the instants `run`: its steps and their programs."""
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
@@ -97,7 +98,11 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
 
 
 def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
-    """Group predicates over the same instants into programs; a predicate that is just a signal needs none."""
+    """Group the predicates over the same instants into programs; return them, and each predicate's source.
+
+    The source has the predicate's step number as its key. A predicate whose margin is just a signal needs no
+    program.
+    """
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
     predicates: dict[int, StepSource] = {}
     for index, step in enumerate(steps):
@@ -125,7 +130,10 @@ def _signed(atom: ir.Predicate) -> ir.Num:
 
 
 def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
-    """Merge overlapping and adjacent ranges; returns each merged range with its parts."""
+    """Merge overlapping and adjacent ranges of instants; return each merged range with the ranges in it.
+
+    Each range of instants comes with the number of its step.
+    """
     out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
     for run, index in sorted(ranges, key=lambda item: (item[0].start, item[0].count)):
         if out and run.start <= out[-1][0].last + 1:
@@ -145,7 +153,7 @@ class Machine:
     """Builder of the functions that compute steps, for traces of one length.
 
     Attributes:
-        domain: length of the traces and treatment of their end.
+        domain: length of the traces, and treatment of instants beyond their last sample.
         windows: algorithms for windows, with semantics and array library.
     """
 
@@ -154,9 +162,9 @@ class Machine:
 
     @property
     def unknown(self) -> float:
-        """Value of an unknown predicate: -inf in a lower bound, +inf in an upper one.
+        """Robustness of an unknown predicate: -inf in a lower bound, +inf in an upper bound.
 
-        If two traces hold the two bounds, it is one value per trace.
+        For the domain `end` "both", in which the batch holds one trace per bound, an array of both values.
         """
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])
@@ -164,9 +172,10 @@ class Machine:
         return math.inf if self.domain.end == "upper" else -math.inf
 
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
-        """Return the function that pads a predicate's values at instants `inside` to those at instants `run`.
+        """Return the function that pads a predicate's values, at instants `inside`, to the instants `run`.
 
-        Beyond the trace a predicate is unknown, or false if windows are clipped.
+        At the added instants the predicate is unknown if the trace is open (continues beyond its last
+        sample), and false otherwise.
         """
         outside = self.unknown if self.domain.open else -node.sign * math.inf
         if inside.count <= 0:
@@ -189,7 +198,7 @@ class Machine:
         return kernel
 
     def bind(self, step: Step) -> Kernel:
-        """Return the function that computes a step other than a predicate."""
+        """Return the function that computes a step from its operands (not for predicates and `freeze`)."""
         node, run = step.node, step.run
         operands = len(step.operands)
         match node:
@@ -220,7 +229,10 @@ class Machine:
         return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
 
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Function for future windows; an unbounded window that starts after the known samples is unknown."""
+        """Function for an operator over future windows at the instants `run`.
+
+        On an open trace, an unbounded window that starts beyond the final length of the trace is unknown.
+        """
         rows = run.count
         beyond = neutral(pick)
         if self.domain.open and window.hi is None:
@@ -234,7 +246,7 @@ class Machine:
         return lambda parts, like: padded(inner(parts, like), run.count, beyond)
 
     def _past(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Function for past windows: future windows with time reversed."""
+        """Function for an operator over past windows: that for future windows, applied in reversed time."""
         ops, reduce = self.windows.ops, self.windows.semantics.reduce
         if not operands:
             return self._constant(run.count, neutral(pick))
@@ -244,7 +256,7 @@ class Machine:
         return lambda parts, like: flip(inner([flip(part) for part in parts], like))
 
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
-        """Function for extrema of one operand, or `until` of two, over windows [lo, hi]."""
+        """Function for extrema of one operand, or `until` of two, over `rows` windows [lo, hi]."""
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
         if operands == 1:
@@ -278,7 +290,7 @@ class Machine:
 
 
 def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps from signals `(time, batch)`."""
+    """Return the values of all steps of a plan, `(count, batch)` each, from signals `(time, batch)`."""
     ops, like = windows.ops, next(iter(env.values()))
     runners = plan.runners.get(windows)
     if runners is None:
@@ -305,7 +317,7 @@ def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
 
 
 def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
-    """Return the function of a predicate from the outputs of its program, or from its signal."""
+    """Return the function that reads a predicate's values from its program's outputs, or from a signal."""
     source, domain = plan.predicates.get(step.number), plan.schedule.domain
     if source is None:
         kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))

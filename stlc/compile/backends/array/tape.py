@@ -1,8 +1,9 @@
 """Tape of array operations: common sub-expressions are shared, constants folded, operations fused.
 
 In training each array operation has microseconds of overhead, so the tape minimizes their number:
-`a * 0.1 + b` becomes one `axpy`, adding a product one `addcmul`, `min` and `max` with constants one `clamp`,
-multiplication by an indicator one `where`. Each rule preserves the value up to rounding.
+`a * 0.1 + b` becomes one `axpy`, the addition of a product becomes one `addcmul`, `min` and `max` with
+constants become one `clamp`, and multiplication by an indicator becomes one `where`. Each rule preserves the
+value up to rounding.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ class Instr:
     """Array operation.
 
     Attributes:
-        kernel: name of the operation: a method of `Ops` or of the switch, or `input`, `extern`, `pick`.
+        kernel: name of the operation: a method of `Ops` or of the switch; or `input` (read a signal),
+            `extern` (call a function of the system), or `pick` (select a component of its result).
         args: operands: register numbers or constants.
         params: further arguments of the operation, after the operands.
     """
@@ -42,7 +44,7 @@ class GradientTape:
         self._known: dict[tuple[object, ...], int] = {}
 
     def emit(self, kernel: str, *args: Operand, params: tuple[object, ...] = ()) -> int:
-        """Return the register of an instruction, which is appended if it is new."""
+        """Append an instruction, unless an equal one exists; return the number of its register."""
         key = (kernel, params, *((type(arg), arg) for arg in args))
         register = self._known.get(key)
         if register is None:
@@ -51,7 +53,7 @@ class GradientTape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction that computes `operand` if its operation is `kernel`, else None."""
+        """Operands of the instruction that computes `operand`; None if its operation is not `kernel`."""
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
@@ -84,7 +86,7 @@ class GradientTape:
         return self.emit("sub", a, b)
 
     def _plus_product(self, whole: int, part: int, sign: float) -> int | None:
-        """`whole + sign * part` in one operation if `part` is a product, else None."""
+        """Register of `whole + sign * part`, as one operation, if `part` is a product; else None."""
         factors = self.parts(part, "mul")
         if factors is None:
             return None
@@ -159,7 +161,7 @@ class GradientTape:
                 return self.call("pow", a, b)
 
     def call(self, kernel: str, *args: Operand) -> Operand:
-        """Any operation by name; computed at once if all operands are constants."""
+        """Result of the operation called `kernel`; computed at once if all operands are constants."""
         if all(isinstance(arg, float) for arg in args):
             with NUMPY.quiet():
                 return float(getattr(NUMPY, kernel)(*(np.float64(arg) for arg in args)))
@@ -199,7 +201,10 @@ class GradientTape:
     # ---------------------------------------------------------------- choice
 
     def compare(self, margin: Operand, strict: bool) -> int | bool:
-        """Mask `margin > 0` (if `strict`) or `margin >= 0`; for a difference, its operands are compared."""
+        """Register of the mask `margin > 0` (if `strict`) or `margin >= 0`; its truth value if constant.
+
+        A margin `a - b` need not be computed: the mask is `a > b` or `a >= b`.
+        """
         if isinstance(margin, float):
             return margin > 0 if strict else margin >= 0
         kernel = "gt" if strict else "ge"
@@ -212,7 +217,7 @@ class GradientTape:
         return self.emit(kernel, margin, 0.0)
 
     def number(self, mask: int) -> int:
-        """Number that is 1 where `mask` is True, else 0, in the dtype of the compared operands."""
+        """Register of a number that is 1 where `mask` is True, else 0, in the dtype of what was compared."""
         return self.emit("number", mask, self._compared(mask))
 
     def _compared(self, mask: int) -> int:

@@ -1,8 +1,9 @@
-"""Extrema over time windows: reductions, the C kernel, or running extrema and doubling.
+"""Extrema over time windows.
 
-All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; it ends with the
-last row of the array at the latest. A window without rows has the neutral value (+inf for a minimum, -inf for
-a maximum).
+They are computed by a reduction over time, by the C kernel, by running extrema, or by merging blocks of 1, 2,
+4, … rows. All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; it
+ends with the last row of the array at the latest. A window without rows has the neutral value (+inf for a
+minimum, -inf for a maximum).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _OVERLAP = 8
 @final
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Extrema over time windows, in one semantics and with one array library."""
+    """Algorithms for extrema over time windows, in one semantics and with one array library."""
 
     semantics: Semantics
     ops: Ops
@@ -60,7 +61,10 @@ class Windows:
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
 
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
-        """Tiles of a long trace: (rows of the windows, rows that they read); empty if one tile suffices."""
+        """Tiles of a long trace, which are computed one after the other; empty if one tile suffices.
+
+        A tile is a pair: the windows to compute, and the rows that these windows read.
+        """
         if self.ops.name != "numpy" or not self.semantics.exact:
             return []
         size = max(_TILE // max(math.prod(x.shape[1:]), 1), _OVERLAP * width)
@@ -95,17 +99,20 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Merge the extrema of blocks of rows with those of the blocks that start `shift` rows later."""
+        """Merge partial results: those of blocks of rows, with those of the blocks `shift` rows later.
+
+        `a` and `b` hold the partial results of the blocks that start at each row.
+        """
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
             tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
         )
 
     def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
-        """`until` for `pick` "max", its dual `release` for "min".
+        """Robustness of `until` (for `pick` "max") or of its dual `release` (for "min") over windows.
 
-        For `until`, row `j` is the maximum over the rows `t` of window `j` of the minimum of `right[t]` and
-        `left[j..lo + t]`.
+        For `until`, row `j` of the result is the maximum, over the rows `t` of window `j`, of the minimum of
+        `right[t]` and the rows `j` to `lo + t` of `left`.
 
         Args:
             left: operand that must hold up to and including `t`; `(time, batch)`.
@@ -156,7 +163,8 @@ class Windows:
     ) -> Array:
         """`until` by a loop over the offset of `t`: `lo + width` operations on `count` rows.
 
-        Faster methods assume that min distributes over max, which is true of exact extrema only.
+        Faster methods assume that min distributes over max, which is true of exact extrema only. `sizes` is
+        (count, width, lo), as in `until`.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -220,8 +228,9 @@ class Windows:
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
         """`until` over windows inside the array, in about log2(width) compositions of adjacent blocks.
 
-        A block is a pair: least `left` over the block, and `until` within the block. `total` covers the first
-        `done` rows of every window, `met` the `size` rows from every row on.
+        A block of rows has two values: the least `left` over the block (`held`), and `until` within the block
+        (`met`). In the loop `held` and `met` belong to the blocks of `size` rows that start at each row, and
+        `total` to the first `done` rows of every window.
         """
         size, done = 1, 0
         total: tuple[Array, Array] | None = None
@@ -236,7 +245,7 @@ class Windows:
             size *= 2
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """Compose block `a` with the block `b` after it: (`left` throughout both, `until` within both)."""
+        """Compose each block `a` with the adjacent later block `b`; a block is (least `left`, `until`)."""
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)
         later = pair(a[0][:rows], b[1][:rows], other, self.ops)
