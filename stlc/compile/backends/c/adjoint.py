@@ -43,7 +43,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
     Args:
         motion: one step of the system.
         formulas: the requirements.
-        fixed: states whose update has no gradient.
+        fixed: states through whose update no gradient is propagated.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
@@ -73,10 +73,10 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
 
 
 def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
-    """C code that propagates the gradient from the states at sample k + 1 to those at k and the controls.
+    """C code that propagates the gradient by the states at sample k + 1 to states and controls at k.
 
-    It treats one lane, one of the trajectories that are computed side by side. States in `fixed` have no
-    gradient.
+    It treats one lane, one of the trajectories that are computed side by side. No gradient is propagated
+    through the update of a state in `fixed`.
     """
     index = state_index(motion)
     writer = SlopeWriter(place_in_step(motion), soft=True)

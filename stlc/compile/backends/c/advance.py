@@ -57,7 +57,10 @@ def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
 
 
 def _writer(motion: Motion) -> NumberWriter:
-    """Writer of C expressions of states `x` and controls `u`, each for the state vector with index `j`."""
+    """Writer of C expressions in which the arrays `x` and `u` hold states and controls, read at index `j`.
+
+    The index `j` numbers the state vectors that are computed side by side.
+    """
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:

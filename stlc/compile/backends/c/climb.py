@@ -1,7 +1,8 @@
 """Local search over plans in C: each generation perturbs the best plan and keeps the best of a batch.
 
-The code is appended to the source of `emit` and calls `roll` and `check` of the task. Each row has its own
-random stream, so the result does not depend on the number of threads.
+The code is appended to the source of `emit` and calls its functions `roll` (rollout) and `check`
+(robustness). Each row of the batch has its own random stream, so the result does not depend on the number of
+threads.
 """
 
 from __future__ import annotations

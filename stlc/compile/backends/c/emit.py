@@ -102,7 +102,7 @@ def state_index(motion: Motion) -> dict[str, int]:
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
-    """Return the C functions `roll`, which fills the states, and `check`, which computes the robustness."""
+    """Return the C functions `roll`, which computes the states, and `check`, for the robustness."""
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
@@ -118,7 +118,7 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 
 
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
-    """Return C statements that compute all sub-formulas, and then output the robustness of each formula."""
+    """Return blocks of C statements that compute all sub-formulas, then store the formulas' robustness."""
     printer = StepPrinter(plan, index)
     roots = along_roots(plan, "LANE out[{i}][j] = {value};")
     return [*(printer.forward([step]) for step in plan.schedule.steps), roots]
@@ -141,7 +141,11 @@ def along_roots(plan: Plan, form: str) -> list[str]:
 
 
 def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
-    """Requirements whose robustness is in consecutive rows: index of the first, its row, and their number."""
+    """Group the requirements whose robustness values are stored in consecutive rows.
+
+    Returns for each group the index of its first requirement, the location of the first value, and the number
+    of requirements.
+    """
     runs: list[tuple[int, Storage, int]] = []
     for i, root in enumerate(plan.roots):
         if runs and root == Storage(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
@@ -163,7 +167,10 @@ CHECK = Frame(
 
 
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
-    """Return the function that gives the C expression of a state or control in a step, for trajectory `j`."""
+    """Return the function that maps a state or control to its C expression in a step.
+
+    The expression is for sample `k` and trajectory `j`; it is None for a leaf that is not a signal.
+    """
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:

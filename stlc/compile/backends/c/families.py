@@ -37,7 +37,7 @@ class FamilyTable:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names that stand for table entries in the common formula: those of constants and of signals."""
+        """Names by which the common formula refers to the constants and signals in the table."""
         return frozenset(f"{LISTED}{name}" for name in (*self.constants, *self.columns))
 
 
@@ -61,7 +61,8 @@ def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
 
     Args:
         formulas: formulas to group.
-        first: number of the first table, which is part of the names in it; further tables count on from it.
+        first: number of the first family's table, which is part of the C names in it; the tables of further
+            families are numbered from there.
     """
     if len(formulas) < LEAST:
         return []
@@ -100,7 +101,7 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 
 
 def _entries(formula: ir.Formula) -> list[Entry]:
-    """Constants and signals of a formula that may differ within a family, in the order of `_changed`."""
+    """Constants and signals of a formula that may differ within a family, in order of occurrence."""
     found: list[Entry] = []
 
     def note(leaf: Entry) -> ir.Num:

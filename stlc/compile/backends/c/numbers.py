@@ -22,8 +22,8 @@ class NumberWriter(NumberEvaluator[str]):
     """Writer of numeric expressions as C statements; equal expressions share a register (C variable).
 
     Args:
-        place: returns the C expression of a signal, a frozen value or an available function result; None for
-            a function that must be expanded in place.
+        place: returns the C expression of a signal, of a value bound by `freeze`, or of a function result
+            that is already computed; None for a function that must be expanded in place.
 
     Attributes:
         lines: the statements.
@@ -83,7 +83,11 @@ class NumberWriter(NumberEvaluator[str]):
         return self._apply(name, args)
 
     def _apply(self, name: str, args: list[str]) -> str:
-        """Write a function call into a register; min and max are applied to two arguments at a time."""
+        """Write a call of the function `name` as a statement; return the register of its value.
+
+        Raises:
+            Untranslatable: the function has no C form.
+        """
         form = FUNCTIONS[name].c
         if form is None:
             raise Untranslatable(name)

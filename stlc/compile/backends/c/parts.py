@@ -62,7 +62,10 @@ def _parts(blocks: Sequence[Sequence[str]]) -> Iterator[list[str]]:
 
 
 def declared(plan: Plan, *, room: str = "room", prefix: str = "") -> dict[str, str]:
-    """Return the C declarations of a plan's buffers by their names."""
+    """Return C name of each buffer of a plan -> its declaration, as a part of the working memory `room`.
+
+    The names begin with `prefix`, so that values and their gradients can have buffers of different names.
+    """
     return {
         f"{prefix}{buffer.name}": f"double (*restrict {prefix}{buffer.name})[LANES] ="
         f" (double (*)[LANES])({room} + {buffer.place} * LANES);"

@@ -1,8 +1,8 @@
 """Evaluation schedule of formulas with memory for all values, from which the C code is printed.
 
-A `freeze` is a loop over its instants; sub-formulas that do not read frozen values are moved out of the loop.
-Operands and requirements that differ in parameters only are a loop over a table (`families`). A function of
-signals is computed once.
+A `freeze` is computed in a loop over its instants; sub-formulas that do not read frozen values are moved out
+of the loop. Operands and requirements that differ in parameters only are computed in a loop over a table of
+the parameters (`families`). A function of signals is computed once for all samples.
 """
 
 from __future__ import annotations
@@ -60,7 +60,10 @@ class Buffer:
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """Step that evaluates a function of signals at all samples; its components have consecutive numbers."""
+    """Step that evaluates a function of signals at all samples.
+
+    The components of the result have consecutive step numbers, from the number of this step on.
+    """
 
     function: ir.Extern
 
@@ -79,7 +82,7 @@ class Loop:
     Attributes:
         index: C name of the loop index.
         steps: steps that are computed in every iteration.
-        own: step numbers of all values in the loop, in order of allocation.
+        own: step numbers of all values that an iteration overwrites, in order of allocation.
         root: step number of an iteration's result.
     """
 
@@ -110,7 +113,8 @@ class Tabled:
 
     Attributes:
         table: parameters of each row.
-        pick: minimum or maximum over the rows at each instant; None: the first value of each row is kept.
+        pick: minimum or maximum over the rows at each instant; None: no extremum, the result has one value
+            per row, that at the first sample.
         loop: body of the loop.
     """
 
@@ -136,7 +140,7 @@ class Plan:
         roots: location of each formula's robustness.
         buffers: memory of each step, by step number.
         size: working memory in doubles per trajectory.
-        calls: function call on signals -> step number of its first component.
+        calls: key of a function call on signals (`call_of`) -> step number of its first component.
     """
 
     schedule: Schedule
@@ -152,10 +156,10 @@ class Plan:
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
-    """Return the schedule that evaluates formulas at the first sample of a trajectory.
+    """Return the schedule, with its memory, that evaluates formulas at the first sample of a trajectory.
 
     Raises:
-        Untranslatable: a window extends beyond the trajectory.
+        Untranslatable: a formula needs samples outside of the trajectory.
     """
     planner = _Planner(TraceDomain(samples))
     places = planner.roots(formulas)
@@ -167,7 +171,10 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 
 @dataclass(slots=True)
 class _Scope(StepScope):
-    """Scope of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table."""
+    """Scope of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
+
+    `read` names the values that change from iteration to iteration; `own` numbers the steps in the scope.
+    """
 
     read: frozenset[str] = frozenset()
     table: bool = False
@@ -188,7 +195,10 @@ class _Planner(Scheduler):
         self._loops = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the step number of a formula; the step is put outside of loops that do not affect it."""
+        """Return the number of the step that computes a formula at `run`; None if `run` is empty.
+
+        A new step is added outside of all loops on which its value does not depend.
+        """
         node = _split(node)
         depth = self._depth(node)
         around = self.scopes[depth + 1 :]
@@ -217,14 +227,18 @@ class _Planner(Scheduler):
             self.scopes, self.scope = before, before[-1]
 
     def _depth(self, formula: ir.Formula) -> int:
-        """Depth of the innermost enclosing loop that affects a formula's value."""
+        """Depth of the innermost enclosing loop on which a formula's value depends; 0 if there is none."""
         if len(self.scopes) == 1:
             return 0
         read = _frozen_names(formula)
         return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add a step; returns its number. Raises Untranslatable if it needs samples beyond the trajectory."""
+        """Add the step of a formula and return its number.
+
+        Raises:
+            Untranslatable: the formula needs samples outside of the trajectory.
+        """
         match node:
             case ir.Predicate(num):
                 self._check(num, run)
@@ -242,7 +256,11 @@ class _Planner(Scheduler):
         return super().scheduled(node, run)
 
     def roots(self, formulas: Sequence[ir.Formula]) -> list[tuple[int, int]]:
-        """Return step number and row of each formula at the first sample; a family has consecutive rows."""
+        """Add the steps of formulas at the first sample; return each formula's step number and row.
+
+        The formulas of a family (which differ in parameters only) are the rows of one step. Any other formula
+        is row 0 of its own step.
+        """
         places: dict[int, tuple[int, int]] = {}
         for family in self._families(list(map(_split, formulas))):
             number = self._tabled(family, _FIRST, None)
@@ -258,7 +276,10 @@ class _Planner(Scheduler):
         return number
 
     def _join(self, node: ir.BoolOp, pick: Pick, items: Sequence[ir.Formula], run: IndexRange) -> int:
-        """Add the minimum or maximum of formulas; each family of alike formulas is one operand."""
+        """Add the step that computes an `and` or `or` as a minimum or maximum; return its number.
+
+        Operands that differ in parameters only (a family) are computed by one step, as a loop over a table.
+        """
         found = self._families(items)
         loops = {family.members[0]: family for family in found}
         taken = {member for family in found for member in family.members[1:]}
@@ -296,7 +317,7 @@ class _Planner(Scheduler):
         return self.add(Step(Frozen(node, bound, loop), run, (), number))
 
     def _check(self, num: ir.Num, run: IndexRange) -> None:
-        """Schedule the function calls in an expression.
+        """Check that an expression is defined at the instants `run`, and schedule the function calls in it.
 
         Raises:
             Untranslatable: the expression needs samples outside of the trajectory.
@@ -318,7 +339,10 @@ class _Planner(Scheduler):
 
 
 def call_of(num: ir.Num) -> CallKey | None:
-    """Key of a function call on signals, which is computed once for all samples; None for others."""
+    """Key of a call of an IR function on signals, all read at one sample; None for any other expression.
+
+    Such a call is computed once for all samples.
+    """
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
     leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
@@ -348,7 +372,10 @@ LARGE = 64
 
 
 def _split(formula: ir.Formula) -> ir.Formula:
-    """Rewrite a predicate over a large `min` or `max` as `and` or `or` of predicates."""
+    """Rewrite a predicate over a large `min` or `max` as `and` or `or` of predicates.
+
+    Any other formula is returned unchanged.
+    """
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
     if not _large(formula.num):
@@ -366,7 +393,10 @@ def _split(formula: ir.Formula) -> ir.Formula:
 
 
 def _distributed(num: ir.Op) -> ir.Op:
-    """Distribute a sum over a minimum or maximum; the result is equal bit for bit: rounding is monotone."""
+    """Rewrite `min(a, b) + c` as `min(a + c, b + c)`, and likewise for `max` and differences.
+
+    The values are equal bit for bit, since rounding is monotone. Any other expression is returned unchanged.
+    """
     if num.name not in ("add", "sub") or len(num.args) != 2:
         return num
     for i, part in enumerate(num.args):
@@ -385,7 +415,7 @@ def _distributed(num: ir.Op) -> ir.Op:
 
 
 def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
-    """Operands of an `and` or `or`; nested ones of the same operator are flattened."""
+    """Operands of an `and` or `or`, including the operands of nested operators of the same kind."""
     found: list[ir.Formula] = []
     for item in map(_split, items):
         found += _operands(op, item.items) if isinstance(item, ir.BoolOp) and item.op == op else [item]

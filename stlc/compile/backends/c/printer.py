@@ -1,10 +1,10 @@
-"""C code of the steps of a schedule, forward and adjoint, on trajectories filled by a rollout.
+"""C code of the steps of a schedule, forward and adjoint, on trajectories computed by a rollout.
 
-A class per kind of step (`FORMS`) prints both. The innermost loop runs over trajectories and is vectorized.
-`gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to the states. The gradient of a
-minimum or maximum goes to the first of equal operands. The adjoint recomputes loop bodies, only for
-iterations with a nonzero gradient. Windows that all end with the trace, or all begin with it, are computed by
-one recursion.
+For each kind of step a class (`FORMS`) prints the forward and the adjoint code. The innermost loop runs over
+trajectories and is vectorized. `gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to
+the states. The gradient of a minimum or maximum goes to the first of equal operands. For a step that is a
+loop over other steps, the adjoint recomputes the body, in iterations with a nonzero gradient only. Windows
+that all end with the trace, or all begin with it, are computed by one recursion.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class StepPrinter:
     Attributes:
         plan: schedule and memory of the steps.
         index: state name -> index in the array of trajectories.
-        held: name of a frozen value -> its buffer.
+        held: name of a frozen value (bound by `freeze`) -> its buffer.
     """
 
     plan: Plan
@@ -100,11 +100,11 @@ def _indented(lines: Iterable[str], by: int = 2) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class LeafReader:
-    """C expressions of the leaves (signals, calls, frozen values) of an expression at sample `k`.
+    """Function from a leaf of an expression (signal, call, frozen value) to its C expression at sample `k`.
 
     Attributes:
         printer: printer of the step that contains the expression.
-        indices: C name of a clamped sample index -> its C expression, the same for all trajectories.
+        indices: C name of a sample index that is clamped to the trajectory -> its C expression.
     """
 
     printer: StepPrinter
@@ -122,7 +122,11 @@ class LeafReader:
         )
 
     def _instant(self, leaf: ir.Num) -> str:
-        """C expression of the sample number at which a signal is read, clamped if the signal is."""
+        """C expression of the index of the sample at which a signal is read.
+
+        For a clamped read, which repeats the first or last sample outside the trajectory, it is a C variable
+        that `heads` declares.
+        """
         if not isinstance(leaf, ir.ShiftedSignal):
             return "k"
         steps, last = leaf.steps, self.printer.plan.samples - 1
@@ -134,14 +138,15 @@ class LeafReader:
         return name
 
     def heads(self) -> str:
-        """C declarations of the clamped indices."""
+        """C declarations of the sample indices that are clamped to the trajectory."""
         return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
 def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
     """C statements that propagate the gradient of an expression at sample `k` to its leaves (signals, calls).
 
-    Several leaves may read the same sample, so gradients are added to them outside of the vectorized loop.
+    `seed` is the C expression of the derivative with respect to the expression. Several leaves may read the
+    same sample, so gradients are added to them outside of the vectorized loop.
     """
     writer = SlopeWriter(reader, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
@@ -158,7 +163,10 @@ def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
 
 
 def column(index: Mapping[str, int], name: str, k: str) -> str:
-    """Return the C expression of a state at sample `k`, for trajectory `j`; it may be a table entry."""
+    """Return the C expression of a state, or of the elapsed time, at sample `k`, for trajectory `j`.
+
+    The name may stand for a table entry, that is, for a state that differs from row to row.
+    """
     if name == ir.ELAPSED:
         return f"(double)({k})"
     where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
@@ -179,7 +187,10 @@ class _Margin(StepForm):
         return [f"{loop(self.run)} {{ {reader.heads()} LANE {{ {body} }} }}"]
 
     def backward(self) -> list[str]:
-        """Propagate the gradient; guards, and predicates on the elapsed time, have a zero gradient."""
+        """Return C statements that propagate the gradient; none if it is zero.
+
+        It is zero for guards (predicates that count as +-inf) and for predicates on the elapsed time.
+        """
         num, sign = self.node.num, "" if self.node.sign > 0 else "-"
         counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
         if self.node.guard or counted:
@@ -229,7 +240,10 @@ class _Constant(StepForm):
 
 
 class _Extremum(StepForm):
-    """C code of `and` or `or`, one operand per statement, since nested macros double in length."""
+    """C code of `and` or `or`, one statement per operand.
+
+    In a nested call of the C macros the text would double in length with each operand.
+    """
 
     def forward(self) -> list[str]:
         pick, (first, *others) = _MACRO[PICKS[self.node.op]], self.args
@@ -334,7 +348,7 @@ class _Windowed(StepForm):
         return [*head, "  else LANE {", *_indented(self._step_back(), 4), "  }", "}"]
 
     def _recursion(self, lines: list[str], *, reverse: bool = False) -> list[str]:
-        """Head of the C loop of the recursion, with statements for its first instant.
+        """Head of the C loop of the recursion; `lines` are the statements for its first instant.
 
         With `reverse` the loop runs in the opposite direction, as the adjoint does.
         """
@@ -343,7 +357,8 @@ class _Windowed(StepForm):
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
 
     def _empty(self, statement: str) -> list[str]:
-        """Branch for instants whose past window lies before the trace."""
+        """C branch with `statement` for instants whose past window lies before the trace; [] if there are none.
+        """
         late = self.back and earliest(self.run.start) < self.window.lo
         return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
 
@@ -429,10 +444,11 @@ class _Until(_Windowed):
         return f"{self.dual}({self.args[0]['k']}, {reached})"
 
     def _scan_back(self) -> list[str]:
-        """Statements that pass the gradient at `k` to the operand that attains the value there.
+        """C statements that pass the gradient of the value at `k` to the operand that attains the value.
 
-        That is, at the first instant that attains it, the right side, or the left side at its worst instant
-        before.
+        They look for the first instant of the window at which the value is attained. The gradient goes to the
+        right side at that instant, or, if the left side decides, to the left side at its worst instant up to
+        then.
         """
         out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
         near, far = self._outwards()
@@ -474,7 +490,7 @@ class _Repeated(StepForm):
         self.root = self.plan.buffers[self.loop.root]
 
     def _blank(self) -> list[str]:
-        """Statements that set the gradients of values recomputed in each iteration to zero."""
+        """C statements that set to zero the gradients of the values that each iteration recomputes."""
         own = (self.plan.buffers[number] for number in self.loop.own)
         return [f"memset(g{each.name}, 0, sizeof(double) * {each.rows} * LANES);" for each in own]
 
@@ -558,7 +574,10 @@ class _TableLoop(_Repeated):
         return [*self._head(), *self.printer.forward(self.loop.steps), *gathered, "}}"]
 
     def backward(self) -> list[str]:
-        """For each row: recompute its value, then propagate the gradient where the row is the extremum."""
+        """Return C statements that for each row recompute its value, then propagate the gradient.
+
+        If the step is an extremum over the rows, only the first row that attains it gets a gradient.
+        """
         if self.node.pick is None:
             own, body = self.out[self.loop.index], self.root[0]
             seeds = f"LANE {{ g{body} += g{own}; matters[j] += fabs(g{own}); }}"
@@ -582,7 +601,7 @@ class _TableLoop(_Repeated):
 
 
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
-    """Entries of a table of one type as a C array, one row per line."""
+    """Entries of a table that have the C type `kind`, as a C array with one row per line."""
     if not entries:
         return []
     rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]

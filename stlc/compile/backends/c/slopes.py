@@ -27,7 +27,8 @@ class SlopeWriter(NumberWriter):
 
     Args:
         place: returns the C expression of a leaf (signal, call, or frozen value).
-        soft: whether conditions have a slope; otherwise only the taken branch has a gradient.
+        soft: whether conditions have the gradient of a smooth step; otherwise they have none, and only the
+            branch taken has a gradient.
     """
 
     def __init__(self, place: Callable[[Leaf], str | None], *, soft: bool) -> None:
@@ -44,8 +45,8 @@ class SlopeWriter(NumberWriter):
             seeds: register -> C expression of the derivative of the output with respect to it.
 
         Returns:
-            The statements, and C expression of a leaf's gradient (`gx[…]` for `x[…]`) -> register that holds
-            the value to add to it.
+            The statements; and a mapping from the C expression of a leaf's gradient (`gx[…]` for `x[…]`) to
+            the register with the value to add to it.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
@@ -58,7 +59,7 @@ class SlopeWriter(NumberWriter):
         """Return C statements that compute expressions and add up the gradients of the signals in them.
 
         Args:
-            outputs: each expression, with the C expression of the output's derivative with respect to it.
+            outputs: pairs of an expression and the C expression of the derivative with respect to it.
         """
         seeds: dict[str, str] = {}
         for num, own in outputs:
