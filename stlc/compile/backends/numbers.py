@@ -55,7 +55,10 @@ class NumberEvaluator(ABC, Generic[V]):
                 return self._leaf(leaf)
 
     def inlined(self, body: ir.Body, args: Sequence[V]) -> Self:
-        """Return an evaluator for the body of a function, with its arguments and variables bound."""
+        """Return an evaluator for the body of a function, in which its parameters have the values `args`.
+
+        The intermediate variables of the body are already evaluated.
+        """
         key = (id(body), *map(repr, args))
         inner = self._calls.get(key)
         if inner is None:

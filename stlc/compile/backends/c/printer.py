@@ -357,8 +357,7 @@ class _Windowed(StepForm):
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
 
     def _empty(self, statement: str) -> list[str]:
-        """C branch with `statement` for instants whose past window lies before the trace; [] if there are none.
-        """
+        """C branch with `statement` for instants whose past window lies before the trace; [] if none."""
         late = self.back and earliest(self.run.start) < self.window.lo
         return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
 

@@ -64,7 +64,7 @@ class SymbolicColumn:
         return SymbolicColumn(self.entries[rows, 0])
 
     def rows(self) -> list[SymbolicColumn]:
-        """The expressions at each instant, (1, 1) each."""
+        """The expressions at each instant, one series (1, 1) per instant."""
         return [self[k] for k in range(len(self))]
 
     def __add__(self, other: Operand) -> SymbolicColumn:
@@ -190,7 +190,7 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask` is true, else -inf; if the mask is symbolic, `GREAT` instead of infinity."""
+        """+inf where `mask` is true, else -inf; +-`GREAT` where the mask is symbolic, not 0 or 1."""
         rows = []
         for each in mask.rows():
             size = math.inf if each.entries.is_constant() else GREAT

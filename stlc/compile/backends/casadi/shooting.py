@@ -46,13 +46,19 @@ class NotSmoothError(Exception):
 @final
 @dataclass(frozen=True, slots=True)
 class Eased:
-    """Smooth indicators of conditions (Eq. 6 of Meng and Fan 2023), whose slope is limited to `sharpness`."""
+    """Switch that evaluates conditions by smooth indicators (Eq. 6 of Meng and Fan 2023).
+
+    `sharpness` is the greatest slope w of an indicator `(1 + tanh(w rho)) / 2` of a margin rho.
+    """
 
     exact: ClassVar[bool] = False
     sharpness: float
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """Smooth indicator `(1 + tanh(w rho)) / 2` of the margin `rho`, with slope w."""
+        """Smooth indicator `(1 + tanh(w rho)) / 2` of the margin `rho`.
+
+        Its slope w is `sharpness`, but at most that of the switch, which is also the default.
+        """
         width = self.sharpness if sharpness is None else min(self.sharpness, sharpness)
         return ops.sigmoid(rho * (2.0 * width))
 
@@ -67,11 +73,12 @@ class Eased:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Dynamics of a system without the clamps of its states.
+    """Dynamics of a system, with the clamps of its states given apart from the expressions of the step.
 
     Attributes:
         lets: intermediate variables of a step as (name, expression), in order.
-        step: state -> expression of its value one step later; states that do not change are absent.
+        step: state -> expression of its value one step later, before any clamp; states that do not change are
+            absent.
         clamps: state -> range to which it is clamped.
         bounds: control -> its range.
         horizon: number of steps of a plan.
@@ -114,12 +121,14 @@ class ScaledFormula:
 
 
 class Shooting:
-    """Nonlinear program of planning for given dynamics and formulas; the initial state is data.
+    """Nonlinear program (multiple shooting) whose solution is a plan.
+
+    It is built once for given dynamics and formulas; the initial state is a parameter.
 
     Attributes:
-        program: the program for CasADi: variables `x`, data `p`, cost `f`, constraints `g`.
+        program: the program for CasADi: variables `x`, parameters `p`, cost `f`, constraints `g`.
         states: names of the states that are variables.
-        given: names of the signals that are data.
+        given: names of the signals whose values at all samples are parameters.
     """
 
     def __init__(
@@ -134,7 +143,8 @@ class Shooting:
             sharpness: greatest slope of the smooth indicators of conditions.
 
         Raises:
-            NotSmoothError: an expression that depends on the controls is discontinuous.
+            NotSmoothError: an expression that depends on the controls is discontinuous or has no CasADi form,
+                or a formula contains `freeze`.
         """
         self._motion, self._switch = motion, Eased(sharpness)
         self._semantics = LogSumExp(smoothing)
@@ -158,7 +168,7 @@ class Shooting:
         self._write(demands)
 
     def _write(self, demands: Sequence[ScaledFormula]) -> None:
-        """Build variables, data, cost and constraints of the program."""
+        """Set `program`: variables, parameters, cost and constraints."""
         motion, steps = self._motion, self._motion.horizon
         controls = casadi.SX.sym("u", steps, len(motion.bounds))
         later = casadi.SX.sym("x", steps, len(self.states))
@@ -207,7 +217,7 @@ class Shooting:
         return {name: _tall(column, steps) for name, column in moved.items()}
 
     def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
-        """Robustness of the required conditions, (conditions, 1), except those that always hold."""
+        """Scaled robustness of the required conditions, (conditions, 1), without those that always hold."""
         found = []
         for each in demands:
             for formula, first, last in _conditions(each.formula, 0, 0, self._motion.horizon):
@@ -222,7 +232,7 @@ class Shooting:
     # ------------------------------------------------------------------- numbers
 
     def limits(self, *, maximise: bool) -> dict[str, Vector]:
-        """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), as CasADi expects them.
+        """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), under the names of CasADi.
 
         If `maximise`, the shortfall may become negative, so that robustness beyond the margin is rewarded.
         """
@@ -239,13 +249,16 @@ class Shooting:
         }
 
     def guess(self, controls: Vector, columns: Mapping[str, Vector]) -> Vector:
-        """Initial guess of the variables from a plan (T, m) and the states (T + 1,) that follow from it."""
+        """Initial guess of the variables: the plan `controls` (T, m), and its states in `columns`.
+
+        `columns` maps the name of a state to its values (T + 1,) under the plan.
+        """
         states = [columns[name][1:] for name in self.states]
         blank = np.zeros(2 * len(self._clamped) * self._motion.horizon + 1)
         return np.concatenate([controls.T.ravel(), *states, blank])
 
     def data(self, columns: Mapping[str, Vector], margin: float) -> Vector:
-        """Data of the program for one initial state.
+        """Values of the program's parameters for one initial state.
 
         Args:
             columns: signal name -> values (T + 1,); the first values of the states are read, and all values
@@ -266,7 +279,8 @@ def _conditions(
 ) -> Iterator[tuple[ir.Formula, int, int]]:
     """Yield conditions that together are equivalent to `formula` at the samples `first` to `last`.
 
-    Each condition is a formula with the first and last sample, both included, at which it must hold.
+    Each condition is a formula with the first and last sample, both included, at which it must hold. `end` is
+    the last sample of the horizon.
     """
     match formula:
         case ir.BoolOp("and", items):
@@ -288,7 +302,7 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals of which an expression reads the value at the first sample, at every instant."""
+    """Names of the signals whose value at the first sample an expression reads, at whatever instant."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 

@@ -39,7 +39,7 @@ SIDES = 16
 
 @dataclass(frozen=True, slots=True)
 class Greatest:
-    """Maximum of some values. A minimum is expressed as minus the maximum of the negated values."""
+    """Maximum of several values. A minimum is expressed as minus the maximum of the negated values."""
 
     items: tuple[Expression, ...]
 
@@ -134,8 +134,8 @@ Row: TypeAlias = dict[str, Expression]
 class Encoding:
     """Mixed-integer linear model whose solutions are plans from one initial state.
 
-    `tight` selects the tight encoding, in which every solution is a plan; otherwise it is relaxed, so that
-    every satisfying plan is a solution.
+    With `tight`, every solution of the model is a plan of the system; otherwise the encoding is relaxed, so
+    that every plan that satisfies the requirements is a solution.
 
     Attributes:
         model: variables and constraints of the program.
@@ -167,7 +167,7 @@ class Encoding:
     ) -> list[Tree]:
         """Encode the dynamics over a horizon, and requirements at the first sample.
 
-        A requirement that must hold in every state, such as `always`, bounds the state variables before the
+        A requirement that must hold at every sample, such as `always`, bounds the state variables before the
         next step is encoded. These bounds decide many of the conditions in that step.
 
         Args:
@@ -179,8 +179,8 @@ class Encoding:
             requirements: formulas that must hold at the first sample, with the margin of their predicates.
 
         Returns:
-            For each requirement the condition that it holds; the conditions are not yet constraints of the
-            model.
+            For each requirement the condition under which it holds. The caller must add these conditions to
+            the model as constraints.
 
         Raises:
             UnencodableError: an expression has no mixed-integer linear form.
@@ -210,7 +210,7 @@ class Encoding:
         return [self._tree(each.formula, 0, each) for each in requirements]
 
     def _invariants(self, requirements: Sequence[Demand], row: Row, k: int) -> None:
-        """Bound the states of sample `k` by the conditions that every satisfying plan meets there."""
+        """Tighten the bounds of the states of sample `k` by conditions that hold in every satisfying plan."""
         self.rows.append(row)
         for each in requirements:
             for body in self._demanded(each.formula, k, each):
@@ -222,7 +222,10 @@ class Encoding:
         self.rows.pop()
 
     def _demanded(self, formula: ir.Formula, k: int, what: Demand) -> Iterator[ir.Formula]:
-        """Subformulas on the states alone that hold at sample `k` in any trace that satisfies `formula`."""
+        """Subformulas on the states alone that hold at sample `k` in any trace that satisfies `formula`.
+
+        `what` is the requirement that `formula` belongs to.
+        """
         match formula:
             case ir.Predicate() if k == 0:
                 yield formula
@@ -285,7 +288,7 @@ class Encoding:
             strong: True for `until`; False for `release`, in which conjunctions and disjunctions are
                 exchanged.
             k: sample at which the formula is evaluated.
-            samples: samples of the window at which `right` may hold.
+            samples: samples of the window, at one of which `right` must hold.
             left: left operand.
             right: right operand.
             margin: requirement that the formula belongs to.
@@ -312,7 +315,7 @@ class Encoding:
         return self._condition(value, ZERO if node.guard else margin, node.num)
 
     def _decided(self, cond: ir.Formula, k: int, *, holds: bool) -> Tree:
-        """Condition that the formula `cond` of states holds, or does not hold, at sample `k`."""
+        """Condition that the state formula `cond` is true, or if not `holds` false, at sample `k`."""
         match cond:
             case ir.Truth(truth):
                 return truth == holds
@@ -327,9 +330,13 @@ class Encoding:
         raise UnencodableError("a condition over time")
 
     def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` as a tree of affine conditions, by cases of maxima and conditionals.
+        """`value >= margin` as a tree of affine conditions.
 
-        `num` is the expression that is shown if there is no mixed-integer linear form.
+        Each operand of a maximum, and each branch of a conditional value, becomes a condition of its own.
+        `num` is the expression that an error names.
+
+        Raises:
+            UnencodableError: the condition has no mixed-integer linear form.
         """
         for index, (factor, atom) in enumerate(value.atoms):
             rest = Expression(value.form, value.atoms[:index] + value.atoms[index + 1 :])
@@ -346,7 +353,10 @@ class Encoding:
         return self._polynomial(value, margin, num)
 
     def _polynomial(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` for a value that is at most quadratic, without maxima and conditional values."""
+        """`value >= margin` as a tree, for an affine or quadratic value without maxima and conditionals.
+
+        `num` is the expression that an error names.
+        """
         squares: dict[int, float] = {}
         for factor, atom in value.atoms:
             if not isinstance(atom, Square):
@@ -373,7 +383,10 @@ class Encoding:
         return False if high < 0.0 else Leaf(form, margin)
 
     def _quadratic(self, variable: int, a: float, form: Affine) -> Tree:
-        """`a x^2 + form >= 0`, with x the given variable and `form` affine in x, split at the roots."""
+        """`a x^2 + form >= 0` as affine conditions on x, the given variable, by the roots of the polynomial.
+
+        `form` is affine in x.
+        """
         b, c = form.terms.get(variable, 0.0), form.const
         inside = b * b - 4.0 * a * c
         if inside <= 0.0:
@@ -386,7 +399,10 @@ class Encoding:
         return junction("or", below) if a > 0.0 else junction("and", between)
 
     def _ellipse(self, squares: Mapping[int, float], form: Affine) -> Tree:
-        """`sum of a_i x_i^2 + b_i x_i + c >= 0` with coefficients `a_i` of one sign, as a norm."""
+        """`sum of a_i x_i^2 + b_i x_i + c >= 0`, with `a_i` of one sign, rewritten as a bound on a norm.
+
+        `squares` maps the variable x_i to a_i; `form` is the sum of all b_i x_i and c.
+        """
         sign = 1.0 if next(iter(squares.values())) > 0.0 else -1.0
         parts, rest = [], sign * form.const
         for variable, factor in squares.items():
@@ -494,10 +510,11 @@ class Encoding:
         return Expression(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
 
     def _held(self, args: Sequence[Expression]) -> Expression | None:
-        """`clip(v + c u, low, high)` as a variable within [low, high]; None if that would exclude solutions.
+        """`clip(v + c u, low, high)` as a new variable within [low, high]; None if that excludes solutions.
 
-        A control u that no other expression reads can be chosen such that the sum reaches a bound exactly
-        instead of exceeding it, provided that v itself lies within the bounds.
+        Here `v + c u` is the first argument, and u a control that no other expression reads. Such a control
+        can be chosen such that the sum reaches a bound exactly instead of exceeding it, provided that v
+        itself lies within the bounds.
         """
         form, low, high = args[0].form, args[1].known, args[2].known
         free = self._free & form.terms.keys()
@@ -540,7 +557,13 @@ class Encoding:
         return Expression(rest)
 
     def _linear(self, value: Expression, num: ir.Num) -> Affine:
-        """Value as a variable; maxima and conditional values are encoded with binary variables."""
+        """Affine form that equals a value; maxima and conditional values become variables of the model.
+
+        `num` is the expression that an error names.
+
+        Raises:
+            UnencodableError: the value contains a norm or a square.
+        """
         form = value.form
         for factor, atom in value.atoms:
             match atom:

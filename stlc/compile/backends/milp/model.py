@@ -195,7 +195,7 @@ class Model:
         self.feasible &= self._lower[index] <= self._upper[index]
 
     def limit(self, variable: Affine, upper: float) -> None:
-        """Lower the upper bound of a variable."""
+        """Lower the upper bound of a variable to `upper`."""
         (index,) = variable.terms
         self._upper[index] = max(self._lower[index], min(self._upper[index], upper))
 
@@ -207,7 +207,7 @@ class Model:
         self._rows.append((form.terms, lower - form.const, upper - form.const))
 
     def named(self, form: Affine) -> Affine:
-        """Variable that equals an affine form; the form itself if it has at most one term."""
+        """New variable that equals an affine form; a form with at most one term is returned unchanged."""
         if len(form.terms) <= 1:
             return form
         low, high = self.bounds(form)
@@ -226,7 +226,7 @@ class Model:
         return found
 
     def imply(self, off: Affine, tree: Tree) -> None:
-        """Require a condition whenever the affine form `off`, a nonnegative integer, is 0."""
+        """Add constraints by which a condition must hold if `off`, a nonnegative integer form, is 0."""
         if isinstance(tree, bool):
             if not tree:
                 self.require(off, 1.0)
@@ -245,7 +245,10 @@ class Model:
             self.require(total, 1.0)
 
     def literal(self, tree: Leaf | Junction | bool) -> Affine:
-        """Binary variable that implies a condition; the same one if the condition is given again."""
+        """Binary variable that implies a condition: if the variable is 1, the condition holds.
+
+        It is created on the first call for the condition; a constant condition gives a constant.
+        """
         if isinstance(tree, bool):
             return constant(float(tree))
         if tree.literal is None:
@@ -255,7 +258,7 @@ class Model:
         return Affine({tree.literal: 1.0}, 0.0)
 
     def arrays(self, cost: Affine = ZERO) -> Arrays:
-        """The model as arrays, with an affine form to minimise."""
+        """The model as arrays for a solver; the affine form `cost` is to be minimised."""
         lengths = [len(terms) for terms, _, _ in self._rows]
         costs = np.zeros(len(self._lower))
         for index, value in cost.terms.items():

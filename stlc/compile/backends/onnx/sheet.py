@@ -62,7 +62,7 @@ class GraphBody:
 
     @property
     def around(self) -> frozenset[str]:
-        """Names of the enclosing graph that the body reads."""
+        """Names of values of the enclosing graph that the body reads."""
         nodes = self.nodes
         read = {name for node in nodes for name in node.reads} | {value.name for value in self.outputs}
         made = {name for node in nodes for name in node.outputs}
@@ -183,7 +183,7 @@ class Value:
     kind: Kind
 
     def on(self, sheet: OnnxGraph) -> Value:
-        """Return the value for use in `sheet`, the graph of a loop body."""
+        """Return this value, of the enclosing graph, for use in `sheet`, the graph of a loop body."""
         return Value(sheet, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic

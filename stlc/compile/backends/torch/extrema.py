@@ -33,7 +33,7 @@ _SMALL = 1 << 12
 
 
 class _Choice(torch.autograd.Function):
-    """Elementwise extremum of arrays of one shape; the first of equal operands gets the gradient."""
+    """Autograd function: elementwise extremum; the first of equal operands gets the gradient."""
 
     @staticmethod
     def forward(ctx: Any, pick: Pick, *items: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ class _Choice(torch.autograd.Function):
 
 
 class _Reduction(torch.autograd.Function):
-    """Minimum or maximum over axis 0, which is kept; equal operands share the gradient."""
+    """Autograd function: minimum or maximum over axis 0; equal operands share the gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, pick: Pick) -> Tensor:
@@ -103,7 +103,10 @@ def reduction(x: Tensor, pick: Pick) -> Tensor:
 
 
 class _Windows(torch.autograd.Function):
-    """Extrema of one operand over windows, or `until` of two; one of equal rows gets the whole gradient."""
+    """Autograd function: extrema over windows, or `until`, by the C kernel.
+
+    The whole gradient goes to one of several equal rows.
+    """
 
     @staticmethod
     def forward(ctx: Any, kernel: WindowKernel, *operands: Tensor) -> Tensor:
@@ -123,11 +126,13 @@ class _Windows(torch.autograd.Function):
 
 
 def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
-    """Return the extrema of one array over windows, or `until` or `release` of two; None without a kernel.
+    """Return the extrema of one array over windows, or `until` or `release` of two arrays.
+
+    The result is None if there is no kernel for the arrays.
 
     Args:
         operands: arrays `(time, batch)` of one dtype.
-        pick: "max" for `until`, "min" for `release`.
+        pick: "max" for a maximum or `until`, "min" for a minimum or `release`.
         window: layout of the windows.
     """
     first = operands[0]
@@ -154,7 +159,7 @@ def _like(x: Tensor, rows: int) -> Tensor:
 
 
 def is_small(x: Tensor, window: Sliding) -> bool:
-    """True if the array is small enough to gather all windows, which takes `rows * width` elements."""
+    """True if the array is small enough to gather all windows, which takes `width` times its memory."""
     return x.numel() * window.width <= _SMALL
 
 

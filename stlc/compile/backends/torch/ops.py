@@ -29,7 +29,7 @@ from stlc.compile.schedule.schedule import Pick
 
 
 class _SafeSqrt(torch.autograd.Function):
-    """Square root whose gradient at 0 is 0."""
+    """Autograd function: square root whose gradient at 0 is 0."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -45,7 +45,10 @@ class _SafeSqrt(torch.autograd.Function):
 
 
 class _MaskedRows(torch.autograd.Function):
-    """Copy of an array with a constant in the rows outside a mask; those rows have no gradient."""
+    """Autograd function: copy of an array with a constant in the rows outside a mask.
+
+    These rows have no gradient.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
@@ -67,7 +70,10 @@ def _masked(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
 
 
 class _SmoothMax(torch.autograd.Function):
-    """`log(sum(exp(k x))) / k` over axis 0; infinite values have gradient 0 and cause no NaN."""
+    """Autograd function: `log(sum(exp(k x))) / k` over axis 0, which is kept with length 1.
+
+    Infinite values have gradient 0 and cause no NaN.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
@@ -86,7 +92,7 @@ class _SmoothMax(torch.autograd.Function):
 
 
 class _SmoothMax2(torch.autograd.Function):
-    """`log(exp(k a) + exp(k b)) / k` for operands of the same shape."""
+    """Autograd function: `log(exp(k a) + exp(k b)) / k` for operands of the same shape."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
@@ -228,7 +234,10 @@ class TorchOps:
         return choice(items, pick)
 
     def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact extrema over sliding windows; one of equal operands may get the whole gradient."""
+        """Exact extrema over sliding windows; None if other torch operations must compute them.
+
+        One of several equal operands may get the whole gradient.
+        """
         if x.ndim != 2 or torch.compiler.is_exporting():
             return None
         if is_small(x, window):
@@ -236,7 +245,10 @@ class TorchOps:
         return by_kernel((x,), pick, window)
 
     def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact `until` and `release`; one of equal operands may get the whole gradient."""
+        """Exact `until` or `release` over windows; None if other torch operations must compute them.
+
+        One of several equal operands may get the whole gradient.
+        """
         if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
             return None
         if is_small(left, window):
