@@ -34,7 +34,7 @@ Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 def dump(compiled: Compiled, part: Part = "all") -> str:
     """Return the text of one part of a compiled specification.
 
-    It depends on nothing but the specification and the time grid.
+    The text depends on nothing but the specification and the time grid.
     """
     blocks = ["\n".join(_head(compiled))]
     if part == "all":
@@ -58,7 +58,7 @@ def _head(compiled: Compiled) -> Iterator[str]:
 
 
 def _both(steps: int, grid: Grid) -> str:
-    """Return the text of a time in seconds and in steps."""
+    """Return the text of a duration, in seconds and in steps; in steps only if no time step is known."""
     count = f"{steps} step{'' if steps == 1 else 's'}"
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
@@ -70,7 +70,7 @@ def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
 
 
 def _beside(compiled: Compiled) -> Iterator[str]:
-    """Yield the text of each requirement in two columns: in the source, and compiled."""
+    """Yield a header, then each requirement in two columns of text: as in the source, and as compiled."""
     written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"
@@ -83,7 +83,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 
 
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
-    """Yield the lines about a compiled requirement: its formula, its added states, its intervals."""
+    """Yield texts about a compiled requirement: its formula, its added states, its intervals."""
     yield show_formula(rule.formula)
     read = columns(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
@@ -102,7 +102,7 @@ def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
 
 
 def _cut(lines: list[str]) -> list[str]:
-    """Return the lines of a formula; of a very long one the first lines and how many follow."""
+    """Return the lines of a formula; of a long formula, the first lines and a count of the others."""
     if len(lines) <= LONG:
         return lines
     return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
@@ -137,7 +137,7 @@ def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
 
 
 def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
-    """Yield a line for each distinct interval of a formula: operator, seconds, samples."""
+    """Yield a line for each distinct interval of a formula: operator, interval in seconds and in samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
         if isinstance(node, ir.Windowed):

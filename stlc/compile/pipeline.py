@@ -64,13 +64,13 @@ class CompiledRequirement:
         formula: formula in negation normal form, with time in steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
-        windowed: whether it mentions `T`, and so applies to every planning window.
+        windowed: whether it mentions the horizon `T`, and so applies to every planning window.
         uses_end: whether it has a window to the end of the trace.
         absolute: whether it has an operator such as `always@[a, b]`, whose interval counts from the start of
             the mission.
-        alive: for training, state formula that holds while the requirement can still be satisfied, given the
-            mission before.
-        span: place of the declaration.
+        alive: for training, state formula that holds while the requirement can still be satisfied after what
+            happened earlier in the mission.
+        span: place of the declaration in the source.
         typed: requirement before lowering.
     """
 
@@ -159,8 +159,8 @@ def compile_spec(
     Args:
         spec: syntax tree of the specification.
         grid: time step and horizon, as far as known.
-        interface: interface of the system; None: signals are as declared in the file.
-        overrides: value of each constant to be replaced, as text, by name.
+        interface: interface of the system; None: signals are as declared in the specification.
+        overrides: name of a constant -> text of the value that replaces its own.
         purpose: "train", or "check" for judging recorded traces.
 
     Raises:
@@ -172,9 +172,12 @@ def compile_spec(
 def resolve_for(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
 ) -> typed.Spec:
-    """Run the first stage, which is independent of the time grid.
+    """Run the first stage of the compiler, which does not depend on the time grid.
 
-    Arguments are those of `compile_spec`.
+    The arguments are those of `compile_spec`.
+
+    Raises:
+        SpecError: all errors that the stage finds.
     """
     overrides = overrides or {}
     if interface is not None and purpose == "check":
@@ -184,7 +187,7 @@ def resolve_for(
 
 
 def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -> Compiled:
-    """Run all stages but the first, for one time grid.
+    """Run all stages of the compiler but the first, for one time grid.
 
     Raises:
         SpecError: all errors that the stages find.
@@ -225,7 +228,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
 @final
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """Compiler of typed requirements that collects their added states, goals and findings."""
+    """Compiler of typed requirements, which collects the states they add, their goals, and findings."""
 
     grid: Grid
     purpose: Purpose
@@ -263,10 +266,10 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Return a requirement with its absolute operators, and for training its past operators, rewritten.
+        """Replace absolute operators (`always@[a, b]`, whose interval counts from the start of the mission).
 
-        Absolute operators (`always@[a, b]`) count from the start of the mission; for recorded traces that is
-        the first sample.
+        For recorded traces the mission starts with the first sample. For training, both absolute and past
+        operators are replaced by formulas over added states.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)
@@ -276,7 +279,7 @@ class _Stage:
 
 
 def _remembered(timers: Iterable[Timer]) -> int:
-    """Return the greatest number of steps that a timer counts; 0 without timers."""
+    """Return the greatest number of steps that one of the timers counts; 0 without timers."""
     return max((int(timer.high) for timer in timers if timer.kind == "timer"), default=0)
 
 
@@ -287,14 +290,14 @@ def _without(interface: Interface, names: Iterable[str]) -> Interface:
 
 
 def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
-    """Return the columns that requirements read, then those of the added states."""
+    """Return the signature: signals that requirements read, then the added states."""
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
 
 
 def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
-    """True if a requirement is undefined at the first sample of a plan, since it reads samples outside."""
+    """True if a requirement, at the first sample of a plan, reads samples outside of the plan."""
     if grid.horizon is None:
         return False
     from stlc.compile.ir.defined import defined

@@ -1,4 +1,4 @@
-"""Export of a controller as one C header, for C99 and C++11: policy, model, monitor, and the paper's guard.
+"""Export of a controller as one C header (C99, C++11): policy, model, monitor, guard of Meng and Fan 2023.
 
 The code is that of the native kernel, whose functions have short names such as `roll` and `check`. These
 could collide with names in the program that includes the header, so every name gets a prefix.
@@ -95,7 +95,7 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
 
     Args:
         texts: file name -> text; a name declared in one file is prefixed in all files.
-        guard: name of the include guard, a macro; it also stands at the `#endif` in the last line of a text.
+        guard: macro of the include guard; a text that uses it repeats it at the `#endif` in its last line.
     """
     names = dict(found for text in texts.values() for found in _renamed(text))
     names |= {"restrict": "STLC_RESTRICT", guard: guard}
@@ -104,7 +104,7 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
 
 
 def _renamed(text: str) -> Iterator[tuple[str, str]]:
-    """Yield the names that a text declares, with their new names."""
+    """Yield each name that a text declares, with its prefixed name."""
     for pattern in _DECLARED:
         yield from ((name, PREFIX + name) for name in pattern.findall(text) if not name.startswith(OWN))
     for name in _DEFINED.findall(text):
@@ -121,7 +121,7 @@ def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
 def _framed(text: str, guard: str) -> str:
     """Insert compiler directives (`extern "C"` and the like) after the include guard of a header.
 
-    A text without the guard is unchanged.
+    A text without the include guard is returned unchanged.
     """
     if guard not in text:
         return text
@@ -135,7 +135,8 @@ def _framed(text: str, guard: str) -> str:
 def weights(network: PlanNetwork) -> str:
     """Return the weights of a network as C arrays.
 
-    These are `centre` and `spread` of the inputs, and `weight_i` (in, out) and `bias_i` of each layer.
+    The arrays are `centre` and `spread`, by which the inputs are normalised, and `weight_i` (in, out) and
+    `bias_i` of each layer.
     """
     lines = ["/* float32, row by row; generated */"]
     lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
@@ -150,7 +151,10 @@ def weights(network: PlanNetwork) -> str:
 
 
 def forward(network: PlanNetwork) -> list[str]:
-    """C statements of the network: from observation `seen` (double) to `raw` (float), via `h0` and `h1`."""
+    """C statements of the network: from the observation `seen` (double) to the output `raw` (float).
+
+    The C arrays `h0` and `h1` hold the values of alternate layers.
+    """
     layers = list(_layers(network))
     lines = [
         f"for (int i = 0; i < {layers[0].in_features}; ++i) h0[i] = ((float)seen[i] - centre[i]) / spread[i];"
@@ -188,7 +192,7 @@ def _float(value: float) -> str:
 
 
 def squashed(task: Task) -> list[str]:
-    """C statements that compute the control `u` of one step from the network's output `raw` for it."""
+    """C statements that compute the controls `u` of one step from the network's outputs `raw` for it."""
     lines, at = [], 0
     for i, each in enumerate(task.system.decl.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
@@ -289,7 +293,7 @@ def main_of(task: Task) -> str:
 
 
 def makefile() -> str:
-    """Return the Makefile of the example."""
+    """Return the text of the Makefile that builds the example program."""
     return _template("Makefile.txt").substitute()
 
 
@@ -302,7 +306,7 @@ class _Template(Template):
 
 
 def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
-    """Sizes, constants and generated code for the placeholders of the header's template."""
+    """Placeholder in the header's template -> its size, constant or generated code."""
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
@@ -357,7 +361,10 @@ def _in_its_unit(text: str, column: Column) -> str:
 
 
 def _added(task: Task) -> dict[str, object]:
-    """C text for the states that the specification adds: their meaning, initial values and updates."""
+    """C texts about the states that the specification adds, by placeholder in the header's template.
+
+    They contain the meaning of these states, their initial values and their updates.
+    """
     system, first = task.system, len(task.system.decl.signature.names)
     measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]
     tables = [
@@ -404,7 +411,10 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
-    """C statements that lower `least` to the weighted robustness of each of the requirements `rules`."""
+    """C statements that lower `least` to the least weighted robustness of the requirements `rules`.
+
+    They read the robustness of the requirements `among`, in order, from the C array `each`.
+    """
     names = [rule.name for rule in among]
     return [
         f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"
@@ -415,7 +425,7 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """C function `fall`: robustness of the safety requirements on a prefix of a trajectory.
 
-    The column with index STATES is positive beyond the end of the prefix.
+    Besides the states it reads a signal, with index STATES, that is positive beyond the end of the prefix.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

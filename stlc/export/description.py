@@ -26,13 +26,13 @@ def observation(task: Task) -> list[ir.Num]:
 
 
 def state_images(task: Task) -> dict[str, ir.Num]:
-    """Return the mirror image of each state by name, as an expression; states without an image are absent."""
+    """Return name of a state -> its mirror image, as an expression; states without an image are absent."""
     names = set(task.system.names)
     return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
 
 
 def control_images(task: Task) -> dict[str, ir.Num]:
-    """Return the mirror image of every control, by name; angles are wrapped into their range."""
+    """Return name of a control -> its mirror image, as an expression; angles are wrapped into their range."""
     images = {each.name: each.value for each in task.system.decl.policy.mirror}
     found: dict[str, ir.Num] = {}
     for each in task.system.decl.controls:
@@ -50,10 +50,11 @@ class CostTerm:
     """Summand of a plan's cost: an expression, averaged or maximized over samples.
 
     Attributes:
-        number: expression at each sample, of the states, of the controls if there are `horizon` samples, of
-            the states at the first sample (`START`), and of `k`, `t`, `sat`, `rho` and `MARGIN`.
+        number: expression that is evaluated at each sample. It may read the states, the states at the first
+            sample (name with suffix `START`), the sample `k`, the time `t`, the robustness `rho`, the flag
+            `sat` (always 1), and `MARGIN`; if there are `horizon` samples, also the controls.
         samples: number of samples, from the first on.
-        greatest: True if `REDUCED` is the maximum over the samples, False if it is the mean.
+        greatest: True if `REDUCED` is the maximum of `number` over the samples, False if it is the mean.
         goal: formula whose robustness at each sample is `MARGIN`.
         value: the summand, an expression of `REDUCED`.
         condition: condition on the states at the first sample; if it is false, the summand is 0.

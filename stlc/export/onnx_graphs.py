@@ -1,7 +1,7 @@
 """ONNX graphs of a controller: rollout, policy, verdicts on plans, and length of safe prefixes.
 
-`stlc.runtime` runs the graphs; it also contains the search of the paper's guard and stores the previous
-plans.
+`stlc.runtime` runs the graphs. It also contains the search of the guard (Meng and Fan 2023) and stores the
+previous plans.
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
 
 class _Rollout:
-    """Values computed by now in a rollout: states and intermediate variables, (steps, batch).
+    """Rollout that is computed stage by stage, for all steps of a stage at once where possible.
 
-    A value that is constant in time is (1, batch).
+    `states` holds the states computed by previous stages, (steps + 1, batch). `now` holds all values at the
+    start of each step, intermediate variables included: (steps, batch), or (1, batch) if constant in time.
     """
 
     def __init__(
@@ -183,7 +184,10 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
 def _folded(
     task: Task, network: PlanNetwork, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
-    """States reflected to the mirror side that the network was trained on; mask of the reflected ones."""
+    """Reflect states to the side of the mirror symmetry on which the network was trained.
+
+    Returns the states by name, and the mask (1, batch) of the reflected ones, None without a symmetry.
+    """
     if network.mirror is None:
         return state, None
     moved = assigned(state_images(task), state)
@@ -242,10 +246,12 @@ States: TypeAlias = Mapping[str, Value]
 class Verdicts:
     """Verdicts on a batch of plans.
 
+    A robustness is -inf if the plan or a value computed from it is not a number.
+
     Attributes:
-        rho: robustness, (1, batch); -inf if the plan or a value computed from it is not a number.
-        safe: robustness of the safety requirements alone, likewise.
-        each: robustness of every requirement, in order, likewise.
+        rho: robustness, (1, batch).
+        safe: robustness of the safety requirements alone, (1, batch).
+        each: robustness of every requirement, in order, (1, batch) each.
         cost: cost of the plans, (1, batch).
         states: state name -> values under the plans, (T + 1, batch).
     """
@@ -303,7 +309,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
 
 
 def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
-    """True if a plan contains a number that is not finite or leads to NaN, (1, batch)."""
+    """Mask of the plans that contain a number that is not finite, or that lead to NaN: (1, batch)."""
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
@@ -338,7 +344,7 @@ def rank(found: Verdicts) -> Value:
 
 
 def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
-    """Cost of the performance terms, (1, batch), computed as if every plan satisfied the specification."""
+    """Cost of plans, (1, batch): sum of the cost terms, as if every plan satisfied the specification."""
     moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
     once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
     once |= {name + START: column[:1] for name, column in states.items()}
@@ -362,9 +368,9 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
 
 
 def deepened(task: Task, states: States) -> Value:
-    """True if a plan increases the margin of a pending goal, as by `PendingGoals.deepened`, (1, batch).
+    """Mask of the plans whose next step increases the margin of a goal that is satisfied now: (1, batch).
 
-    The task must have at least one goal.
+    The mask equals `PendingGoals.deepened`. The task must have at least one goal.
     """
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
@@ -381,8 +387,8 @@ def deepened(task: Task, states: States) -> Value:
 def falls(task: Task, start: States, plans: Value) -> Value:
     """Robustness of the safety requirements on every prefix (first steps) of each plan: (T + 1, batch).
 
-    It equals `stlc.controller.guard.safe_prefix.prefix_robustness`. Every prefix is treated as a separate
-    trajectory: values are (T + 1, prefixes * batch).
+    The result equals `stlc.controller.guard.safe_prefix.prefix_robustness`. In the computation every prefix
+    is a separate trajectory, so arrays are (T + 1, prefixes * batch).
     """
     rows = task.horizon + 1
     states = rolled(task.system.exact_step, start, inputs_of(plans, task))
@@ -410,8 +416,8 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
 
-    Outputs are `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), and `requirements` (batch, R); if the
-    specification adds states, also `added` (batch, k), their values one step later.
+    Outputs are `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), and `requirements` (batch, R). If the
+    specification adds states, the output `added` (batch, k) holds these states one step later.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -423,11 +429,12 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
-    """Graph from `state` and `begun`, the rest of the previous plan, to the plan that `Guard` chooses.
+    """Graph from `state` (batch, n) and `begun` (batch, T, m) to the plan that `Guard` chooses.
 
-    The outputs are those of `deciding`, for the chosen plan. `kept` (batch,) tells that this is `begun`: it
-    satisfies the specification, and either the policy's plan ranks no higher, or `begun` increases the margin
-    of a goal that is being met. `policy_plan` and `policy_rho` belong to the policy's own plan.
+    `begun` is the rest of the previous plan. It is kept if it satisfies the specification, and either the
+    policy's plan ranks no higher, or `begun` increases the margin of a goal that is satisfied now; otherwise
+    the policy's plan is chosen. The outputs are those of `deciding`, for the chosen plan; `kept` (batch,),
+    whether `begun` was kept; and `policy_plan` and `policy_rho`, the policy's plan and its robustness.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
@@ -494,7 +501,10 @@ def _one(values: Value, place: int) -> Value:
 
 
 def _added(task: Task, state: Value) -> dict[str, Value]:
-    """States that the specification adds (parameters and timers) one step later, as the output `added`."""
+    """States that the specification adds (parameters and timers) one step later, as the output `added`.
+
+    The result is empty if the specification adds none.
+    """
     if not task.system.added:
         return {}
     now = columns_of(state, task.system.names)
@@ -526,7 +536,7 @@ def judging(task: Task) -> dict[str, Value]:
 
 
 def falling(task: Task) -> dict[str, Value]:
-    """Graph from `state` and `plan` to `falls` (batch, T + 1).
+    """Graph from `state` (batch, n) and `plan` (batch, T, m) to the output `falls` (batch, T + 1).
 
     `falls` is the robustness of the safety requirements on every prefix (first steps) of the plan.
 

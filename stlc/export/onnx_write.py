@@ -199,7 +199,7 @@ def _states(task: Task) -> list[ControllerQuantity]:
 
 
 def timed(task: Task, folder: Path) -> Latency:
-    """Measure decision times of the runtime in random states, after a warm-up."""
+    """Measure decision times of the Python runtime with the files in `folder`, in random states."""
     controller = Controller.load(folder)
     times = []
     for state in task.sample(TIMED, seed=8, dtype=torch.float64).numpy():

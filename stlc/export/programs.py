@@ -1,8 +1,8 @@
-"""Torch modules of a controller and of the paper's guard, for export with any number of agents.
+"""Torch modules of a controller and of its guard, for export with any number of agents.
 
-The guard takes the first T0 steps of a plan from a grid. `stlc.controller.guard.shooting` tries a longer T0
-only if no plan was found with a shorter one. An exported program has no such branches: it tries every T0,
-costs as much as the longest one does, and gives the same plans.
+The guard (Meng and Fan 2023) takes the first T0 steps of a plan from a grid of control sequences.
+`stlc.controller.guard.shooting` tries a longer T0 only if no plan was found with a shorter one. An exported
+program has no such branches: it always tries every T0, and returns the same plans.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Deciding(nn.Module):
         self._task = task
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the policy's plan and its verdict, as `Policy.plan_judged`."""
+        """Return the best of the policy's plans and its verdict, equal to those of `Policy.plan_judged`."""
         plans = self.network(x).to(x.dtype)
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
@@ -102,7 +102,7 @@ _NOTHING: tuple[Tensor, ...] = ()
 class _Tried:
     """Plans whose first T0 steps are a prefix from a grid, and their verdicts, (states, choices, …) each.
 
-    `falls`, the safety robustness on every prefix, is computed for the last T0 only.
+    `falls`, the safety robustness on every prefix of a plan, is computed for the longest T0 only.
     """
 
     plans: Tensor
@@ -114,12 +114,12 @@ class _Tried:
 
 
 class Guarding(nn.Module):
-    """Module from states (B, n) and the policy's plans (B, T, m) to the plans of the paper's guard; float64.
+    """Module from states (B, n) and the policy's plans (B, T, m) to the plans that the guard chooses.
 
-    The outputs are plan (B, T, m), rho and safe (B,), and requirements (B, R); as int64, source (1: the plan
-    satisfies the specification or the safety requirements, 2: it keeps the safety requirements longest) and
-    t0 (B,), the number of first steps taken from the grid, as in
-    `stlc.controller.guard.candidates.Candidates`.
+    The guard is that of Meng and Fan 2023. Outputs in float64: plan (B, T, m), rho and safe (B,), and
+    requirements (B, R). Outputs in int64: source (B,), which is 1 if the plan satisfies the specification or
+    the safety requirements, and 2 if it keeps the safety requirements as long as possible; and t0 (B,), the
+    number of first steps taken from the grid, as in `stlc.controller.guard.candidates.Candidates`.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
@@ -131,7 +131,10 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose a plan as the paper's guard does without a previous plan."""
+        """Return the outputs of the guard for states `x` and the policy's plans `plan`.
+
+        As the module gets no previous plan, the guard chooses as in the first step of a mission.
+        """
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
@@ -154,7 +157,7 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans for one prefix length T0, with verdicts.
+        """All plans for one prefix length T0, with verdicts; safety robustness on prefixes with `falls`.
 
         The first T0 controls of a plan are a prefix from the backup policy's grid; in the first plan they are
         those of the policy's own plan. The later controls come from the policy.
@@ -167,7 +170,11 @@ class Guarding(nn.Module):
         return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
-        """Plans that begin with controls `heads` (B, C, L, m) and continue by the policy; their verdicts."""
+        """Plans that begin with controls `heads` (B, C, L, m) and continue by the policy, and verdicts.
+
+        Returns plans, rho, safe, requirements, cost, and with `falls` the safety robustness on every prefix:
+        (B, C, …) each.
+        """
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         head = heads.reshape(-1, *heads.shape[2:])
@@ -200,7 +207,7 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Results of shorter prefixes for states that these have decided; results `here` for other states."""
+    """Select `before`, the results of shorter prefixes, where `decided`; elsewhere `here`."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)
@@ -208,7 +215,10 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
 
 
 def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """Return the paper's guard as an exported torch program for any number of states; all float64."""
+    """Return the guard of Meng and Fan 2023 as an exported torch program for any number of states.
+
+    All floating-point inputs and outputs are float64.
+    """
     x = task.sample(2, seed=0, dtype=torch.float64)
     plan = torch.zeros(2, task.horizon, len(task.system.decl.controls), dtype=torch.float64)
     return _exported(Guarding(task, network), x, plan)

@@ -122,7 +122,9 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
 
 
 def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11) -> Agreement:
-    """Compare the guard with its exported program at `path` in random states, even where no guard is needed.
+    """Compare the guard with its exported program at `path` in random states.
+
+    The guard is called in every state, even if the policy's plan is satisfying and no guard is needed.
 
     Raises:
         RunError: R105, they disagree.
@@ -141,7 +143,7 @@ def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11)
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
-    """Decisions of ONNX graphs, evaluated by the runtime, as a function of states."""
+    """Function from states (B, n) to the decisions of ONNX graphs, evaluated by the runtime."""
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
@@ -151,7 +153,7 @@ def _answer(judged: JudgedPlans) -> Answer:
 
 
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Compare the graphs with the policy one step later, when there are previous plans.
+    """Compare the graphs with the guard in the step after random states, given the previous plans.
 
     Raises:
         RunError: R105, they disagree.
@@ -166,7 +168,9 @@ def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed
 
 
 def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:
-    """Return the greatest difference of verdicts on random plans: robustness, cost, states, prefixes.
+    """Return the greatest difference between verdicts of the graphs and of the task on random plans.
+
+    A verdict consists of robustness, cost, states, and robustness of prefixes.
 
     Raises:
         RunError: R105, the difference is too large.
@@ -196,7 +200,7 @@ def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> 
 
 
 class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
-    """The export could not be verified; `why` completes the message "not checked: "."""
+    """Exception: the export could not be verified; `why` completes the message "not checked: "."""
 
     def __init__(self, why: str) -> None:
         super().__init__(why)
@@ -235,7 +239,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Run the example program; per state it gives source, t0, rho, safe, requirements, plan.
+    """Run the example program; return for each state source, t0, rho, safe, requirements, plan.
 
     Raises:
         RunError: R105, the program fails or does not end.

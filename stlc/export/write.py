@@ -48,9 +48,9 @@ class Exported:
     Attributes:
         folder: folder of the written files.
         files: names of the files.
-        agreement: comparison with the run; None if it could not be made.
-        latency: decision time of the Python runtime, if it was measured.
-        unchecked: reason why there is no comparison.
+        agreement: comparison with the run; None if the export could not be verified.
+        latency: decision time of the Python runtime; None if it was not measured.
+        unchecked: reason why the export could not be verified; "" if it was verified.
     """
 
     folder: Path
@@ -71,7 +71,10 @@ def target_of(word: str) -> Target:
 
 
 def export(run: Run, target: Target, folder: Path) -> Exported:
-    """Export the controller of a run, and verify it.
+    """Export the controller of a run, and verify it by a comparison with the run.
+
+    An export that cannot be verified, such as C without a compiler, is written all the same; the result says
+    why.
 
     Args:
         run: a run with a checkpoint.
@@ -101,7 +104,13 @@ Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
 def _torch(run: Run, folder: Path) -> Checked:
-    """Write `decide.pt2`, `backup.pt2`, and `controller.json`, which describes their inputs and outputs."""
+    """Write `decide.pt2`, `backup.pt2` and `controller.json`; compare the programs with the run.
+
+    `controller.json` describes the inputs and outputs of the programs.
+
+    Raises:
+        RunError: R105, a program disagrees with the run.
+    """
     path, backup = folder / "decide.pt2", folder / "backup.pt2"
     torch.export.save(recorded(run.task, run.network), path)
     torch.export.save(recorded_guard(run.task, run.network), backup)
@@ -112,7 +121,13 @@ def _torch(run: Run, folder: Path) -> Checked:
 
 
 def _onnx(run: Run, folder: Path) -> Checked:
-    """Write the ONNX graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
+    """Write the ONNX graphs of `stlc.export.onnx_graphs`, and `controller.json`.
+
+    The graphs are then compared with the run, and the decision times of the runtime are measured.
+
+    Raises:
+        RunError: R105, the graphs disagree with the run.
+    """
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
@@ -122,7 +137,15 @@ def _onnx(run: Run, folder: Path) -> Checked:
 
 
 def _c(run: Run, folder: Path) -> Checked:
-    """Write the C header, its weights, an example program and its Makefile."""
+    """Write the C header, its weights, an example program and its Makefile.
+
+    The example program is then compiled and compared with the run.
+
+    Raises:
+        UsageError: U101, the task has no C form.
+        Unchecked: there is no working compiler.
+        RunError: R105, the program cannot be compiled or disagrees with the run.
+    """
     try:
         text = c_header.header(run.task, run.network)
     except Untranslatable as error:

@@ -1,8 +1,9 @@
 """Schedule: ordered steps that compute the values that formulas need, each at its instants.
 
-Only needed values are computed: a state predicate at the root at one instant, the body of `always[0, T]` at T
-+ 1. Equal sub-formulas at equal instants share one step. All back ends read the same steps and handle each by
-the class of its node. Instants are integers, or expressions in a loop index of the back end (`LoopIndex`).
+Only needed values are computed: for `p and always[0, T] q` at one instant, `p` is computed at that instant,
+and `q` at T + 1 instants. Equal sub-formulas at equal instants share one step. All back ends read the same
+steps and handle each by the class of its node. Instants are integers, or expressions in a loop index of the
+back end (`LoopIndex`).
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ class IndexRange:
 
     @property
     def count(self) -> int:
-        """Number of instants from the earliest start to the latest end; a range with 0 or less is empty."""
+        """Number of instants from the earliest start to the latest end; 0 or less for an empty range."""
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
         return latest(self.last) - earliest(self.start) + 1
@@ -132,7 +133,7 @@ class IndexRange:
 
     @property
     def settled(self) -> IndexRange:
-        """Range of all instants over all iterations of the enclosing loops."""
+        """Range from the earliest to the latest instant over all iterations of the enclosing loops."""
         return IndexRange(earliest(self.start), latest(self.last))
 
 
@@ -200,7 +201,10 @@ _NEVER = IndexRange(0, -1)
 
 
 def _first(read: ir.Offsets, run: IndexRange) -> Instant:
-    """Return the first instant at which a formula needed at `run` reads an operand."""
+    """Return the first instant at which a formula needed at `run` reads an operand.
+
+    `read` holds the offsets, from an instant of the formula, at which it reads the operand.
+    """
     return 0 if read.first is None else at_least(run.start + read.first, 0)
 
 
@@ -209,8 +213,15 @@ def _last(
 ) -> Instant:
     """Return the last instant at which a formula needed at `run` reads an operand.
 
-    On an open trace this may be cut to the first known instant beyond the trace from which all operands are
-    constant.
+    An open trace (one that continues with unknown predicates) may need instants far beyond the last sample.
+    If all operands are known to be constant from some instant on, later instants are left out.
+
+    Args:
+        read: offsets, from an instant of the formula, at which it reads the operand.
+        run: instants at which the formula is needed.
+        window: offsets of the formula's window.
+        parts: all operands of the formula.
+        domain: length of the trace, and treatment of instants beyond its last sample.
     """
     if read.last is None:
         return domain.length - 1
@@ -228,17 +239,17 @@ def _last(
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
-    """Return how many samples before and after now a number requires in order to be defined.
+    """Return how many samples before and after its instant a number requires in order to be defined.
 
-    A clamped read, which repeats the last sample, requires its actual sample on a trace whose final length
-    (`domain.stop`) is known.
+    Outside the trace, a clamped read repeats the last sample. If more samples will follow (`domain.stop` is
+    the final length), the last sample is not known yet, so a clamped read then requires its actual sample.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
-    """Return the instants of `run` at which all samples that a number reaches (`reach`) exist."""
+    """Return the instants of `run` at which all samples within the lookback and lookahead `reach` exist."""
     first = max(earliest(run.start), reach.past)
     return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
 
@@ -300,7 +311,7 @@ class Scheduler:
         self._count = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the number of the step that computes a formula at `run`, adding it if there is none yet.
+        """Return the number of the step that computes a formula at `run`; a missing step is added.
 
         The result is None if `run` is empty.
         """

@@ -26,8 +26,8 @@ class Semantics(Protocol):
             window.
         associative: whether the extremum of extrema is that of all their operands.
         sound: whether no value has the opposite sign of the exact one.
-        bounded: whether the value is bounded when unknown operands are replaced by their bounds, even
-            infinite ones. Means omit infinite operands, so that their value may exceed such a bound.
+        bounded: whether replacing unknown operands by their lower (upper) bounds, even infinite ones, gives a
+            lower (upper) bound on the value. Means have no such bound, since they omit infinite operands.
     """
 
     exact: ClassVar[bool]
@@ -37,13 +37,13 @@ class Semantics(Protocol):
     bounded: ClassVar[bool]
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the parts (partial result of `pick`) of each single operand."""
+        """Return the partial result (`Parts`) of each operand taken alone, for the extremum `pick`."""
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """Return the parts of two disjoint sets of operands together, elementwise."""
+        """Return the partial result of two disjoint sets of operands together, elementwise."""
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """Return the minimum or maximum (`pick`) of the operands that `parts` sums up."""
+        """Return the minimum or maximum (`pick`) of a set of operands from their partial result `parts`."""
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
         """Return the minimum or maximum (`pick`) of two values, elementwise."""
@@ -75,5 +75,5 @@ class Associative:
         return (self.pair(a[0], b[0], pick, ops),)
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:  # noqa: ARG002
-        """Return the partial result itself, the extremum of its operands."""
+        """Return the partial result itself, which is the extremum of its operands."""
         return parts[0]

@@ -49,7 +49,8 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
 
     Args:
         asked: a semantics, or the name of one in `SEMANTICS`.
-        smoothing: scale k of log-sum-exp, which it selects in place of `exact` or `smooth`.
+        smoothing: scale k; if given, the result is log-sum-exp with this scale, in place of `exact` or
+            `smooth`.
 
     Raises:
         UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.

@@ -1,4 +1,4 @@
-"""Switches: conditions as numbers from 0 to 1, choices as weighted means of their branches.
+"""Switches: how conditions become numbers from 0 to 1, and how a condition chooses between two values.
 
 A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the smooth
 approximation of Meng and Fan 2023 (Eq. 6); `StraightThrough` has exact values with smooth gradients.
@@ -13,11 +13,11 @@ from stlc.compile.backends.array.namespace import Array, Ops
 
 
 class Switch(Protocol):
-    """Evaluation of conditions in a program.
+    """Protocol of a switch, which evaluates conditions as numbers and chooses between values by them.
 
     Attributes:
-        exact: whether conditions are evaluated by comparisons and masks, without a margin, so that each
-            predicate keeps its own strictness.
+        exact: whether conditions are evaluated as masks, by comparisons instead of margins, so that each
+            predicate keeps its own `>` or `>=`.
     """
 
     exact: ClassVar[bool]
@@ -34,9 +34,10 @@ class Switch(Protocol):
         """
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """Adjust the indicator of a condition that contains strict and non-strict inequalities.
+        """Return the indicator of a condition that contains both strict and non-strict inequalities.
 
-        `weight` is the indicator of its margin, `truth` the mask of its exact truth.
+        The margin of such a condition does not determine its truth at 0. `weight` is the indicator of the
+        margin, `truth` the mask of the exact truth.
         """
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -104,7 +105,7 @@ class StraightThrough:
         return ops.straight_through(rho, strict, self.slope)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """Return the mask as 0 or 1, with the gradient of `weight`."""
+        """Return the mask `truth` as 0 or 1, with the gradient of `weight`."""
         return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:

@@ -19,7 +19,7 @@ from stlc.compile.semantics.protocol import Parts
 
 
 class Mean(ABC):
-    """Minimum as a mean: a function of two sums over the operands.
+    """Base of the mean-based semantics: a minimum is a function of two sums over the operands.
 
     A partial result (`Parts`) consists of the exact minimum, which decides the sign; the sums over the
     positive and over the negative operands; and the number of finite operands.
@@ -39,7 +39,7 @@ class Mean(ABC):
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Return the summand of an operand -x that is not positive (x >= 0); it is 0 for x = 0.
+        """Return the summand of an operand -x <= 0, from its magnitude x >= 0; it is 0 for x = 0.
 
         The sum is used where some operand is not positive.
         """
@@ -48,18 +48,19 @@ class Mean(ABC):
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
         """Return the mean where all operands are positive.
 
-        `gains` is the sum of their summands, `count` the number of finite operands.
+        `gains` is the sum of the summands `gain` of the operands, `count` the number of finite operands.
         """
 
     @abstractmethod
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
         """Return the mean where some operand is not positive.
 
-        `losses` is the sum of the summands of such operands, `count` the number of finite operands.
+        `losses` is the sum of the summands `loss` of the operands that are not positive, `count` the number
+        of all finite operands.
         """
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the parts of each operand: its value, its two summands, and whether it is finite."""
+        """Return the partial result of each operand: its value, its two summands, and 1 if finite, else 0."""
         x = x if pick == "min" else -x
         known = ops.gt(math.inf, ops.abs(x))
         positive = ops.both(known, ops.gt(x, 0.0))
@@ -69,11 +70,11 @@ class Mean(ABC):
         return x, gains, losses, ops.number(known, x)
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """Return the parts of two disjoint sets of operands together: the least value, and sums."""
+        """Return the partial result of two disjoint sets of operands together: least value, and sums."""
         return (ops.minimum(a[0], b[0]), a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """Return the mean of the operands that `parts` sums up.
+        """Return the mean-based minimum or maximum (`pick`) of the operands from their partial result.
 
         A single operand is returned unchanged, and a minimum of -inf stays -inf.
         """
@@ -85,18 +86,18 @@ class Mean(ABC):
         return value if pick == "min" else -value
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """Return the mean of two values, elementwise."""
+        """Return the mean-based minimum or maximum (`pick`) of two values, elementwise."""
         return self.join([a, b], pick, ops)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """Return the mean of one or more values, elementwise."""
+        """Return the mean-based minimum or maximum (`pick`) of one or more values, elementwise."""
         if len(items) == 1:
             return items[0]
         lifted = [self.lift(item, pick, ops) for item in items]
         return self.finish(reduce(lambda a, b: self.merge(a, b, pick, ops), lifted), pick, ops)
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """Return the mean over time: `(time, batch)` -> `(1, batch)`."""
+        """Return the mean-based minimum or maximum (`pick`) over time: `(time, batch)` -> `(1, batch)`."""
         if len(x) == 1:
             return x
         least, *sums = self.lift(x, pick, ops)

@@ -14,12 +14,13 @@ from stlc.compile.semantics.kinds._mean import Mean
 class ArithmeticGeometricMean(Mean):
     """AGM robustness (Mehdipour, Vasile and Belta, ACC 2019).
 
-    `min(x)` is the geometric mean of `1 + x`, minus 1, where all operands are positive; else the arithmetic
-    mean of the negative ones, with the others as 0. It rewards more satisfied operands and larger margins.
-    Predicates should be of similar magnitude: the authors normalise them to [-1, 1].
+    Where all operands are positive, `min(x)` is the geometric mean of `1 + x`, minus 1. Elsewhere it is the
+    arithmetic mean of the operands, where positive ones count as 0. The semantics rewards more satisfied
+    operands and larger margins. Predicates should be of similar magnitude: the authors normalise them to [-1,
+    1].
 
-    Sound: the sign is that of the exact robustness. The value is no bound on perturbations of predicates. The
-    gradient is discontinuous where an operand changes sign.
+    Sound: the sign is that of the exact robustness. But a change of predicates by less than the value can
+    change the verdict. The gradient is discontinuous where an operand changes sign.
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:
@@ -27,7 +28,7 @@ class ArithmeticGeometricMean(Mean):
         return ops.log1p(x)
 
     def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return x, the magnitude of the operand -x, as its summand."""
+        """Return x, the magnitude of an operand -x <= 0, as its summand."""
         return x
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
@@ -35,7 +36,7 @@ class ArithmeticGeometricMean(Mean):
         return ops.expm1(gains / count)
 
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return the arithmetic mean of the negative operands, with the others as 0."""
+        """Return the arithmetic mean of all operands, where positive ones count as 0."""
         return -(losses / count)
 
 

@@ -16,11 +16,11 @@ class GeneralizedMean(Mean):
     """D-GMSR, the generalized mean-based smooth robustness measure (Uzun, Elango, Garoche, Acikmese 2024).
 
     `min(x) = sqrt(M0(x+^2)) - sqrt(Mp(x-^2))`, where x+ and x- are the positive and the negative parts of the
-    n operands, `M0(z) = (eps^n + prod z)^(1/n)` and `Mp(z) = (eps^p + mean(z^p))^(1/p)`. Continuously
-    differentiable.
+    n operands, `M0(z) = (eps^n + prod z)^(1/n)` and `Mp(z) = (eps^p + mean(z^p))^(1/p)`. The measure is
+    continuously differentiable.
 
-    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). The value is
-    no bound on perturbations of predicates.
+    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). But a change
+    of predicates by less than the value can change the verdict.
 
     Attributes:
         eps: smoothing near 0; margins below its square root have little weight.
@@ -35,7 +35,7 @@ class GeneralizedMean(Mean):
         return ops.log(x) * 2.0 - math.log(self.eps)
 
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Return (x^2 / eps)^p, the summand of an operand -x, x >= 0."""
+        """Return (x^2 / eps)^p, the summand of an operand -x <= 0, from its magnitude x."""
         square = ops.square(x) * (1.0 / self.eps)
         return square if self.p == 1 else ops.pow(square, float(self.p))
 
