@@ -151,7 +151,10 @@ def judged(
 
 
 def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
-    """Agents whose trajectory is unsafe; `agents` is the number of agents per seed."""
+    """Agents whose trajectory violates a requirement tagged `@safety`.
+
+    `agents`: number of agents per seed.
+    """
     rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
     return tuple(Unsafe(*divmod(row, agents), bool(executed.viable[row])) for row in rows)
 
@@ -171,7 +174,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Share of the decisions by the source of the followed plan, as in `Deployment.decisions`."""
+    """Source of the followed plan -> share of the decisions; see `Deployment.decisions`."""
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
     for length in np.unique(recording.t0[backup]).tolist():
@@ -203,7 +206,7 @@ def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY
 def as_json(
     deployments: Mapping[Mode, Deployment], setting: Setting, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Content of `eval/simulate.json`; `facts` are further entries."""
+    """Content of `eval/simulate.json`; `facts`: further entries at its top level."""
     return {
         **facts,
         "seeds": list(setting.seeds),

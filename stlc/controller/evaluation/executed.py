@@ -1,4 +1,4 @@
-"""Exact verdicts on simulated trajectories, and the share of the trajectories that agrees with the model."""
+"""Exact verdicts on simulated trajectories, and comparison of the trajectories with the model."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Executed:
-    """Verdicts on recorded trajectories, one row per agent and seed.
+    """Verdicts on recorded trajectories. A row is one agent of one seed.
 
-    A requirement that mentions T is judged at every start instant from which a whole planning window is
-    recorded; any other requirement is judged once, from the first sample.
+    A requirement that mentions T (the horizon of plans) is judged at every start instant from which a whole
+    planning window is recorded; any other requirement is judged once, from the first sample.
 
     Attributes:
         rules: requirement -> whether it holds, (starts, rows); one start if it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        consistent: (starts, rows), whether all steps of the window equal those of the model.
-        eventless: (starts, rows), whether the window has no exogenous event: only the true dynamics acted,
-            even if the model differs from them; None if not recorded.
-        viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
+        consistent: (starts, rows), whether all steps in the planning window from the start instant equal
+            those of the model.
+        eventless: (starts, rows), whether no exogenous event occurs in the planning window, so that all steps
+            equal those of the true dynamics (from which the model may differ); None if not recorded.
+        viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
     """
 
     rules: Mapping[str, Mask]
@@ -58,7 +59,7 @@ class Executed:
     def starts(self, names: Sequence[str]) -> Mask:
         """Mask of the start instants at which all requirements in `names` hold, (starts, rows).
 
-        The one verdict of a requirement without T counts for every start instant.
+        A requirement that does not mention T has a single verdict, which counts for every start instant.
         """
         held = np.ones_like(self.consistent)
         for name in names:
@@ -67,9 +68,10 @@ class Executed:
 
 
 def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask | None = None) -> Executed:
-    """Judge a recording at every sample from which a whole planning window is recorded.
+    """Judge the trajectories of a recording exactly; see `Executed`.
 
-    `viable`: (rows,), whether a safe plan from the first state is known; if None, it is found by search.
+    `viable`: (rows,), whether a safe plan from the first state is known; if None, a search for safe plans
+    determines it.
     """
     columns = dict(
         zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
@@ -87,10 +89,12 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 
 
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """Requirement in the form that judges a whole run; one with absolute times is then evaluated once.
+    """Form of a requirement for trajectories that begin with the mission.
 
-    Absolute times (`always@[a, b]`) count from the start of the mission; for single windows they are
-    rewritten.
+    An absolute operator (`always@[a, b]`, whose interval counts from the start of the mission) is compiled so
+    that its interval counts from the first sample. The requirement is then judged only once per trajectory. A
+    requirement without such operators is returned unchanged; for planning windows, which may begin later,
+    they are compiled differently.
     """
     if not rule.absolute:
         return rule
@@ -100,7 +104,10 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 
 
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Verdicts on one requirement, (starts, rows) booleans."""
+    """Verdicts on one requirement, (starts, rows) booleans.
+
+    `columns`: state -> samples, (time, rows). `horizon`: steps of a planning window.
+    """
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
         return _margin(rule, columns, 1) >= -TOLERANCE
@@ -119,7 +126,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
 
 
 def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
-    """Mask of the steps in which the recorded next state equals that of the model, (rows, steps)."""
+    """Mask of the steps whose recorded next state equals that of the model up to rounding, (rows, steps)."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
@@ -127,7 +134,10 @@ def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
 
 
 def _throughout(right: Mask, task: Task, starts: int) -> Mask:
-    """Start instants with `right` True at all steps of the window: (rows, steps) -> (starts, rows)."""
+    """Mask of the start instants from which `right` is True in all steps of a planning window.
+
+    `right`: (rows, steps). `starts`: number of start instants. Returns (starts, rows).
+    """
     so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
     return whole

@@ -72,7 +72,7 @@ class Score:
     endless: float | None = None
 
     def summary(self) -> dict[str, object]:
-        """Scalars for `run.json`."""
+        """The shares and counts as a JSON object for `run.json`."""
         return {
             "accuracy": self.accuracy,
             "interval": list(self.interval),
@@ -97,14 +97,23 @@ def score(
     enough: Stop = never,
     report: Callable[[str], None] = silent,
 ) -> Score:
-    """Judge a policy on `n` held-out states, drawn with `seed`; for missions, states along missions.
+    """Judge a policy on held-out states (initial states that the training does not use).
 
-    At most `MOST_SEARCHED` of the states whose plan fails are searched for a satisfying plan, in random
-    order, until `enough` returns True. A search starts from the policy's plan; if that fails, it continues
-    independently of the policy (in native code, which is fast enough), so that the feasible share hardly
-    depends on how well the policy is trained. States whose search was cut off do not count as searched,
-    unless they are the first ones. If `enough` returns True while the policy is still being judged, fewer
-    states are judged. `report` receives the progress as a short text.
+    If the specification has timers, the held-out states also come from later instants of simulated missions.
+    Of the states whose plan fails, at most `MOST_SEARCHED` are searched for a satisfying plan, in random
+    order. A search starts from the policy's plan; if it fails, another one is independent of the policy (only
+    in native code, because it is slow otherwise), so that the feasible share hardly depends on how well the
+    policy is trained.
+
+    Args:
+        task: specification and system.
+        policy: policy to judge.
+        n: number of held-out states.
+        seed: seed of their random numbers.
+        enough: function that returns True to end the evaluation early. While plans are being judged, this
+            reduces the number of states; during the searches, the states of the interrupted batch do not
+            count as searched, except those of the first batch.
+        report: function that receives the progress as a short text.
     """
     if task.compiled.timers:
         states = visited(task, policy, n, seed, enough)
@@ -172,9 +181,9 @@ def _judged(
 
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Search by exploration for plans from failing states, and mark the solved ones in `known`.
+    """Explore from a few failing states for satisfying plans, and mark the solved states in `known`.
 
-    Starts of missions are tried first.
+    `failing`: indices of the failing states, (k,); those at the start of a mission are taken first.
     """
     clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
@@ -185,7 +194,10 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """Estimated share of feasible states; the share of solved searches is applied to all failing states."""
+    """Estimated share of feasible states.
+
+    A failing state that was not searched counts with the share of successful searches in the others.
+    """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried
     return (int(known.sum()) + left * found / max(1, tried)) / len(known)
@@ -199,7 +211,7 @@ def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
 
 
 def save_states(path: Path, task: Task, result: Score) -> None:
-    """Save the states and their verdicts for pictures of where a policy fails."""
+    """Write the held-out states and their verdicts to the `.npz` file `path`, for pictures of failures."""
     meta = {"names": list(task.system.names), "requirements": [rule.name for rule in task.rules]}
     buffer = io.BytesIO()
     np.savez_compressed(

@@ -25,21 +25,21 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """Masks of one seed of a deployment; for plans (agents, steps), for closed-loop runs (starts, agents).
+    """Results of one seed as masks: of plans (agents, steps), of trajectories (starts, agents).
 
     Attributes:
         followed: whether the followed plan satisfies the specification.
         proposed: whether the policy's plan satisfies the specification.
         plan_safe: whether the followed plan satisfies the safety requirements.
-        satisfied: whether the run satisfies the specification from a start instant.
-        safe: whether the run satisfies the safety requirements from a start instant.
+        satisfied: whether the trajectory satisfies the specification from a start instant.
+        safe: whether the trajectory satisfies the safety requirements from a start instant.
         satisfied_agents: (agents,), whether every requirement holds at all start instants.
         safe_agents: (agents,), whether every safety requirement holds at all start instants.
-        viable: (agents,), whether the run is safe, or a search finds a safe plan from its first state.
-        consistent: whether the steps of the window from a start instant equal those of the model.
-        eventless: whether the window has no exogenous event; None if not recorded.
-        searched: visited states that were searched for a plan; None if there are none.
-        feasible: visited states with a known satisfying plan.
+        viable: (agents,), whether the trajectory is safe, or a search finds a safe plan from its first state.
+        consistent: whether all steps in the planning window from a start instant equal those of the model.
+        eventless: whether no exogenous event occurs in the planning window; None if not recorded.
+        searched: visited states whose feasibility was determined; None if there are none.
+        feasible: visited states with a known satisfying plan; None if there are no searched ones.
     """
 
     followed: Mask
@@ -85,7 +85,7 @@ class Metric:
     safety: bool = False
 
     def of(self, seed: Seed) -> float:
-        """Value for a seed; NaN for an empty population."""
+        """Value of the metric for a seed; NaN if the population is empty or the property was not recorded."""
         mask = self.mask(seed)
         among = None if self.among is None else self.among(seed)
         if mask is None or (self.among is not None and among is None):
@@ -224,7 +224,7 @@ HOLDS = "holds."
 
 
 def is_progress(key: str) -> bool:
-    """True for a metric reported by the world itself."""
+    """True if `key` names progress that a world reports, not a metric of `METRICS` or `holds.NAME`."""
     return key not in METRICS and not key.startswith(HOLDS)
 
 

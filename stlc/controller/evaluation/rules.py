@@ -60,7 +60,7 @@ class Rules:
 
     @property
     def name(self) -> str:
-        """Name of the specification."""
+        """Name of the specification, by default that of its file."""
         return self.spec.name or Path(self.path).stem
 
     @property
@@ -128,12 +128,15 @@ class RunVerdicts:
 
     @property
     def obeyed(self) -> NDArray[np.bool_]:
-        """Runs that satisfy every rule, (rows,)."""
+        """Mask of the runs that satisfy every rule, (rows,)."""
         return obeying(self.rules, len(self.viable))
 
 
 def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
-    """Runs that satisfy every rule, (rows,)."""
+    """Mask of the runs that satisfy every rule, (rows,).
+
+    `rules`: rule -> status of each run, (rows,). `rows`: number of runs.
+    """
     satisfied = [statuses == "satisfied" for statuses in rules.values()]
     held: NDArray[np.bool_] = np.all([np.ones(rows, dtype=bool), *satisfied], axis=0)
     return held
@@ -147,7 +150,7 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
 
     Raises:
         SystemFileError: S210, the file does not exist.
-        SpecError: it is not a specification.
+        SpecError: the file is not a valid specification.
     """
     try:
         spec = parse(read_source(judge.path))
@@ -160,11 +163,11 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
 
 
 def keep_rules(folder: RunDir, task: Task) -> None:
-    """Check the rules that a system names, and copy them into the run folder.
+    """Compile the rules (specifications of closed-loop runs) of a system; copy them to the run folder.
 
     Raises:
-        SystemFileError: S210, the file does not exist.
-        SpecError: they are invalid, or do not fit the system.
+        SystemFileError: S210, a file of rules does not exist.
+        SpecError: the rules are invalid, or use names that the system does not have.
     """
     decl = task.system.decl
     found = {judge.written: (judge, _fitting(judge, task)) for judge in decl.judges}
@@ -178,7 +181,10 @@ def keep_rules(folder: RunDir, task: Task) -> None:
 
 
 def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
-    """Read the rules and compile them for the recorded states, so that errors show before the training."""
+    """Read the rules that a system file names, and compile them for the states that a deployment records.
+
+    This reports errors in the rules before the training begins.
+    """
     spec, system = read_rules(judge), task.plain
     changed = _own(spec, system.decl.overrides)
     compile_spec(
@@ -188,15 +194,15 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 
 
 def rules_of(run: Run) -> Rules | None:
-    """Rules that judge a run under the deployment's settings; None if the specification of the plans judges.
+    """Rules that judge the closed-loop runs of a trained run; None: the specification of the plans does.
 
-    They are read from the copy in the run folder of the file that the run's `system.yaml` names. A file that
-    is named later (by the scenario or with `--set test.judge=…`) is read at its own path. A run that was
-    trained before `test.judge` existed uses the rules that its system file names today.
+    The run folder contains a copy of the rules that the system file named at training; they are read from
+    there. Rules that are named later (by the scenario or with `--set test.judge=…`) are read from their own
+    file. For a run that was trained before `test.judge` existed, the present system file names the rules.
 
     Raises:
-        RunError: R101, the run's copy is damaged.
-        SystemFileError: the file is missing.
+        RunError: R101, the index of the copies in the run folder is damaged.
+        SystemFileError: S210, the file of rules does not exist.
         SpecError: the file is not a specification.
     """
     decl = run.task.system.decl
@@ -226,7 +232,10 @@ def _copied(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Ru
 
 
 def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
-    """Rules that the system file of a run names today, under the chosen scenario."""
+    """Reference to the rules that the present system file of a run names for the chosen scenario.
+
+    None if it names none, does not exist or is invalid, or if `test.judge` is overridden.
+    """
     path = Path(str(folder.record().get("system_path") or ""))
     if "test.judge" in decl.overrides or not path.is_file():
         return None
@@ -259,7 +268,7 @@ def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
 def judge_runs(
     rules: Rules, task: Task, recording: DeploymentRecording, viable: NDArray[np.bool_]
 ) -> RunVerdicts:
-    """Judge every run from its first sample to its last.
+    """Judge every closed-loop run from its first sample to its last.
 
     Args:
         rules: specification for closed-loop runs.
@@ -268,7 +277,7 @@ def judge_runs(
         viable: (rows,), whether a safe plan from the first state is known.
 
     Raises:
-        SpecError: the rules do not fit the recording.
+        SpecError: the rules use names that the system does not have.
     """
     verdict = verdict_on_runs(rules, task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
@@ -287,7 +296,7 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
     """Evaluate the rules on every run from its first sample to its last.
 
     Raises:
-        SpecError: the rules do not fit the recording.
+        SpecError: the rules use names that the system does not have.
     """
     outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
     decl = task.system.decl
@@ -305,7 +314,11 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
 ) -> Lost | None:
-    """Time and cause of a loss, for the first broken rule, those tagged `@safety` before others."""
+    """Instant and cause from which a run could no longer obey the rule that it broke first; see `Lost`.
+
+    Only rules tagged `@safety` are considered if one of them is broken. None if the followed plans were good
+    until then, or if the cause is unknown. `viable`: whether a safe plan from the first state is known.
+    """
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
@@ -333,10 +346,15 @@ def _lost(
 def judge_runs_by_plans(
     held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
 ) -> RunVerdicts:
-    """Verdicts on runs by the specification of the plans: `held` maps requirement -> (starts, rows) booleans.
+    """Verdicts on runs by the specification of the plans.
 
-    A requirement is obeyed if it holds at every start instant; it is broken at the first one at which it
+    A requirement is obeyed if it holds at every start instant; it is broken at the first instant at which it
     fails.
+
+    Args:
+        held: requirement -> whether it holds, (starts, rows) booleans.
+        viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
+        dt: time step in seconds.
     """
     rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
     rules |= {name: np.full(len(viable), "inconclusive") for name, starts in held.items() if not len(starts)}
@@ -364,7 +382,7 @@ def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator
 
 
 def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Times at which a run broke the rules `names`: those of the samples that decide the verdicts."""
+    """Rule -> time in seconds at which the run `row` broke it; None if no single instant decides."""
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}
@@ -375,12 +393,14 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 
 
 def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
-    """The entry `drives` of a guard in `eval/simulate.json`.
+    """Return the entry `drives` of a guard in `eval/simulate.json`.
 
-    Of `count` runs, `obeyed` satisfy every rule, `undecided` are inconclusive, and `lost` of the others were
-    lost (see `RunVerdicts.viable`): `told` of these by a later exogenous event, the rest from the start.
-    `rules` holds the same numbers per rule. `broken` lists each run that broke rules, with the times (seconds
-    from the start, null if not located) and the `cause`: since when no plan is known, and why (`Lost`).
+    `count`: number of runs. `obeyed`: runs that satisfy every rule. `undecided`: inconclusive runs. `lost`:
+    runs that could not obey the rules (see `RunVerdicts.viable`); of these, `told` were lost by an exogenous
+    event after the start, the rest from the start. `rules`: the numbers of obeyed, broken and undecided runs
+    for each rule. `broken`: the runs that broke rules, each with the times of its violations (`rules`:
+    seconds from the start, null if unknown) and their `cause`: the instant since which no plan is known, and
+    the reason (see `Lost`).
     """
     obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {

@@ -22,7 +22,7 @@ class MeanInterval:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> MeanInterval:
-        """Mean of one or more values; the interval is omitted if a value is not finite."""
+        """Mean of one or more values; without an interval for a single value, or if a value is not finite."""
         mean = fmean(values)
         if len(values) < 2 or not all(map(math.isfinite, values)):
             return cls(mean, None, None, tuple(values))
@@ -30,17 +30,17 @@ class MeanInterval:
         return cls(mean, mean - half, mean + half, tuple(values))
 
     def summary(self) -> dict[str, object]:
-        """Entry for JSON documents."""
+        """Mean, interval and values as a JSON object."""
         return {"mean": self.mean, "low": self.low, "high": self.high, "values": list(self.values)}
 
     @property
     def half(self) -> float | None:
-        """Half-width of the interval."""
+        """Half-width of the interval; None if there is no interval."""
         return None if self.high is None else self.high - self.mean
 
 
 def student(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t: exact for 1 and 2 degrees of freedom, else within 0.1 %.
+    """97.5 % quantile of Student's t with `freedom` degrees of freedom: exact for 1 and 2, else within 0.1 %.
 
     Cornish-Fisher expansion (Abramowitz & Stegun 26.7.5).
     """

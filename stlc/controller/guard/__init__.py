@@ -1,1 +1,1 @@
-"""Runtime safety filters: plans are judged, and unsafe ones replaced."""
+"""Runtime safety filters (guards): they judge the policy's plans and replace unsafe ones."""

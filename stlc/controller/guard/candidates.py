@@ -32,13 +32,14 @@ POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Plans with their verdicts. Leading dimensions of all fields: (agents,), or (agents, choices).
+    """Plans with their verdicts. The leading dimensions (…) are (agents,), or (agents, choices).
 
     Attributes:
         plans: (…, T, m) float64, physical units.
-        rho: robustness of phi, (…).
-        safe: robustness of phi_safe, (…); +inf where no requirement is tagged `@safety`.
-        cost: performance terms, (…); 0 where not computed.
+        rho: robustness of the specification phi, (…).
+        safe: robustness of phi_safe (the requirements tagged `@safety`), (…); +inf where no requirement is
+            tagged `@safety`.
+        cost: performance cost of the objective, (…); 0 where not computed.
         source: index into `SOURCES`, (…) int64.
         prefix_length: T0, (…) int64; 0 without a sampled prefix.
     """
@@ -54,7 +55,10 @@ class Candidates:
     def judged(
         cls, task: Task, x: Tensor, plans: Tensor, source: int, prefix_length: int = 0, *, cost: bool = False
     ) -> Candidates:
-        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether to compute costs."""
+        """Judge plans (agents, …, T, m) from states (agents, n) float64.
+
+        All get the given source and prefix length. `cost`: whether to compute performance costs.
+        """
         shape, rows = plans.shape[:-2], plans.flatten(0, -3)
         starts = x.repeat_interleave(len(rows) // max(len(x), 1), 0)
         found = task.judge(starts, rows, states=cost)
@@ -77,12 +81,12 @@ class Candidates:
 
     @property
     def satisfies(self) -> Tensor:
-        """Plans that satisfy phi, (…) booleans."""
+        """Mask of the plans that satisfy the specification phi, (…) booleans."""
         return self.rho >= -TOLERANCE
 
     @property
     def is_safe(self) -> Tensor:
-        """Plans that satisfy phi_safe, (…) booleans."""
+        """Mask of the plans that satisfy phi_safe (the requirements tagged `@safety`), (…) booleans."""
         return self.safe >= -TOLERANCE
 
     def of(self, rows: Tensor) -> Candidates:
@@ -126,9 +130,10 @@ _FIELDS = tuple(each.name for each in fields(Candidates))
 def rank(plans: Candidates) -> Tensor:
     """Rank of plans, (…); larger is better.
 
-    The order, from best to worst: plans that satisfy phi, by robustness; safe plans of which the policy
-    continues the prefix, because they return to the training distribution; other safe plans; plans with the
-    longest safe prefix; other plans, by the smaller of the robustness of phi and that of phi_safe.
+    The order, from best to worst: plans that satisfy phi, by robustness; safe plans that the policy continues
+    after a sampled prefix (they return to states on which it was trained); other safe plans; plans with the
+    longest safe prefix; other plans, by the smaller of the robustness of phi and that of phi_safe; plans that
+    were not judged.
     """
     good, safe = plans.satisfies, plans.is_safe
     within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
@@ -142,7 +147,11 @@ def rank(plans: Candidates) -> Tensor:
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
-    """Best allowed choice per row, by `keys` in lexicographic order: (rows, choices) -> (rows,) indices."""
+    """Best allowed choice per row: (rows, choices) -> (rows,) indices.
+
+    `allowed`: mask of the choices. `keys`: values (rows, choices), larger is better; a later key decides
+    between choices that are equal in all earlier ones. NaN is the smallest value.
+    """
     for key in keys:
         value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
         allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
@@ -159,7 +168,10 @@ def finite(plan: Tensor, task: Task) -> Tensor:
 
 
 class Deadline:
-    """Time by which a decision for a number of agents must be made; without time limit it never passes."""
+    """Time by which a decision for a number of agents must be made.
+
+    `seconds`: time per agent; if None, the time never passes.
+    """
 
     def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
         self.until = inf if seconds is None else perf_counter() + seconds * agents
@@ -175,20 +187,20 @@ class Limits:
     """Computational limits of a decision.
 
     Attributes:
-        seconds: time limit per agent of the full guard, which then takes the best plan found until then;
-            None: no limit.
-        tries: number of plans that a local search judges per starting plan.
-        prefixes: maximum number of prefixes of each length that the paper's guard compares if it found no
-            safe plan.
-        drawn: maximum number of prefixes of each length for sampled shooting; if there are more, a random
-            sample is used.
-        places: number of plans of sampled shooting from which local searches start.
-        again: number of plans that each of these searches judges.
+        seconds: time limit of the guard "full" per agent; the best plan found until then is taken. None: no
+            limit.
+        tries: number of plans that a local search in the guard "full" judges per starting plan.
+        prefixes: maximum number of prefixes of one length in the stage "prefix shooting" of the guard "full",
+            which skips longer prefixes if there are more; it is used if no other stage found a safe plan.
+        drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
+            random sample is used.
+        places: number of best plans of sampled shooting from which local searches start.
+        again: number of plans that each of these local searches judges.
         rescue: whether to search for a plan that satisfies phi_safe alone, without the policy, if no other
             stage found a safe plan.
         margin: name of a safety requirement -> robustness margin, in its unit, by which an accepted plan must
-            satisfy it; also for the paper's guard.
-        paper: time limit per agent of the paper's guard; None: no limit.
+            satisfy it, in both guards.
+        paper: time limit of the guard "paper" in seconds per agent; None: no limit.
     """
 
     seconds: float | None = 0.1
@@ -203,7 +215,10 @@ class Limits:
 
 
 def grid_of(task: Task) -> PrefixGrid:
-    """Control grid of the backup policy: `levels` of the system file, else evenly spaced values."""
+    """Grid of control values and prefix lengths for the backup policy, from the system file.
+
+    Without `levels` in the file, the values of a control are evenly spaced over its range.
+    """
     decl = task.system.decl
     values = tuple(
         decl.backup.levels.get(control.name)

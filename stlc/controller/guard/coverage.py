@@ -1,4 +1,4 @@
-"""Probability that the backup policy's grid contains a working plan: Theorem 1 of the paper, and exact.
+"""Probability that the backup policy finds a satisfying plan: Theorem 1 of the paper, and exact value.
 
 Assumption: a prefix u* of T0 actions is uniformly distributed over the control ranges, and every prefix
 within `radius` of u*, in every control at every step, leads to satisfaction. The backup policy finds such a
@@ -47,21 +47,25 @@ class Axis:
         return total / (self.high - self.low)
 
     def bound(self, radius: float) -> float:
-        """Bound of Theorem 1 for one step, (2 L - 4) radius / range; it ignores the ends of the range."""
+        """Lower bound of Theorem 1 on the covered share, (2 L - 4) radius / range, for L grid values.
+
+        It ignores the ends of the range.
+        """
         return max(2 * len(self.values) - 4, 0) * radius / (self.high - self.low)
 
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """Probabilities that the prefixes of one length contain a working one (one that leads to satisfaction).
+    """Probabilities that a tried prefix of one length works (leads to a satisfying plan).
 
     Attributes:
-        radius: distance in which prefixes work, as a share of each control's range.
+        radius: largest distance from u* at which a prefix works, as a share of each control's range.
         length: number of actions of a prefix, T0.
         candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
         theorem: the paper's bound, min{1, product over controls and steps}.
-        bound: the same with the minimum taken for each control. The paper's product counts overlapping cover
-            of a control more than once and may exceed the exact value.
+        bound: the same, but with each control's factor limited to 1. In the paper's product a factor may
+            exceed 1, because overlapping intervals of a control are counted more than once, so that the
+            product may exceed the exact probability.
         exact: exact probability under the same assumptions; for a sample of the prefixes, a lower bound.
         sampled: whether only a sample of the prefixes is tried.
     """
@@ -82,11 +86,11 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 
 
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
-    """Compute the probabilities for one radius, a share of each control's range, and one prefix length.
+    """Compute the probabilities for one prefix length and one radius, a share of each control's range.
 
-    If the grid has more than `samples` prefixes, that many are drawn with replacement. A given one of the M
-    prefixes is then tried with probability 1 - (1 - 1 / M)^samples, so this is a lower bound on the
-    probability that a tried prefix works if some prefix of the grid does.
+    If the grid has M > `samples` prefixes, `samples` of them are drawn with replacement, so that each is
+    tried with probability 1 - (1 - 1 / M)^samples. The probabilities are multiplied by this number; as
+    several prefixes may work, the product is a lower bound.
     """
     radii = [radius * (axis.high - axis.low) for axis in axes]
     bounds = [axis.bound(each) for axis, each in zip(axes, radii, strict=True)]
@@ -107,6 +111,6 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
 
 
 def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
-    """Probabilities for all radii and all prefix lengths of the grid."""
+    """Probabilities for all radii (as shares of the control ranges) and all prefix lengths of the grid."""
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

@@ -50,11 +50,11 @@ def solve(
         task: specification and system.
         x0: states, (B, n).
         start: starting plans, (B, T, m); the middle of every control range if None.
-        library: plans from which the search also takes parts, (k, T, m); those of `extremes` if None.
+        library: plans of which the search also inserts parts, (k, T, m); those of `extremes` if None.
         passes: maximum number of passes.
         tries: number of plans judged per pass and state.
-        generator: random numbers of the search; seed 0 if None.
-        stop: ends the search early.
+        generator: random numbers of the search; a generator with seed 0 if None.
+        stop: function that returns True to end the search early.
 
     Returns:
         Plans and their robustness in float64; -inf for states whose search was stopped before it began.
@@ -82,24 +82,27 @@ def solve(
 
 
 def solvable(task: Task, x0: Tensor) -> Tensor:
-    """Mask of the states from which a search finds a plan that satisfies phi: (B, n) -> (B,)."""
+    """Mask of the states from which a search finds a satisfying plan: (B, n) -> (B,)."""
     return solve(task, x0).rho >= -TOLERANCE
 
 
 def viable(task: Task, x0: Tensor) -> Tensor:
-    """Mask of the states from which a search finds a plan that satisfies phi_safe: (B, n) -> (B,)."""
+    """Mask of the states from which a search finds a safe plan: (B, n) -> (B,).
+
+    A plan is safe if it satisfies the requirements tagged `@safety`; without any, all entries are True.
+    """
     if not task.compiled.safety:
         return torch.ones(len(x0), dtype=torch.bool)
     return solvable(safety_task(task), x0)
 
 
 def safety_task(task: Task) -> Task:
-    """The task with phi_safe as its only specification."""
+    """The task with the requirements tagged `@safety` as its only specification."""
     return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
 
 
 def extremes(task: Task, generator: torch.Generator) -> Tensor:
-    """Piecewise constant plans with each control at a low, middle or high value: (k, T, m)."""
+    """Plans of 3 constant pieces, each control at the low end, middle or high end of its range: (k, T, m)."""
     low, high = task.system.control_low, task.system.control_high
     levels = torch.stack((low, 0.5 * (low + high), high))
     shape = (PIECES, len(low))

@@ -49,9 +49,10 @@ class GuardDecision:
     proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> GuardDecision:
-        """The decision after `steps` further steps, one number or (agents,): the remainders of the plans.
+        """The decision for the instant `steps` steps later: the remainders of the plans.
 
-        A remainder is filled up to the length of a plan by holding its last action.
+        `steps`: one number for all agents, or (agents,). The last action of a plan is held to its full
+        length.
         """
         agents, length, controls = self.plan.shape
         ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
