@@ -1,4 +1,4 @@
-"""Interval arithmetic over numbers, and the typical range of random draws."""
+"""Interval arithmetic on numbers of the IR, and the range of nearly all values of random draws."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
     """Yield W403 for each predicate with a modulo that is discontinuous within its signals' ranges.
 
     Args:
-        formula: resolved formula.
+        formula: formula whose names and units are resolved.
         ranges: ranges of signals, declared or never left, each in the unit in which its signal is stored.
     """
     for node in nodes(formula):

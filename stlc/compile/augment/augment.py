@@ -83,7 +83,8 @@ def augment(
 class _Goals:
     """Builder of a requirement's goal: its absolute formulas (`always@[a, b] p`), joined by `and` and `or`.
 
-    For each absolute formula, a status and the mission clock are added to `table`.
+    For each absolute formula, its status (an added state: open, true or false) and the mission clock are
+    added to `table`.
     """
 
     grid: Grid

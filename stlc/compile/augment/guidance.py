@@ -1,8 +1,8 @@
 """Guidance cost: a performance term that drives plans towards deadlines beyond their horizon.
 
-Robustness covers only the horizon. Therefore the open goal with the earliest deadline adds the violation of
-its formula, `max(-margin, 0)`, to the cost at every sample, so that plans that approach the goal sooner cost
-less. Once it is met, the goal with the next deadline takes over.
+Robustness covers only the horizon. Therefore the open (undecided) goal with the earliest deadline adds the
+violation of its formula, `max(-margin, 0)`, to the cost at every sample, so that plans that approach the goal
+sooner cost less. Once this goal is met, the goal with the next deadline takes over.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
-    """Return the guidance of a disjunction of two goals: that of the less violated goal.
+    """Return the guidance of a disjunction of two goals: that of the goal with the smaller violation.
 
     A goal that can no longer be met is left out; a goal that is already met has no violation.
     """

@@ -38,13 +38,18 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
     """True if the window of `node` contains the present sample.
 
-    A past window that does not contain it may be empty; the truth of `node` then does not depend on its body.
+    A past window without the present sample may be empty; the truth of `node` then does not depend on its
+    body.
     """
     return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
 
 
 def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Return `node` applied to `body`, with the parts of `body` of constant truth moved out of `node`."""
+    """Return `node` applied to `body`, with the parts of `body` moved out whose truth is constant.
+
+    E307 is reported for other absolute operators (`always@[a, b]`) in `body`; the result then contains
+    `true`.
+    """
     if _constant(body):
         return body
     if isinstance(body, typed.Logic) and body.op in ("and", "or"):
@@ -91,8 +96,8 @@ def from_first_sample(formula: typed.Formula) -> typed.Formula:
     """Return the formula of a requirement that is evaluated only at the first sample of a recorded trace.
 
     At that sample, mission time and relative time are equal, so absolute operators (`always@[a, b]`) become
-    relative ones (`always[a, b]`). Those below another temporal operator stay absolute; they too are
-    evaluated at the first sample.
+    relative ones (`always[a, b]`). Absolute operators below another temporal operator are not changed; they
+    too are evaluated at the first sample.
     """
     if isinstance(formula, (typed.Temporal, typed.Until)):
         return from_now(formula)

@@ -1,10 +1,11 @@
 """Absolute formulas, each with an added state that holds its status, and their progression over a plan.
 
 An absolute formula such as `always@[a, b] p` has an interval that counts from the start of the mission. Its
-status is open, true or false; once true or false it stays so. A plan satisfies an absolute formula unless the
-samples up to the plan's end falsify it: an open formula is evaluated over the horizon and assumed satisfiable
-beyond it. This also holds for any combination of absolute formulas by `and`, `or`, `not` and `->`: an
-executed trace whose plans all satisfy the progressed formula satisfies the formula.
+status is open (undecided), true or false; once true or false it stays so. Progression turns the formula into
+one that a plan must satisfy: the samples up to the plan's end must not falsify the absolute formula. An open
+formula is evaluated over the horizon and assumed satisfiable beyond it. An executed trace whose plans all
+satisfy the progressed formula satisfies the formula. This also holds for any combination of absolute formulas
+by `and`, `or`, `not` and `->`.
 """
 
 from __future__ import annotations
@@ -34,11 +35,12 @@ class Absolute:
 
     Attributes:
         op: the operator.
-        window: its samples, counted from the start of the mission.
-        span: its place in the source.
+        window: the interval in samples, counted from the start of the mission.
+        span: source location of the operator.
         left: left operand of `until` and `release`, a typed formula; a constant for `always` and
             `eventually`.
-        right: right operand, or the only one, a typed formula.
+        right: right operand of `until` and `release`, or the operand of `always` and `eventually`, a typed
+            formula.
         left_now: `left` as a condition on the current state, in which ties count as satisfied.
         right_now: `right` as a condition on the current state, in which ties count as satisfied.
         margin: `right` as a formula of the IR, for its robustness.
@@ -58,7 +60,8 @@ class Absolute:
 class GoalLeaf:
     """Goal of one absolute formula (`always@[a, b] p`), with the states that the compiler adds for it.
 
-    `status` holds whether the formula is open, true or false; `clock` counts the steps of the mission.
+    The state `status` is 0 while the formula is open (undecided), then 1 (true) or -1 (false); the state
+    `clock` counts the steps of the mission.
     """
 
     formula: Absolute
@@ -111,7 +114,7 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Return the next status (open, true or false) of an open formula, as the current sample decides it."""
+    """Return the next status of an open formula: true or false if the current sample decides it."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:

@@ -106,7 +106,7 @@ def _on_grid(
 ) -> typed.Formula:
     """Return a formula with its bounds in whole samples, rounded conservatively for each operator.
 
-    `negated` tells that the formula is below a `not`.
+    `negated`: whether the formula is the operand of a `not`, which reverses the rounding of `since`.
     """
     match formula:
         case typed.Logic(_, _, items):

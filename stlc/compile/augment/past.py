@@ -91,7 +91,7 @@ class Past:
         grid: time step and horizon.
         table: table to which the timers are added.
         sink: list to which findings are appended: E309 for an operator that no timer represents.
-        name: name of the requirement, with which the names of its timers begin.
+        name: name of the requirement, which begins the names of its timers.
     """
 
     grid: Grid
@@ -256,9 +256,10 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Return the truth that `body` had `steps` samples ago, stored in one added state per sample.
+        """Add a state per sample, and return the truth that `body` had `steps` samples ago.
 
-        Before the start of the mission the truth is `before`.
+        Before the start of the mission the truth is `before`. E309 is appended to `sink` if more than
+        `REGISTER` states are needed.
         """
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")

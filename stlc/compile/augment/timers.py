@@ -64,10 +64,10 @@ def clock_of(name: str, high: int) -> Timer:
 
 
 class TimerTable:
-    """Added states of a specification, collected over its requirements; equal ones are shared."""
+    """Added states of a specification, collected over its requirements; equal states are shared."""
 
     def __init__(self, taken: frozenset[str]) -> None:
-        """Create an empty table that gives no added state a name in `taken`."""
+        """Create an empty table, in which no added state has a name in `taken`."""
         self._taken = set(taken)
         self._known: dict[tuple[object, ...], Timer] = {}
         self._clock: str | None = None
@@ -152,5 +152,5 @@ def tolerant(formula: ir.Formula) -> ir.Formula:
 
 
 def both(*items: ir.Formula) -> ir.Formula:
-    """Return the conjunction of formulas, simplified where one is a constant."""
+    """Return the conjunction of formulas, simplified where a formula is a constant."""
     return joined("and", items, ir.Truth(True))

@@ -585,7 +585,7 @@ def _verb(function: Function) -> str:
 
 
 def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 for two units that do not agree, with both places and a repair."""
+    """Return E203 for two units that do not agree, with the locations of both sides and a suggestion."""
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(

@@ -213,7 +213,7 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
 def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: str, scope: Scope) -> Value:
     """Return a number, a vector or a formula shifted in time by `delay`.
 
-    `name` is that of the function, for messages.
+    `name` is the name of the function, for messages.
     """
     match value:
         case Number() if value.kind != "bool":
@@ -429,7 +429,7 @@ def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
 def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
     """Return `ind(phi, sharpness = w)`: 1 where the state formula phi holds, else 0.
 
-    In training it is smoothed with the factor w (`stlc.compile.ir.nodes.Indicator`).
+    In training the indicator is smoothed with the factor w (`stlc.compile.ir.nodes.Indicator`).
     """
     if not call.args or call.args[0].name is not None or len(call.args) > 2:
         message = "`ind` takes a formula, and perhaps `sharpness = w`"

@@ -33,7 +33,7 @@ from stlc.units import Unit
 
 
 def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> typed.Formula:
-    """Return the conjunction of the comparisons in a chain such as `a <= b < c`."""
+    """Return the formula of a comparison; a chain such as `a <= b < c` is a conjunction."""
     pairs = []
     for index, op in enumerate(expr.ops):
         left, right = expr.operands[index], expr.operands[index + 1]
@@ -106,7 +106,7 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Return the unit in which a comparison is reported: that of a side that is not constant, if any."""
+    """Return the unit in which a comparison is reported: the unit of a side that varies, if there is one."""
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 

@@ -426,7 +426,7 @@ def _check_twice(spec: ast.Spec, scope: Scope) -> None:
 
 
 def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]], scope: Scope) -> None:
-    """Record the declaration of a name, or report E102 if it has one already.
+    """Record the declaration of a name; report E102 if the name is already declared.
 
     Different enums may have members of the same name.
     """

@@ -135,7 +135,7 @@ def resolve_numbers(
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
-    """Return a number as a column in `unit` stores it: 20 degC is 20 in degC, and 72 km/h is 72 in km/h."""
+    """Return a number as a column in `unit` stores it: for km/h, the number 20 m/s is stored as 72."""
     number = rebased(number, unit)
     if unit.ratio == 1:
         return number.num

@@ -25,8 +25,8 @@ class InterfaceFunction(Protocol):
             result: size of the result; None for a number.
 
         Returns:
-            Function from the components of all arguments, as broadcastable arrays, to those of the result; or
-            its body in the IR.
+            Function from the components of all arguments to the components of the result, all of them
+                broadcastable arrays; or the body of the function in the IR.
         """
 
 

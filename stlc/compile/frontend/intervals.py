@@ -160,10 +160,10 @@ def interval(
 
     Args:
         node: interval in the source; None if there is none, which means from now to the end.
-        bounds: values of its two bounds.
+        bounds: values of the two bounds.
         op: name of the operator.
         place: source location of the operator.
-        body: operand, for the help of a message.
+        body: operand of the operator, for the help of a message.
         scope: receives findings.
 
     Raises:

@@ -1,8 +1,8 @@
 """Imports of other specifications, from files or from the texts stored with a run or a trace.
 
-An imported file is identified by its key: its path relative to the folder of the specification read first, or
-`@std` for the library. Stored texts have the same keys, so that a specification keeps its meaning in another
-place.
+An imported file is identified by its key: its path relative to the folder of the main specification, or
+`@std` for the library. Stored texts have the same keys, so that a specification keeps its meaning when it is
+moved to another folder.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Module:
     """Imported specification.
 
     Attributes:
-        key: path relative to the folder of the specification that is read first, or `@std`.
+        key: path relative to the folder of the main specification, or `@std` for the library.
         alias: name in the importing file.
         written: import declaration.
-        spec: syntax tree of the file.
-        imports: modules that the file imports itself.
+        spec: syntax tree of the imported file.
+        imports: modules that the imported file imports itself.
     """
 
     key: str

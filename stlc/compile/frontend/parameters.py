@@ -81,7 +81,8 @@ def parameters(
         scope: names that the distribution may use; receives findings.
 
     Raises:
-        Failed: an invalid distribution (E205, E203), or one that differs from the system's (E104).
+        Failed: the distribution is invalid (E205), has another unit (E203), or differs from that of the
+            system (E104).
     """
     carried = interface is not None and columns[0].name in interface.signature
     if carried and interface is not None:
@@ -191,7 +192,7 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
 
 
 def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
-    """Return the parameters, those named in `values` with a constant in place of their distribution.
+    """Return the parameters, with a constant in place of the distribution of those named in `values`.
 
     A constant may be outside the declared range.
 

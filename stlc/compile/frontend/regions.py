@@ -1,8 +1,8 @@
-"""Regions and the signed distance of a point to them, positive inside.
+"""Regions and the signed distance of a point to a region, positive inside.
 
-Distances to balls, boxes, half-spaces and polygons are Euclidean and exact. A union takes the greatest, an
-intersection the least distance of its parts; its sign is exact, and inside a union or outside an intersection
-its magnitude is a lower bound.
+Distances to balls, boxes, half-spaces and polygons are Euclidean and exact. The distance to a union is the
+greatest, to an intersection the least distance to its parts. The sign of these distances is exact; inside a
+union and outside an intersection their magnitude is a lower bound.
 """
 
 from __future__ import annotations
@@ -222,10 +222,9 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
 
 
 def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return `turn(start, end, point)` for points that vary.
+    """Return `turn(start, end, point)` for points that vary: twice the signed area of the triangle.
 
-    It is twice the signed area of the triangle: positive if `point` is left of the edge from `start` to
-    `end`.
+    The area is positive if `point` is left of the edge from `start` to `end`.
     """
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)

@@ -43,9 +43,9 @@ class File:
 
     Attributes:
         spec: syntax tree of the file.
-        found: its declarations.
-        scope: scope in which its names are resolved.
-        files: files that it imports.
+        found: declarations of the file.
+        scope: scope in which names in the file are resolved.
+        files: files that the file imports.
     """
 
     spec: ast.Spec
@@ -77,7 +77,7 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
     """Return the distinct columns of a file and its imports, and the components of their parameters.
 
-    E104 is reported if two files disagree about a column, or a file and the system about a parameter.
+    E104 is reported if two files declare a column differently, or a file and the system a parameter.
     """
     columns: dict[str, tuple[Column, Span]] = {}
     drawn: dict[str, typed.Parameter] = {}

@@ -158,10 +158,11 @@ class _Sweep:
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
-        """Return minus the distance to a box at each point of the segment that may be closest to it.
+        """Return minus the distance to a box at each point of the segment that may be closest to the box.
 
-        The squared distance is convex and piecewise quadratic along the segment. Its minimum is that of one
-        of the pieces, which begin at the start of the segment and where it crosses a face.
+        The squared distance is convex and piecewise quadratic along the segment, and its minimum is the
+        minimum of one of the pieces. A piece begins at the start of the segment or where the segment crosses
+        a face.
         """
         slopes = [self.apply("sub", after, before) for before, after in faces]
         starts = [literal(0, self.span), *(self._passing(face) for face in faces)]
@@ -186,7 +187,7 @@ class _Sweep:
     def _passing(self, face: Pair) -> Number:
         """Return the position in [0, 1] along the segment where the segment crosses a face.
 
-        If it crosses none, the position is arbitrary.
+        If the segment crosses no face, the position is arbitrary.
         """
         before, after = face
         slope = self.apply("sub", after, before)

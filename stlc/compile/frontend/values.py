@@ -76,7 +76,10 @@ class VectorValue:
 
 @dataclass(frozen=True, slots=True)
 class EnumMember:
-    """Member of one or several enums; the other operand of a comparison decides which one is meant."""
+    """Name of a member of one or several enums.
+
+    If there are several, the other operand of a comparison decides which enum is meant.
+    """
 
     name: str
     options: tuple[Labels, ...]
@@ -106,7 +109,7 @@ class TimeExpr:
         return TimeExpr(self.seconds * factor, self.steps * factor, self.horizons * factor)
 
     def on(self, span: Span | None) -> typed.Time:
-        """Return the time as an interval bound or a delay whose place in the source is `span`."""
+        """Return the time as an interval bound or a delay with the source location `span`."""
         return typed.Time(self.seconds, self.steps, self.horizons, span)
 
 
@@ -197,14 +200,14 @@ def is_formula(value: Value) -> bool:
 
 
 def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
-    """Return a number without a unit."""
+    """Return a constant as a number without a unit, exact if it is a fraction or an integer."""
     exact = Fraction(value) if isinstance(value, Fraction | int) else None
     kind: Kind = "int" if exact is not None and exact.denominator == 1 else "real"
     return Number(ir.Const(float(value)), flexible=True, bare=True, exact=exact, kind=kind, span=span)
 
 
 def at(value: Value, span: Span) -> Value:
-    """Return a value with another place in the source; a formula keeps its own."""
+    """Return a value with another source location; a formula keeps its own."""
     return value if isinstance(value, typed.Node) else replace(value, span=span)
 
 

@@ -194,15 +194,15 @@ class Requirement:
 
     Attributes:
         name: name of the requirement.
-        doc: text of the `##` comment before it.
-        tags: names of its tags without arguments (`safety`, `liveness`).
-        weight: factor of its robustness in the overall minimum.
-        scale: divisor of its robustness in the overall minimum.
+        doc: text of the `##` comment before the requirement.
+        tags: names of the tags without arguments (`safety`, `liveness`).
+        weight: factor of the robustness in the overall minimum.
+        scale: divisor of the robustness in the overall minimum.
         id: text of `@id("…")`; "" without this tag.
         group: name in `@group(name)`; "" without this tag.
         formula: typed formula.
         written: syntax tree of the formula, for messages.
-        span: place of the declaration.
+        span: source location of the declaration.
     """
 
     name: str

@@ -34,7 +34,7 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
 
 
 def _one_unit(formula: typed.Formula) -> Unit | None:
-    """Return the unit in which all predicates are written; None if they differ or there are none."""
+    """Return the unit in which all predicates are written; None if they differ or there is no predicate."""
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
     alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)

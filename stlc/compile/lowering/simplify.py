@@ -24,11 +24,11 @@ _NOW = ir.Window(0, 0)
 
 
 def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
-    """Return an equivalent formula with fewer nodes; simplifying it again changes nothing.
+    """Return an equivalent formula with fewer nodes; simplifying the result again changes nothing.
 
     Args:
-        formula: in negation normal form.
-        semantics: semantics under which robustness is preserved; the exact one allows all laws.
+        formula: formula in negation normal form.
+        semantics: semantics under which the robustness is preserved; the exact semantics allows all laws.
     """
     whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
     law = _LAWS.get(type(whole))
