@@ -1,1 +1,1 @@
-"""State augmentation: added states (timers, latches, statuses) that carry the past into a plan."""
+"""State augmentation: added states (timers, latches, statuses) that carry the mission's past into a plan."""

@@ -191,7 +191,7 @@ class _Writer:
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
         """Return `eventually@[window] (when and what)` with only past operators below the absolute operator.
 
-        The window of the result is that of the samples at which `what` is decided. `when` are past formulas,
+        The window of the result contains the samples at which `what` is decided. `when` are past formulas,
         all of which must hold at the sample at which `what` holds.
         """
         if not looks_ahead(what):
@@ -324,7 +324,7 @@ class _Writer:
         The operator is expanded sample by sample.
 
         Raises:
-            TooFarError: its window is longer than `_LONGEST` samples.
+            TooFarError: the window of `node` is longer than `_LONGEST` samples.
         """
         window, end, strong = _window(node), _end(node), node.op == "until"
         if end > _LONGEST:

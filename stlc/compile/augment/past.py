@@ -283,7 +283,7 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, by operators that end now.
+        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, by windows that end now.
 
         The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q` held a ago.
         """

@@ -148,7 +148,7 @@ def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Nu
     """Return the same quantity in `unit`, a unit of the same dimensions.
 
     Raises:
-        Failed: `number` is a temperature difference, and `unit` is that of a temperature such as degC (E203).
+        Failed: `number` is a temperature difference, and `unit` has an offset, such as degC (E203).
     """
     if unit.offset and number.sense == "difference":
         scope.fail(difference_for_point(number, unit, place))
@@ -284,7 +284,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """True for a temperature in degC times or divided by a plain number, as in a mean."""
+    """True for a temperature in degC multiplied or divided by a plain number, as in a mean."""
     points = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in points]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)

@@ -237,7 +237,10 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Return one component of a vector shifted in time by `delay`, and with it `Number.formula`."""
+    """Return one component of a vector, shifted in time by `delay`.
+
+    If the component has a formula of its own (`Number.formula`), the formula is shifted too.
+    """
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
 

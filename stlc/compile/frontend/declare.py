@@ -144,7 +144,7 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """Return the unit that a declaration has in brackets; dimensionless without one.
+    """Return the unit that a declaration has in brackets; dimensionless if `text` is empty.
 
     W107 is reported for a name such as `temp` in coulombs (`[C]`).
 
@@ -187,8 +187,8 @@ def columns_of(
 ) -> tuple[Column, ...]:
     """Return the columns (name, unit, type, role) of a signal or parameter, one per component.
 
-    If there is a system, unit and range are those of its column of the same name. The range in the
-    declaration is not read (`ranged`).
+    If there is a system, unit and range are those of its column of the same name. The declared range is not
+    read here, but in `ranged`.
 
     Raises:
         Failed: the type is unknown (E101), or the system lacks the signal (E103) or declares it with another
@@ -371,8 +371,9 @@ def declare(
 ) -> Declared:
     """Return the declarations of a file, and report the errors in them to `scope`.
 
-    E101 is an unknown type, E102 a name declared twice, E501 a tag on a declaration that takes none. A signal
-    that the system lacks is E103, one that it declares with another type or unit E104 or E203.
+    E101 is an unknown type, E102 a name declared twice, E103 a signal that the system lacks, E104 a signal of
+    another type than in the system, E203 a signal of another unit, E501 a tag on a declaration that takes
+    none.
 
     Args:
         spec: syntax tree of the file.

@@ -242,8 +242,8 @@ def _refuse_products(
 ) -> None:
     """Raise Failed (E205) for an operator that is not defined between a vector and its other operand.
 
-    These are the sum of a vector and a number, the product of two vectors, and a vector on the right of `/`,
-    `%` or `^`.
+    Not defined are the sum or difference of a vector and a number, the product of two vectors, and a vector
+    on the right of `/`, `%` or `^`.
     """
     vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
@@ -332,7 +332,7 @@ def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
     """Return the values of independent expressions, all of which are evaluated.
 
     Raises:
-        Failed: an expression has errors; those of all expressions are in `scope.sink`.
+        Failed: an expression has errors; the errors of all expressions are in `scope.sink`.
     """
     return _all(partial(evaluate, expr, scope) for expr in exprs)
 
@@ -463,7 +463,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> V
 
 @contextmanager
 def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Context for the expansion of a macro: the place of the call is added to the findings if it fails."""
+    """Context for the expansion of a macro: on failure, the location of the call is added to the findings."""
     before = len(scope.sink)
     try:
         yield
@@ -670,7 +670,7 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 
 
 def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """Return a number that `freeze` binds as a frozen value, whose unique name is appended to `bindings`.
+    """Return the frozen value of a number that `freeze` binds; append (unique name, number) to `bindings`.
 
     A constant is returned unchanged, without an entry in `bindings`.
     """

@@ -138,8 +138,8 @@ class _Sweep:
         """Return the maximum along the segment of the least distance to a face, positive inside.
 
         The result is negative if the segment stays outside. By duality of linear programs it is the least of
-        two kinds of values: the greater of each face's distances at both ends of the segment, and, for two
-        faces with distances of opposite slope, the distance at the point where both are equal.
+        two kinds of values: for each face, the greater of its distances at both ends of the segment; for two
+        faces whose distances have opposite slopes, the distance at the point where the two are equal.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]
@@ -213,7 +213,8 @@ class _Sweep:
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
         """Return the distance of the segment to every edge of a polygon; negative where they cross.
 
-        The magnitude is the least distance from an end of either of the two to the other one.
+        Where they cross, the magnitude is the least of the distances from the ends of the segment to the edge
+        and from the ends of the edge to the segment.
         """
         now, then = self.ends
         past = edges([self.past(corner) for corner in corners])

@@ -114,7 +114,8 @@ def _pow(base: Any, exponent: Any) -> Any:
 def _corners(fold: Callable[..., Any]) -> RangeRule:
     """Return the range rule of a function that is monotone in each argument.
 
-    Its extremes are among the values at the corners: every argument at its least or greatest value.
+    A range rule is the function from the ranges of the arguments to the range of the result. The extremes are
+    among the values at the corners: every argument at its least or greatest value.
     """
 
     def rule(args: Sequence[Bounds]) -> Bounds:
@@ -148,7 +149,10 @@ def _modulo(args: Sequence[Bounds]) -> Bounds:
 
 
 def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
-    """Return the range rule of a norm, from the least and the greatest magnitude of each component."""
+    """Return the range rule of a norm: the function from the ranges of its components to its range.
+
+    `combine` is the norm itself, applied to the least and to the greatest magnitude of each component.
+    """
 
     def rule(args: Sequence[Bounds]) -> Bounds:
         sides = [_even([arg]) for arg in args]

@@ -309,8 +309,8 @@ class Shift(Operator):
         outside: truth where that sample lies outside the trace. None: undefined, like a window that leaves
             the trace. False: used by `rise` and `fall` at the first sample.
         span: source location.
-        weak: whether an undefined value counts as true, since the node results from a negation, or as false;
-            only where windows are cut at the end of the trace (`truncate`).
+        weak: whether the node results from a negation. If so, an undefined value counts as true where windows
+            are cut at the end of the trace (`truncate`), otherwise as false.
     """
 
     steps: int

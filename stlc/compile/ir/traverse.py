@@ -35,7 +35,7 @@ _SORTS: Mapping[str, _Sort] = {
 
 @cache
 def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
-    """Return the fields of a node class that hold children, in order: (name, sort of the value)."""
+    """Return the fields of a node class that hold children, in order: (name, kind of the children)."""
     declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
     return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
@@ -188,7 +188,7 @@ def frozen_in(num: ir.Num) -> frozenset[str]:
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """Return the value of a number later, by `steps` samples and in addition by the time `delay`.
+    """Return a number shifted in time by `steps` samples (positive: later), and further by the time `delay`.
 
     Outside the trace a `clamped` number repeats the first or last sample.
     """

@@ -135,7 +135,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
-        """Lower a temporal operator as the operator `op`: its own or, if it is negated, the dual."""
+        """Lower a temporal operator as `op`: the operator itself or, if it is negated, its dual."""
         if on_clock(node):
             return ir.AtStart(self._timed(from_now(node), op), node.span)
         parts = [self.formula(part) for part in operands(node)]
