@@ -25,14 +25,14 @@ AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implicat
 
 @dataclass(frozen=True, slots=True)
 class Ambiguity:
-    """Part of a formula that should be in parentheses.
+    """Part of a formula that should be in parentheses, since other STL tools can parse it differently.
 
     Attributes:
         span: its place in the source.
-        kind: "scope": a temporal operator whose operand extends further in other tools; "mixed": `and` next
-            to `or`; "chain": consecutive implications; "until": `until` next to another connective;
-            "implication": `and` or `or` next to `->`, which most tools parse as this one does.
-        outer: connective next to the part.
+        kind: reason: "scope": a temporal operator whose operand extends further in other tools; "mixed":
+            `and` next to `or`; "chain": consecutive implications; "until": `until` next to another
+            connective; "implication": `and` or `or` next to `->`, which most tools parse as this one does.
+        outer: the connective of which the part is an operand.
     """
 
     span: Span
@@ -58,7 +58,10 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """Words and signs of the source text, and the source locations that will get parentheses."""
+    """Words and signs of a source text, to tell which operands have parentheses.
+
+    `parenthesised` are the (start, end) offsets of the parts that already were found to need parentheses.
+    """
 
     def __init__(self, spec: ast.Spec) -> None:
         self.items: list[Lexeme] = list(lexemes(spec.source.text))
@@ -66,7 +69,7 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """True if an operand is, or will be, in parentheses; `left`: it is the left operand."""
+        """True if an operand has parentheses, or was found to need them; `left`: it is the left operand."""
         if (node.span.start, node.span.end) in self.parenthesised:
             return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)
@@ -76,7 +79,7 @@ class _Words:
 
 
 def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the operands that are connectives without parentheses and parsed differently elsewhere."""
+    """Yield the operands of a connective that are connectives without parentheses and easily misread."""
     for operand, left in ((node.left, True), (node.right, False)):
         if words.closed(operand, left=left):
             continue
@@ -99,9 +102,10 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield a temporal operator that ends the left operand of a connective.
+    """Yield the temporal operator, if any, with which the left operand of a connective ends.
 
-    In other tools its operand extends beyond the connective.
+    In other tools the operand of this temporal operator extends beyond the connective: they parse
+    `always p and q` as `always (p and q)`.
     """
     part: ast.Node = node.left
     governed: ast.Node | None = None

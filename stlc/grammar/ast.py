@@ -16,7 +16,7 @@ from stlc.source import Source, Span
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Base of all nodes of the syntax tree; `span` is the place in the source."""
+    """Base class of all nodes of the syntax tree; `span` is the location of the node's text in the source."""
 
     span: Span = field(compare=False, repr=False)
 
@@ -26,7 +26,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Quantity(Node):
-    """Number with its unit: "" for a number without one; "steps" is a unit of time."""
+    """Number with its unit: "" if none is written, "steps" for a number of time steps."""
 
     value: Fraction
     unit: str = ""
@@ -92,7 +92,7 @@ class Arg(Node):
 
 @dataclass(frozen=True, slots=True)
 class Call(Node):
-    """Call `func(args)`; `func` is a `Name`, or an `Attr` for an imported file."""
+    """Call of a function: `func(args)`; `func` is a `Name`, or an `Attr` for one of an imported file."""
 
     func: Expr
     args: tuple[Arg, ...]
@@ -150,7 +150,7 @@ class Not(Node):
 
 @dataclass(frozen=True, slots=True)
 class Logic(Node):
-    """Logical connective with two operands: `and`, `or`, `xor`, `->` or `<->`."""
+    """Logical connective between two formulas: `and`, `or`, `xor`, `->` or `<->`."""
 
     op: Literal["and", "or", "xor", "->", "<->"]
     left: Expr
@@ -277,11 +277,11 @@ class TypeRef(Node):
 
 @dataclass(frozen=True, slots=True)
 class Declaration(Node):
-    """Base of declarations.
+    """Base class of the declarations in a specification.
 
     Attributes:
         name: the declared name.
-        name_span: place of the name in the source.
+        name_span: location of the name in the source.
         tags: tags before the declaration.
         doc: text of the `##` comment before it.
     """
@@ -294,7 +294,7 @@ class Declaration(Node):
 
 @dataclass(frozen=True, slots=True)
 class Signal(Declaration):
-    """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`; one node per name."""
+    """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`, one node per declared name."""
 
     role: Literal["input", "output", "state", "env"] | None
     type: TypeRef | None
@@ -314,7 +314,10 @@ class Const(Declaration):
 
 @dataclass(frozen=True, slots=True)
 class Param(Declaration):
-    """Declaration `param r [unit] in [lo, hi]`, or `param r [unit] ~ distribution` with a call."""
+    """Declaration of a parameter: `param r [unit] in [lo, hi]`, or `param r [unit] ~ uniform(…)`.
+
+    `domain` is the pair of bounds, a set of values, or the call that names a distribution.
+    """
 
     type: TypeRef | None
     unit: str
@@ -394,12 +397,14 @@ class Spec(Node):
     Attributes:
         name: name given by `spec NAME`; "" without it.
         system: path given by `system "…"`, or None.
-        system_span: place of this path in the source, or None.
-        time_unit: unit of numbers without one in intervals, given by `time UNIT`; "" without it.
+        system_span: location of that path in the source, or None.
+        time_unit: unit of the numbers in intervals that have none, given by `time UNIT`; "" without that
+            line.
         imports: imports, in order.
         items: declarations, in order.
         source: the source text.
-        library: texts of imported files, by key (`stlc.compile.frontend.modules`); None: the files are read.
+        library: texts of imported files by key (see `stlc.compile.frontend.modules`), such as those stored in
+            a trace; None: the files are read from disk.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Coarse scanner of a text: its lexemes (words, numbers, strings, signs) and where declarations start.
+"""Fast scanner that splits any text into lexemes (words, numbers, strings, signs), and into declarations.
 
 The parser reads one declaration at a time, so that errors in different ones are found independently.
 Declaration keywords are reserved words, so a text can be split before each of them.
@@ -44,7 +44,7 @@ class Lexeme:
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """Opening bracket with its closing one, or None if it is not closed.
+    """Opening bracket (`opening`), and the bracket that closes it, or None if it is not closed.
 
     `interval` tells whether it may open the interval of a temporal operator.
     """
@@ -55,7 +55,7 @@ class Bracket:
 
 
 def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """Yield the lexemes (words, numbers, strings, signs) of a part of a text, whatever the text.
+    """Yield the lexemes (words, numbers, strings, signs) of a part of a text; any text is accepted.
 
     Blanks and comments are left out.
     """
@@ -66,7 +66,7 @@ def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexem
 
 
 def declaration_starts(text: str) -> list[int]:
-    """Return the offset at which each declaration of a text starts, with its tags and role.
+    """Return the offset at which each declaration of a text starts, including its tags and its role (`env`).
 
     The first offset is always 0.
     """
@@ -124,5 +124,5 @@ def opens_interval(before: Lexeme) -> bool:
 
 
 def closes(bracket: Bracket, text: str) -> bool:
-    """True if the sign `text` closes an open bracket."""
+    """True if the sign `text` closes the bracket: its counterpart, or for an interval also `)` or `]`."""
     return text == CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

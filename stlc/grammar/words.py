@@ -1,4 +1,4 @@
-"""Vocabulary of the language: temporal operators, reserved words, unit names, grammar patterns."""
+"""Words of the language: temporal operators, reserved words, unit names, grammar patterns."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from stlc.units import SYMBOLS
 
 @dataclass(frozen=True, slots=True)
 class TemporalOperator:
-    """Facts about a temporal operator that the parser, printers, messages and editor use.
+    """A temporal operator of the language: its spellings and meaning, for parser, printers and messages.
 
     Attributes:
         name: preferred spelling.
         meaning: one sentence about it, for the editor.
-        english: phrase with the operands `{p}` and `{q}` and the window `{when}`; `{q}` makes it binary.
+        english: phrase with the operands `{p}` and `{q}` and the window `{when}`; the operator is binary if
+            the phrase contains `{q}`.
         aliases: other spellings.
         past: whether the window lies in the past.
-        mirror: the past operator that corresponds to a future one, for help texts; "" without one.
-        expansion: equivalent formula of `p` and `q` by which the operator is replaced, each of its operators
-            with the same window; "" if it is not replaced.
+        mirror: for a future operator, the corresponding operator of the past, for help texts, or "".
+        expansion: equivalent formula of `p` and `q` that replaces the operator; all operators in it have the
+            window of the replaced one. "" if the operator is not replaced.
     """
 
     name: str

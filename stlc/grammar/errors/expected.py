@@ -1,4 +1,4 @@
-"""General syntax error E010: expected tokens in words, and the smallest repair.
+"""Diagnostic of a syntax error that is no known mistake (E010): the expected tokens, and a repair.
 
 A message names the terminals of the grammar in words, one by one or as a class; a repair is offered only if
 the repaired text parses.
@@ -53,7 +53,7 @@ _BEFORE_FORMULA = frozenset(
 
 
 def expected(failure: ParseFailure) -> Diagnostic:
-    """Return E010 for a syntax error that no recogniser of a common mistake matches."""
+    """Return E010 for a syntax error that is none of the common mistakes with a message of their own."""
     repair = _repair(failure)
     if repair is not None:
         return repair
@@ -66,7 +66,7 @@ def expected(failure: ParseFailure) -> Diagnostic:
 
 
 def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
-    """Return the source location of the first character of a word or sign."""
+    """Return the source location of the first character of a lexeme (word or sign)."""
     return failure.piece.source.span(lexeme.start, lexeme.start + 1)
 
 
@@ -177,7 +177,7 @@ def _begins_line(failure: ParseFailure, lexeme: Lexeme) -> bool:
 
 
 def _repair(failure: ParseFailure) -> Diagnostic | None:
-    """Return the finding for one missing or wrong sign whose correction parses, else None."""
+    """Return the diagnostic of one missing or wrong sign, if the text parses with that sign; else None."""
     previous, found = failure.previous, failure.found
     if previous is None:
         return None
@@ -214,10 +214,10 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
 def _missing(
     failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
-    """Return the diagnostic for a missing sign.
+    """Return the diagnostic for a missing sign, with the corrected line as help.
 
-    The correction replaces the characters from `low` to `high` by `text`; it is offered as a repair if
-    `sure`.
+    In that line `text` replaces the characters from offset `low` to `high`. If `sure`, an editor and
+    `stlc lint --fix` can apply this correction.
     """
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
@@ -232,7 +232,7 @@ def _missing(
 
 
 def _product(failure: ParseFailure) -> tuple[str, ...]:
-    """Return the help for a product without `*`: `2 (x + 1)`, `x y`."""
+    """Return advice if the error is a product written without `*`, such as `2 (x + 1)`; else ()."""
     previous, found = failure.previous, failure.found
     if previous is None or found is None or "MULOP" not in failure.accepts or "UNIT" in failure.accepts:
         return ()
@@ -299,7 +299,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """Return the name that the declaration with the error declares, and the kind of declaration."""
+    """Return the first name that a declaration declares, and the kind of declaration in words; else None."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]
@@ -322,7 +322,7 @@ def _found(failure: ParseFailure) -> str:
 
 
 def _notes(failure: ParseFailure) -> tuple[str, ...]:
-    """Return a note about a letter such as `F` that is an operator but may be meant as a name."""
+    """Return a note if a letter such as `F`, which is an operator, seems to be meant as a name; else ()."""
     near = (failure.found, failure.previous) if failure.wants_operand else ()
     name = next((lexeme.text for lexeme in near if lexeme is not None and lexeme.text in _LETTERS), None)
     if name is None:

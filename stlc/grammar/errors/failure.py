@@ -1,4 +1,4 @@
-"""Syntax errors with the words and signs around them, as input of the recognisers of mistakes."""
+"""Syntax errors with the words and signs around them, from which common mistakes are recognised."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class ParseFailure:
-    """Place in a part of the text (`piece`) at which no rule of the grammar applies."""
+    """Syntax error: part of the text (`piece`), and the offset at which no rule of the grammar applies."""
 
     piece: Piece
     at: int
@@ -102,14 +102,14 @@ class ParseFailure:
 
     @property
     def span(self) -> Span:
-        """Source location of the lexeme at the error; without one, the place after the lexeme before it."""
+        """Source location of the lexeme at the error; without one, the end of the lexeme before the error."""
         if self.found is not None:
             return self.of(self.found)
         end = self.previous.end if self.previous is not None else self.piece.start
         return self.piece.source.span(end, end)
 
     def of(self, first: Lexeme, last: Lexeme | None = None) -> Span:
-        """Return the source location of a lexeme, or from the first to the last of several lexemes."""
+        """Return the source location of the lexeme `first`, or from there to the end of the lexeme `last`."""
         return self.piece.source.span(first.start, (last or first).end)
 
     def line_with(self, *edits: tuple[int, int, str]) -> str:

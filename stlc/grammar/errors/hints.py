@@ -30,7 +30,7 @@ _TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/"
 
 
 def diagnose(piece: Piece, at: int) -> Diagnostic:
-    """Return the diagnostic of a part of a text that does not parse at offset `at`."""
+    """Return the diagnostic of a part of a text (`piece`) whose parsing failed at offset `at`."""
     failure = ParseFailure(piece, at)
     for recognise in RECOGNISERS:
         finding = recognise(failure)
@@ -40,7 +40,7 @@ def diagnose(piece: Piece, at: int) -> Diagnostic:
 
 
 def too_deep(span: Span, limit: int) -> Diagnostic:
-    """Return E005 for a part of a text that is nested more deeply than later passes support."""
+    """Return E005 for a part of a text, at `span`, that is nested more than `limit` deep."""
     first_line = span.source.span(span.start, min(span.end, span.start + 40))
     return Diagnostic(
         "E005",

@@ -12,9 +12,9 @@ from stlc.grammar.scan import Lexeme, lexemes
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """Advice about a character that is not in the language.
+    """Advice about a character that is not in the language, such as `≤`.
 
-    `text` replaces the character; it is None if there is no unique replacement.
+    `text` is its spelling in the language; it is None if there is no unique one.
     """
 
     help: str
@@ -63,7 +63,7 @@ _OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
 
 
 def replacement(char: str) -> Replacement | None:
-    """Return the advice about a character that is not in the language, or None."""
+    """Return the advice about a character that is not in the language; None if there is none."""
     return _ADVICE.get(char)
 
 
@@ -75,14 +75,20 @@ def unexpected_character(lexeme: Lexeme) -> bool:
 
 
 def apart(word: str, text: str, at: int) -> str:
-    """Return `word`, which replaces the character at offset `at`, with blanks where it would join others."""
+    """Return the text that replaces the one character of `text` at offset `at` by `word`.
+
+    A blank is added on each side on which `word` would join a letter or digit.
+    """
     before = " " if word[0].isalpha() and at and text[at - 1].isalnum() else ""
     behind = " " if word[-1].isalpha() and text[at + 1 : at + 2].isalnum() else ""
     return f"{before}{word}{behind}"
 
 
 def plain_text(text: str) -> str:
-    """Return the text with symbols such as `□`, `≤`, `∧` replaced, except in comments and quoted names."""
+    """Return the text with symbols such as `□`, `≤`, `∧` spelled in the language.
+
+    Symbols in comments, strings and quoted names are kept.
+    """
     parts: list[str] = []
     done = 0
     for lexeme in lexemes(text):

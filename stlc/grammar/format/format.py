@@ -51,7 +51,10 @@ _PREFIX = frozenset({*_UNARY, "_NOT", "QUANTIFIER", "_FREEZE", "_IF"})
 
 
 def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout of the expression that consists of the tokens from `start` to `end`."""
+    """Return the layout elements (words, possible line breaks) of an expression.
+
+    The expression consists of the tokens with indices from `start` to `end` (exclusive).
+    """
     for row in _ROWS:
         splits = _splits(text, start, end, row)
         if splits:
@@ -66,7 +69,7 @@ def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout of the tokens from `start` to `end` on one line."""
+    """Return the layout elements of the tokens from `start` to `end`, without a possible line break."""
     parts: list[Doc] = []
     for index in range(start, end):
         if index > start and gap(text, index):
@@ -76,9 +79,10 @@ def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def hangs(text: Text, start: int, end: int) -> bool:
-    """True if the tokens from `start` to `end` may begin on the line of the `=` and continue below it.
+    """True if the body of a declaration may begin on the line of the `=` and continue below it.
 
-    They are one bracket, with or without a name before it, as in `circle(…)`.
+    This holds if its tokens, from `start` to `end`, are one bracket, with or without a name before it, as in
+    `circle(…)`.
     """
     last = end - 1
     opening = text.partner.get(last, last)
@@ -93,7 +97,7 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Return the indices of the operators in `row`, outside of brackets and of `if … else`."""
+    """Return the indices of the operators of the kinds `row` outside of brackets and of `if … else`."""
     found: list[int] = []
     index, conditions = start, 0
     while index < end:
@@ -106,7 +110,10 @@ def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
 
 
 def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
-    """Return the layout of operands with a possible line break before each operator (`splits`)."""
+    """Return a group of operands with a possible line break before each operator.
+
+    `splits` are the indices of the operators.
+    """
     parts = [*expression(text, start, splits[0])]
     for at, following in zip(splits, [*splits[1:], end], strict=True):
         operand = at + 1
@@ -119,7 +126,7 @@ def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
 
 
 def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout of a prefix operator and its operand."""
+    """Return the layout elements of a prefix operator (such as `not` or `always[a, b]`) and its operand."""
     kind = text.tokens[start].kind
     if kind == "_IF":
         return (_condition(text, start, end),)
@@ -130,7 +137,7 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _condition(text: Text, start: int, end: int) -> Group:
-    """Return the layout of `if … then … else …`; if it does not fit, the branches get their own lines."""
+    """Return the group of `if … then … else …`; if it is too long for a line, branches get their own."""
     marks: list[int] = []
     index, depth = start, 0
     while index < end and depth >= 0:
@@ -152,7 +159,7 @@ def _condition(text: Text, start: int, end: int) -> Group:
 
 
 def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout of consecutive tokens, with line breaks only inside brackets."""
+    """Return the layout elements of consecutive tokens; lines can be broken only inside brackets."""
     parts: list[Doc] = []
     index = start
     while index < end:
@@ -168,7 +175,7 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _bracket(text: Text, opening: int) -> Group:
-    """Return the layout of a bracket; if it does not fit, each entry gets its own line."""
+    """Return the group of a bracket; if it does not fit on a line, each entry gets its own line."""
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
     inside: list[Doc] = [edge]
@@ -193,7 +200,7 @@ def _comma(text: Text, start: int, end: int) -> int:
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout of one entry of a bracket: an expression, or an argument with its name or type."""
+    """Return the layout elements of one entry of a bracket: an expression, or `name = expression`."""
     if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
         return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
     return expression(text, start, end)
@@ -206,7 +213,7 @@ _REQUIRED = frozenset({"require_decl", "assume_decl"})
 
 @dataclass(slots=True)
 class _Page:
-    """Lines of the formatted text, each with the width by which it is aligned with its neighbours."""
+    """Lines of the formatted text under construction, before adjacent lines are aligned."""
 
     columns: list[AlignedColumn] = field(default_factory=list)
 
@@ -216,7 +223,10 @@ class _Page:
 
 
 def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) -> str:
-    """Return the formatted text of all items; the `unclear` parts get parentheses."""
+    """Return the formatted text of a specification, in lines of at most `width` characters where possible.
+
+    The parts in `unclear`, which other tools parse differently, get parentheses.
+    """
     page = _Page()
     spans = sorted((part.span.start, part.span.end) for part in unclear)
     for item in layout.items:
@@ -280,7 +290,10 @@ def _declaration(text: Text, rule: str, page: _Page, width: int) -> None:
 
 
 def _document(text: Text, rule: str) -> tuple[Doc, ...]:
-    """Return the layout of a declaration: the part up to `=` or `:`, then a body that may be broken."""
+    """Return the layout elements of a declaration.
+
+    The part up to `=` or `:` stays on one line; the body after it may be broken into lines.
+    """
     count = len(text.tokens)
     start = _body(text, rule)
     if start >= count:
@@ -303,9 +316,9 @@ def _body(text: Text, rule: str) -> int:
 
 
 def _head(text: Text, rule: str) -> int:
-    """Return the width of the first part of a declaration, which is aligned with its neighbours.
+    """Return the width of the first part of a declaration, such as `def NAME`, in characters.
 
-    It is 0 for a declaration without such a part.
+    Adjacent declarations of one kind are aligned after this part; the width is 0 if there is no such part.
     """
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
@@ -341,7 +354,8 @@ WIDTH = 100
 def format_text(source: Source) -> str:
     """Return the formatted text of a specification, ending with a line break.
 
-    Symbols such as `□`, `≤`, `∧` are replaced by their spelling in the language.
+    If the text does not parse, symbols such as `□`, `≤`, `∧` are first replaced by their spelling in the
+    language.
 
     Raises:
         SpecError: the text does not parse.
@@ -355,12 +369,10 @@ def format_text(source: Source) -> str:
 
 
 def _read(source: Source) -> tuple[Source, ast.Spec]:
-    """Return a source text that parses, and its syntax tree.
-
-    If the given text does not parse, symbols such as `≤` are replaced first; errors refer to the given text.
+    """Return the source if it parses, else the source with symbols such as `≤` replaced; and the syntax tree.
 
     Raises:
-        SpecError: neither text parses.
+        SpecError: neither text parses; the errors are those of the given text.
     """
     try:
         return source, parse(source)

@@ -1,6 +1,6 @@
-"""Breaking of formatted text into lines of limited width, and alignment of columns.
+"""Breaking of formatted text into lines of limited width, and alignment of adjacent lines.
 
-A document is a sequence of layout elements: `Word`, `Blank`, `Line`, `Nest` and `Group`.
+A text to be broken is a sequence of layout elements: `Word`, `Blank`, `Line`, `Nest` and `Group`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ INDENT = 4
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Text without line breaks, with the comments above it (`before`) and after it on its line (`after`)."""
+    """Text that is never broken, with the comments on lines above it (`before`) and behind it (`after`)."""
 
     text: str
     before: tuple[Comment, ...] = ()
@@ -30,21 +30,21 @@ class Blank:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Possible line break: taken in a group that does not fit on one line, else replaced by `flat`."""
+    """Possible line break: taken if the surrounding group does not fit on a line, else the text `flat`."""
 
     flat: str = " "
 
 
 @dataclass(frozen=True, slots=True)
 class Nest:
-    """Layout elements whose new lines are indented by one more level."""
+    """Sequence of layout elements; lines that begin within it are indented by one more level."""
 
     parts: tuple[Doc, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Layout elements that stand on one line if they fit."""
+    """Sequence of layout elements that is printed on one line if it fits."""
 
     parts: tuple[Doc, ...]
 
@@ -59,7 +59,10 @@ _Entry: TypeAlias = tuple[int, bool, Doc]
 
 
 def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
-    """Return the lines of a sequence of layout elements; only unbreakable parts exceed `width`."""
+    """Return the lines of a sequence of layout elements, of at most `width` characters.
+
+    Only a word may exceed that width; `indent` is the indentation of the first line, in characters.
+    """
     page = _Page(indent)
     stack: list[_Entry] = [(indent, False, part) for part in reversed(parts)]
     while stack:
@@ -97,7 +100,7 @@ def is_plain(parts: Sequence[Doc]) -> bool:
 
 
 def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
-    """True if a group, and what follows it up to the next line break, fits into `room` characters."""
+    """True if a group, and the elements after it up to the next line break, fit into `room` characters."""
     inside: list[_Entry] = [(0, True, group)]
     behind = len(rest)
     while inside or behind:
@@ -119,7 +122,7 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """Return the width of a layout element on one line, in characters."""
+    """Width of a layout element without a line break, in characters; 0 for a word below comments."""
     match doc:
         case Word(text, before, _):
             return 0 if before else len(text)
@@ -130,14 +133,14 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True if a line break must stand before or after a layout element, as with a comment."""
+    """True if the line ends at a layout element: a line break that is taken, or a word with a comment."""
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat
 
 
 class _Page:
-    """Lines of text under construction."""
+    """Lines under construction, of which the last can still grow."""
 
     def __init__(self, indent: int) -> None:
         self.lines: list[str] = []
@@ -148,11 +151,14 @@ class _Page:
 
     @property
     def column(self) -> int:
-        """Width of the current line, with the blank that follows it, in characters."""
+        """Width of the current line in characters, including the blank before the next word."""
         return (self.indent if not self.line else len(self.line)) + self.blank
 
     def write(self, word: Word, level: int) -> None:
-        """Append a word; one with comments above it, or after a comment, begins a new line."""
+        """Append a word to the current line.
+
+        A word with comments above it, or after a comment, begins a new line.
+        """
         if word.before or self.commented:
             self.end_line(level)
         for comment in word.before:
@@ -166,7 +172,7 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """End the current line unless it is empty; the next one is indented by `level`."""
+        """End the current line, unless it is empty, and begin a new one indented by `level` blanks."""
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -183,12 +189,14 @@ _COMMENT_SPREAD = 40
 
 @dataclass(frozen=True, slots=True)
 class AlignedColumn:
-    """Line of formatted text, with the width by which it is aligned with its neighbours.
+    """Line of formatted text before alignment with the lines around it.
 
     Attributes:
         text: the line without its comment.
-        kind: grammar rule of its declaration; "tag"; "comment"; or "part" of a declaration of several lines.
-        head: width of its first part, made equal among adjacent lines of one kind; 0 without such a part.
+        kind: grammar rule of the declaration on this line; "tag" or "comment"; "part" for a line of a
+            declaration that takes several lines.
+        head: width in characters of its first part, such as `def NAME`, padded to be equal in adjacent lines
+            of one kind; 0 without such a part.
         comment: comment at the end of the line.
         apart: whether an empty line precedes it.
     """
@@ -212,7 +220,7 @@ def align(lines: Sequence[AlignedColumn]) -> Iterator[str]:
 def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
     """Return the lines with first parts, such as `def NAME`, padded to equal width.
 
-    Padded together are adjacent declarations of one kind.
+    Adjacent declarations of one kind get a common width.
     """
     result = list(lines)
     for group in _groups(lines, by_kind=True):
@@ -226,7 +234,7 @@ def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
 
 
 def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
-    """Return the text of each line, with the comments of adjacent lines in one column."""
+    """Return the text of each line with its comment, which starts in the same column as in adjacent lines."""
     texts = [line.text for line in lines]
     for group in _groups(lines, by_kind=False):
         noted = [i for i in group if lines[i].comment]
@@ -238,9 +246,10 @@ def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
 
 
 def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[int]]:
-    """Yield the indices of adjacent lines that are aligned; a tag belongs to the declaration below it.
+    """Yield the indices of adjacent lines that are aligned with each other.
 
-    `by_kind`: a group has declarations of one kind only.
+    A tag belongs to the group of the declaration below it. With `by_kind`, all declarations of a group have
+    the same kind.
     """
     group: list[int] = []
     kind = ""
@@ -257,7 +266,10 @@ def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[i
 
 
 def _close(items: Iterable[int], widths: Sequence[int], spread: int) -> Iterator[list[int]]:
-    """Yield runs of consecutive items whose widths differ by at most `spread`."""
+    """Split `items` into runs of consecutive items whose widths differ by at most `spread`.
+
+    `widths` has the width of each item, in characters.
+    """
     part: list[int] = []
     within: list[int] = []
     for item, width in zip(items, widths, strict=True):

@@ -1,6 +1,6 @@
-"""Tokens for the formatter: canonical spelling, matching brackets, blanks between tokens.
+"""Preparation of tokens for the formatter: canonical spelling, pairs of brackets, blanks between tokens.
 
-A unary plus and doubled parentheses are redundant; they are dropped unless a comment is attached to them.
+Redundant tokens (a unary plus, doubled parentheses) are dropped unless a comment is attached to them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _OPERAND = frozenset({"NAME", "NUMBER", "UNIT", "STRING", "TYPE_SIZE", "_TRUE", 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Tokens of a declaration in their printed form.
+    """Tokens of a declaration as the formatter prints them.
 
     Attributes:
         tokens: tokens with canonical spelling.
-        partner: index of the closing bracket by that of the opening one, and vice versa.
-        roles: role of each bracket, by the index of the opening one.
+        partner: index of an opening bracket -> index of its closing bracket, and vice versa.
+        roles: index of an opening bracket -> use of the bracket, such as "call" or "interval".
     """
 
     tokens: tuple[Token, ...]
@@ -55,7 +55,7 @@ class Text:
 
 
 def prepare(tokens: Sequence[Token]) -> Text:
-    """Return the tokens of a declaration in their printed form; its tags are not included.
+    """Return the tokens of a declaration (without its tags) as the formatter prints them.
 
     Spelling is normalised, brackets are paired, redundant tokens are dropped.
 
@@ -84,7 +84,7 @@ def spelling(kind: str, text: str) -> str:
 
 
 def gap(text: Text, index: int) -> str:
-    """Return the separator before the token at `index`: a blank, or nothing."""
+    """Return the text between the token at `index` and the token before it: a blank or ""."""
     left, right = text.tokens[index - 1], text.tokens[index]
     if _hugs_right(text, index - 1) or _hugs_left(text, index):
         return ""
@@ -112,7 +112,7 @@ def _hugs_left(text: Text, index: int) -> bool:
 
 
 def _typed(text: Text, index: int) -> bool:
-    """True if the colon at `index` precedes a type, as in `signal x : Type`; a blank precedes it."""
+    """True if the colon at `index` precedes a type, as in `signal x : Type`; then a blank precedes it."""
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
     return declared and not any(token.text == "=" for token in text.tokens[:index])
 
@@ -150,7 +150,7 @@ def _paired(tokens: tuple[Token, ...]) -> Text:
 
 
 def _role(text: Text, index: int) -> Role:
-    """Return the role of an opening bracket, from the tokens before it."""
+    """Return the use of the bracket that opens at `index`, such as "call", judged by the tokens before it."""
     token = text.tokens[index]
     before = text.tokens[index - 1] if index else None
     if before is not None and before.kind.endswith(("_AT", "_BRACKET")):
@@ -163,9 +163,9 @@ def _role(text: Text, index: int) -> Role:
 
 
 def _holds_interval(text: Text, opening: int) -> bool:
-    """True if the bracket at `opening` is an interval.
+    """True if the bracket at `opening` is the interval of a temporal operator.
 
-    It follows a temporal operator, and contains a comma or is closed by `]`.
+    An interval follows a temporal operator, and contains a comma or is closed by `]`.
     """
     closing = text.partner[opening]
     if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
@@ -174,9 +174,10 @@ def _holds_interval(text: Text, opening: int) -> bool:
 
 
 def level(text: Text, opening: int) -> list[int]:
-    """Return the indices of the tokens directly within a bracket, those of inner brackets left out.
+    """Return the indices of the tokens directly within a bracket, without those of inner brackets.
 
-    As in `behind`, an inner bracket counts as one token, and so does a binder such as `forall i in …:`.
+    An inner bracket is represented by its opening token, and a binder such as `forall i in …:` by its first
+    token.
     """
     found: list[int] = []
     index = opening + 1
@@ -201,7 +202,7 @@ def behind(text: Text, index: int) -> int:
 
 
 def _doubled(text: Text) -> set[int]:
-    """Return the indices of redundant parentheses: the outer pair of two directly nested ones."""
+    """Return the indices of redundant parentheses: of two directly nested pairs, those of the outer one."""
     found: set[int] = set()
     for opening, role in text.roles.items():
         inner = opening + 1
@@ -217,7 +218,7 @@ def _commented(token: Token) -> bool:
 
 
 def _without(text: Text, dropped: set[int]) -> Text:
-    """Return the tokens without those at `dropped`, except those with a comment."""
+    """Return the text without the tokens at the indices `dropped`; tokens with a comment are kept."""
     kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
     return _paired(kept) if len(kept) < len(text.tokens) else text
 
@@ -231,7 +232,7 @@ def _check_depth(text: Text) -> None:
 
 
 def _with_commas(text: Text) -> Text:
-    """Return the tokens with intervals `[0:5]` written as `[0, 5]`."""
+    """Return the text with commas in intervals: `[0:5]` becomes `[0, 5]`."""
     tokens = list(text.tokens)
     for opening, role in text.roles.items():
         if role == "interval":

@@ -1,8 +1,8 @@
 """Conversion of parsed expressions to the syntax tree: one function per rule of `stl.lark`.
 
 A function takes the converted children of its parse-tree node: nodes of the syntax tree, `TerminalToken`s,
-and None for an omitted optional part. Every rule needs a function. Errors that the grammar does not exclude,
-such as an unknown unit, are reported.
+and None for an omitted optional part. Every rule needs a function. Errors that the grammar cannot exclude,
+such as an unknown unit, are collected in the context.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LETTERS = re.compile(r"[A-Za-z]+")
 
 @dataclass(frozen=True, slots=True)
 class TerminalToken:
-    """Token of the text: the name of its terminal in the grammar, its text and its source location."""
+    """Token of the text: name of its terminal in the grammar (`kind`), its text and its source location."""
 
     kind: str
     text: str
@@ -40,12 +40,12 @@ class TerminalToken:
 
 @dataclass(slots=True)
 class BuildContext:
-    """Context in which the rules of one text are converted.
+    """State of the conversion of one text to the syntax tree.
 
     Attributes:
         source: the whole text.
-        findings: errors that the grammar does not exclude (a number too large, an unknown unit).
-        documented: offset up to which `##` comments are assigned to declarations.
+        findings: errors found that the grammar cannot exclude (a number too large, an unknown unit).
+        documented: offset up to which all `##` comments already belong to a declaration.
     """
 
     source: Source
@@ -54,14 +54,14 @@ class BuildContext:
 
 
 def name_of(leaf: TerminalToken) -> str:
-    """Return the name in a NAME token, without backticks."""
+    """Return the name that a NAME token denotes, without backticks."""
     return leaf.text[1:-1] if leaf.text.startswith("`") else leaf.text
 
 
 def own_name(context: BuildContext, leaf: TerminalToken) -> str:
-    """Return the declared name in a NAME token.
+    """Return the name that a declaration introduces, from its NAME token.
 
-    E010 is reported for `T`, `end` and `dt`, which need backticks to be declared.
+    An error (E010) is added to the context for `T`, `end` and `dt`: these can be declared only in backticks.
     """
     if leaf.text in BUILT_IN:
         context.findings.append(
@@ -79,7 +79,7 @@ def own_name(context: BuildContext, leaf: TerminalToken) -> str:
 def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
     """Return the text of the unit in a UNIT or UNIT_BRACKET token; "" for None.
 
-    E101 is reported for an unknown unit.
+    An error (E101) is added to the context for an unknown unit.
     """
     if leaf is None:
         return ""
@@ -118,7 +118,8 @@ def near_unit(word: str) -> str | None:
 def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:
     """Return the exact value of a NUMBER token.
 
-    A number that exceeds the range of double precision is reported (E005), and its value is 0.
+    For a number that exceeds the range of double precision an error (E005) is added to the context, and 0 is
+    returned.
     """
     match = _MANTISSA.fullmatch(leaf.text)
     assert match is not None
@@ -142,15 +143,15 @@ BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
 def node(kind: Callable[..., Any]) -> BuildRule:
-    """Return a function that converts the parse-tree nodes of a rule to nodes of class `kind`.
+    """Return a function that converts parse-tree nodes of a grammar rule to tree nodes of class `kind`.
 
-    The converted children are its fields, in order.
+    The converted children become the fields of the node, in order.
     """
     return lambda _, span, children: kind(span, *children)
 
 
 def several(_: BuildContext, __: Span, children: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the converted children as a tuple."""
+    """Convert a grammar rule for a list: return the converted children as a tuple."""
     return tuple(children)
 
 
@@ -198,7 +199,10 @@ def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
 
 
 def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[str, ast.Interval | None, str]:
-    """Return the name of a temporal operator, its interval, and the alias used in the source, or ""."""
+    """Return (name, interval or None, alias) of a temporal operator.
+
+    The alias is the spelling in the source, such as `G`; "" if that is the preferred name.
+    """
     match = _LETTERS.match(token.text)
     assert match is not None
     op = (UNARY_TEMPORAL | BINARY_TEMPORAL)[match[0]]

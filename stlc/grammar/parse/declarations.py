@@ -32,7 +32,7 @@ _DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[^\S\n]*$", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True)
 class Pragma:
-    """Line about the whole file: `spec NAME`, `system "path"` or `time unit`."""
+    """Line with a property of the whole file: `spec NAME`, `system "path"` or `time unit`."""
 
     kind: str
     value: str
@@ -86,9 +86,9 @@ def _formal(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.F
 def _heads(
     context: BuildContext, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
-    """Return the fields common to all declarations, for each declared name.
+    """Return the values of the fields that all declarations have, as one mapping for each declared name.
 
-    The `##` lines before the first name are its documentation.
+    The `##` lines before the first name become the field `doc`.
     """
     lines = _DOC.finditer(context.source.text, context.documented, names[0].span.start)
     shared = {"span": span, "tags": tags, "doc": "\n".join(match[1] for match in lines)}
@@ -96,10 +96,10 @@ def _heads(
 
 
 def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
-    """Return a function that converts declarations of one name to nodes of class `kind`.
+    """Return a function that converts declarations with one name to nodes of class `kind`.
 
-    `parts` names the fields that the further children of a declaration give. A child of the grammar rule
-    `sort` gives the two fields `type` and `unit`.
+    `parts` names the fields of the node that are set from the children after tags and name, in order. A child
+    of the grammar rule `sort` sets the two fields `type` and `unit`.
     """
 
     def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:
@@ -197,7 +197,10 @@ DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
 
 
 def assemble(source: Source, items: Sequence[Item], findings: list[Diagnostic]) -> ast.Spec:
-    """Return the specification that consists of `items`; E102 is appended for a repeated pragma."""
+    """Return the specification that consists of the pragmas, imports and declarations in `items`.
+
+    Pragmas are the lines about the whole file. E102 is appended to `findings` for a pragma that is repeated.
+    """
     pragmas: dict[str, Pragma] = {}
     imports: list[ast.Import] = []
     declared: list[ast.Item] = []

@@ -1,7 +1,8 @@
-"""Parser from text to syntax tree. Only the modules of `stlc.grammar.parse` use Lark.
+"""Parser from text to syntax tree, based on Lark.
 
 A text is split before each declaration and the pieces are parsed separately, so that one run reports all
 independent errors. Parse trees are converted bottom-up without recursion, so that no text exhausts the stack.
+Only the modules of `stlc.grammar.parse` use Lark.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def parse(source: Source) -> ast.Spec:
     """Return the syntax tree of a specification.
 
     Raises:
-        SpecError: all independent errors, at most `MAX_ERRORS`.
+        SpecError: the text has errors; of the independent ones, the first `MAX_ERRORS` are reported.
     """
     _check_size(source, 0, len(source.text))
     context = BuildContext(source)
@@ -66,7 +67,7 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
     Source locations refer to the whole text.
 
     Raises:
-        SpecError: all syntax errors.
+        SpecError: the expression has an error in its syntax, a unit or a number.
     """
     end = len(source.text) if end is None else end
     _check_size(source, start, end)
@@ -89,7 +90,7 @@ class _PieceError(Exception):
 
 
 def _check_size(source: Source, start: int, end: int) -> None:
-    """Raise SpecError (E005) for a text above the length limits, which would take minutes to parse."""
+    """Raise SpecError (E005) for a text that is so long that parsing it would take minutes."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
@@ -115,7 +116,10 @@ def _offset(error: UnexpectedInput, piece: Piece) -> int:
 
 
 def _fold(tree: Tree[Token], context: BuildContext, base: int) -> Any:
-    """Return the syntax tree of a parse tree, converted bottom-up without recursion."""
+    """Convert a parse tree to the syntax tree, bottom-up and without recursion.
+
+    `base` is the offset of the parsed piece in the text. An error (E005) is raised if the tree is too deep.
+    """
     values: dict[int, Any] = {}
     depths: dict[int, int] = {}
     for node in tree.iter_subtrees():

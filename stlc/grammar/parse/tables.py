@@ -1,4 +1,4 @@
-"""Parser of `stl.lark` (by Lark), built once per process, with tables cached on disk.
+"""Parser of the language, made by Lark from `stl.lark` once per process, with tables cached on disk.
 
 Building the LALR tables takes a tenth of a second, reading them a fifth of that. They are stored as JSON
 (never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar and on the
@@ -58,7 +58,7 @@ def build_parser(grammar: str) -> lark.Lark:
 
 
 def cache_name(grammar: str) -> str:
-    """Return the name under which the tables of a grammar are cached."""
+    """Return the file name of the cached tables of a grammar, for these versions of Lark and Python."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
     return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
 
@@ -80,17 +80,20 @@ def _read(text: bytes | None) -> lark.Lark | None:
 
 
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
-    """Return an object read from JSON with the integer keys that JSON stores as strings."""
+    """Return an object read from JSON in which keys that are digits are integers again.
+
+    JSON stores integer keys as strings.
+    """
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
 
 
 def acceptable(text: str, rule: str = "start", *, even_broken: bool = False) -> frozenset[str] | None:
-    """Return the names of the terminals that may follow `text`; None if `text` itself has an error.
+    """Return the names of the grammar's terminals that may follow `text`; None if `text` has a syntax error.
 
     Args:
         text: the beginning of a declaration, or of an expression.
         rule: start rule of the grammar, `start` or `expr`.
-        even_broken: whether to return the terminals accepted at the first error, if there is one.
+        even_broken: if `text` has an error, return the terminals accepted there instead of None.
     """
     interactive = load_parser().parse_interactive(text, start=rule)
     try:

@@ -39,14 +39,15 @@ class Comment:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """Token of the grammar with the comments around it.
+    """Token of the source text, with the comments around it.
 
     Attributes:
-        kind: name of its terminal.
+        kind: name of its terminal in the grammar.
         text: its text in the source.
         start: offset of its first character.
         end: offset after its last character.
-        before: comments between this token and the previous one, without the previous one's `after`.
+        before: comments between the previous token and this one, except the comment that is `after` of the
+            previous token.
         after: comment after it on the same line.
         apart: whether an empty line precedes it (and follows its comments).
     """
@@ -70,14 +71,14 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class TokenLayout:
-    """Tokens of a whole text: the items in order, and the comments after the last one (`rest`)."""
+    """Tokens of a whole text, by item (such as a declaration), and the comments after the last (`rest`)."""
 
     items: tuple[Item, ...]
     rest: tuple[Comment, ...]
 
 
 def tokenize(source: Source) -> TokenLayout:
-    """Return the tokens of a text that `parser.parse` accepts.
+    """Split a text that `parser.parse` accepts into tokens, each with the comments around it.
 
     Raises:
         SpecError: E010, the text is not well-formed.
@@ -97,7 +98,10 @@ def tokenize(source: Source) -> TokenLayout:
 def _read_piece(
     source: Source, start: int, end: int, tokens: list[Token], places: list[tuple[str, int, int]]
 ) -> None:
-    """Append the tokens of one part of the text, and (rule, start, end) of each item in it."""
+    """Parse a part of a text; append its tokens to `tokens` and (rule, start, end) of items to `places`.
+
+    Raises SpecError (E010) if the part does not parse.
+    """
     interactive = load_parser().parse_interactive(source.text[start:end], start="start")
     last: LarkToken | None = None
     try:
@@ -120,9 +124,9 @@ def _at(token: LarkToken) -> int:
 
 
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
-    """Yield the items with their tokens.
+    """Yield the items (pragmas, imports, declarations) with their tokens; `places` are their offsets.
 
-    Comments at tokens between items, such as `;`, move to the next item.
+    A comment at a token between two items, such as `;`, is moved to the next item.
     """
     index = 0
     for rule, start, end in places:
@@ -141,9 +145,9 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 
 
 def _own(token: Token) -> tuple[Comment, ...]:
-    """Return the comments of a dropped token, each on its own line.
+    """Return the comments of a token that is not printed; each gets its own line.
 
-    A `##` comment after the token gets a `#` in front, so that it does not document the next item.
+    A `##` comment after the token gets another `#` in front, so that it does not document the next item.
     """
     if token.after is None:
         return token.before
@@ -178,9 +182,10 @@ def _inside(token: Token) -> tuple[Comment, ...]:
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
-    """Attach the first comment to the token at `index` if it ends the same line; return the others.
+    """Attach the first of the comments `found` to the token before it on its line; return the others.
 
-    After a `;` it is attached to the token before the `;`.
+    `index` is the index of the token before the comments. If that token is `;`, the comment is attached to
+    the token before the `;`.
     """
     if not found or found[0].own_line or index < 0:
         return found
@@ -192,7 +197,10 @@ def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) 
 
 
 def _comments(text: str, start: int, end: int, *, first: bool) -> tuple[tuple[Comment, ...], bool]:
-    """Return the comments between two tokens, and whether an empty line follows them."""
+    """Return the comments between two tokens, and whether an empty line follows them.
+
+    `first`: there is no token before them, so that the first comment has its own line.
+    """
     found: list[Comment] = []
     offset = start
     for match in _COMMENT.finditer(text, start, end):

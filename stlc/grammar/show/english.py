@@ -32,7 +32,7 @@ REPEATED = 200_000
 
 
 class Meanings:
-    """Definitions of a specification in words, each computed once."""
+    """Descriptions in words of the definitions of a specification; each is computed once."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self._known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
@@ -41,9 +41,10 @@ class Meanings:
         self._letters = 0
 
     def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
-        """Return (name, meaning) for each definition that a requirement uses, directly or indirectly.
+        """Return (name, description) for each definition that a requirement uses, directly or indirectly.
 
-        Once the texts of a specification exceed `REPEATED` characters, those already given are left out.
+        Once all descriptions returned exceed `REPEATED` characters, those that were returned before are left
+        out.
         """
         found: dict[str, str] = {}
         queue = deque(self._used(item.formula))
@@ -85,7 +86,7 @@ def say(expr: ast.Expr) -> str:
 
 
 def _inner(expr: ast.Expr) -> str:
-    """Return an expression in words for use within a sentence; connectives get parentheses."""
+    """Return an expression in words for use as an operand; a connective or `until` gets parentheses."""
     return f"({say(expr)})" if isinstance(expr, ast.Logic | ast.Until) else say(expr)
 
 
@@ -142,7 +143,7 @@ def _logic(expr: ast.Logic) -> str:
 
 
 def _side(expr: ast.Expr, op: str) -> str:
-    """Return an operand of `op` in words, in parentheses if it is another connective."""
+    """Return an operand of the connective `op` in words; another connective gets parentheses."""
     return say(expr) if isinstance(expr, ast.Logic) and expr.op == op else _inner(expr)
 
 

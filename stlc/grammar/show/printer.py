@@ -21,9 +21,9 @@ _PLAIN_DIGITS = 16
 
 
 class Level(IntEnum):
-    """Precedence levels, loosest first.
+    """Precedence levels of expressions, from the connective that binds loosest to names and numbers.
 
-    An operand gets parentheses if its level is below the one that its place requires.
+    An operand gets parentheses if its level is below the level that its operator requires there.
     """
 
     IFF = 0
@@ -57,7 +57,7 @@ def _level(expr: ast.Expr) -> Level:
 
 
 def show_at(expr: ast.Expr, least: Level) -> str:
-    """Return the text of an expression, in parentheses if its precedence is below `least`."""
+    """Return the text of an expression, in parentheses if it binds more loosely than the level `least`."""
     text = show_expr(expr)
     return text if _level(expr) >= least else f"({text})"
 
@@ -73,9 +73,9 @@ def _quantity(expr: ast.Quantity) -> str:
 
 
 def _base(expr: ast.Expr) -> str:
-    """Return the text of what stands before an index, a dot or an argument list.
+    """Return the text of an expression that stands before an index, a dot or an argument list.
 
-    A number gets parentheses.
+    A number gets parentheses, and so does an expression that binds more loosely than an index.
     """
     return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
 
@@ -200,9 +200,9 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 
 def show_name(name: str) -> str:
-    """Return a name as an expression uses it, in backticks if needed.
+    """Return a name as an expression writes it, in backticks if it is a reserved word or no identifier.
 
-    `T`, `end` and `dt` have none, as they refer to the built-in names.
+    `T`, `end` and `dt` get no backticks: they refer to the built-in names.
     """
     return f"`{name}`" if name in RESERVED or not _IDENTIFIER.fullmatch(name) else name
 
