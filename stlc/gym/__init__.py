@@ -2,8 +2,8 @@
 
 `make` returns one environment; `make_vec` returns many, which are simulated as one batch in C. Importing this
 package registers the six benchmarks with gymnasium: `gymnasium.make("stlc/traffic-v0")` and
-`gymnasium.make_vec(…)`. A policy that maximises the robustness of episodes satisfies the specification. Needs
-the extra `stlc[gym]`.
+`gymnasium.make_vec(…)`. The reward is computed from the specification, by default as the robustness of the
+episode. The package needs the optional packages of `stlc[gym]`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Environments of a task for Stable-Baselines3, which has its own class of vector environments.
 
-Needs the extra `stlc[rl]`.
+The module needs the optional packages of `stlc[rl]`.
 """
 
 from __future__ import annotations

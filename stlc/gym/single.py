@@ -41,8 +41,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     action is the actuator command, (m,) float32, in physical units, clipped to the actuator's range. `info`
     holds `state`, (n,) float64. After the last step, and with the reward `dense` after each step, it also
     holds `robustness` per requirement, `rho` of the whole specification, and `satisfied`. Robustness is that
-    of the last horizon of the episode, or of the whole episode while it is shorter (windows are cut, `end =
-    "truncate"`), clipped to ±10.
+    of the last T steps of the episode (T is the horizon of a plan), clipped to ±10; while the episode is
+    shorter, windows of the formulas end at its last sample.
 
     Args:
         task: specification and system.
@@ -98,8 +98,11 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         """Begin an episode. The same seed gives the same sequence of episodes from this one on.
 
         Args:
-            seed: seed of all random numbers from this episode on.
+            seed: seed of all random numbers from this episode on; None: the random numbers continue.
             options: `state`, (n,): an initial state instead of a random one.
+
+        Returns:
+            The first observation, and `info`.
         """
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
@@ -148,10 +151,10 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self._bounds.shown(values.astype(np.float32), unit=self.normalised)
 
     def _told(self, *, judged: bool) -> dict[str, Any]:
-        """Info after a step: the state and, if `judged`, the robustness of the last horizon of the episode.
+        """Info after a step: the state and, if `judged`, the robustness of the last T steps.
 
-        Robustness is that of the last T steps (one plan horizon). While the episode has fewer, windows of the
-        formula end at its last sample.
+        While the episode has fewer steps than the horizon T of a plan, windows of the formulas end at its
+        last sample.
         """
         state = {"state": self._driven[-1][0].numpy(force=True).copy()}
         if not judged:

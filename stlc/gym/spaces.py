@@ -68,12 +68,12 @@ class Bounds:
 
 
 def of_actuators(task: Task) -> Bounds:
-    """Bounds of the actuators."""
+    """Bounds of the actuator commands, in physical units."""
     return Bounds.of(task.system.actuators)
 
 
 def of_observation(task: Task, *, time: bool) -> Bounds:
-    """Bounds of the observed values.
+    """Bounds of the observed values, in physical units.
 
     They cover the nominal ranges and the values that random plans reach, widened by a quarter at each end. If
     `time`, the elapsed share of the episode, from 0 to 1, is the last observed value.

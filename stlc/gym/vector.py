@@ -92,6 +92,9 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             seed: seed of all random numbers from these episodes on, one number for all environments.
             options: `state`, (n,) or (N, n): initial states instead of random ones.
 
+        Returns:
+            The first observations, (N, k), and `info`.
+
         Raises UsageError (U101) for a list of seeds, if only some environments are to be reset, or for a
         wrong state.
         """
@@ -135,14 +138,17 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._shown(moved.observation), reward, done, none, info
 
     def _plans(self, actions: NDArray[np.float32]) -> Tensor:
-        """Controls of the model, (N, m), under which the actuators receive `actions`."""
+        """Controls of the model, (N, m), for which the actuator commands are `actions`."""
         if np.shape(actions) != self.action_space.shape:
             raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
         held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))
         return self.task.system.planned(self._episodes.states, held)
 
     def _shown(self, seen: Tensor) -> Floats:
-        """Observations of the environments, (N, k), from those of the episodes, which end with the time."""
+        """Clip and scale observations for the agent, (N, k).
+
+        The last entry of `seen` is the elapsed share of the episode, which is dropped unless it is observed.
+        """
         values = seen.numpy() if self.time else seen[:, :-1].numpy()
         return self._bounds.shown(values, unit=self.normalised)
 
@@ -150,7 +156,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._marked({"state": states.numpy(force=True)})
 
     def _at_end(self, moved: Transition, verdicts: PlanVerdicts) -> Info:
-        """Info of all environments at the end of their episodes."""
+        """Info of all environments at the end of their episodes: states, robustness, and verdicts."""
         each = verdicts.requirements.clamp(-MOST, MOST).numpy(force=True)
         names = (rule.name for rule in self.task.rules)
         robustness = {name: each[:, i] for i, name in enumerate(names)}

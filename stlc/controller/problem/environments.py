@@ -1,4 +1,4 @@
-"""Episodes of a task on its model, in one batch: the environment of learners that choose an action per step.
+"""Episodes of a task on its model, in one batch: environment for learners that choose one action per step.
 
 An episode begins at a random initial state and has as many steps as a plan. There are the three rewards that
 Meng and Fan (2023) compare: the one that the system declares for every step (RL_R), the robustness of the
@@ -131,7 +131,7 @@ class Environments:
         return self.task.system.observed_count + 1
 
     def observe(self, states: Tensor, step: int) -> Tensor:
-        """Observations: the inputs of a policy, and the elapsed share of the episode: (B, n) -> (B, k)."""
+        """Observations of states (B, n) at the step number `step` of the episode: (B, k), see `observe`."""
         return observe(self.task, states, step)
 
     @torch.no_grad()
@@ -149,7 +149,7 @@ class Environments:
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> Transition:
-        """Advance all episodes by one step; those that end are restarted.
+        """Advance all episodes by one step; after their last step all begin anew.
 
         Args:
             actions: actions in physical units, (N, m); clipped to their ranges.

@@ -48,7 +48,7 @@ class Effort:
 
 
 def motion_of(system: System) -> Motion:
-    """The exact step of a system, in the form from which C code is generated."""
+    """The exact (not smoothed) step of a system, in the form from which C code is generated."""
     step = system.exact_step
     return Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
 
@@ -58,7 +58,7 @@ class NativeJudge:
 
     Attributes:
         kernel: library built from the task's dynamics and requirements.
-        names: names of the state columns.
+        names: names of the states.
     """
 
     def __init__(self, kernel: Kernel, system: System, rules: Sequence[CompiledRequirement]) -> None:
@@ -73,7 +73,7 @@ class NativeJudge:
 
     @classmethod
     def of(cls, system: System, rules: Sequence[CompiledRequirement]) -> NativeJudge | None:
-        """Build the kernel for a system and requirements; None if torch has to be used."""
+        """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
         try:
             library = load(emit(motion_of(system), [rule.formula for rule in rules]))
         except Untranslatable:
@@ -84,12 +84,16 @@ class NativeJudge:
         return cls(kernel, system, rules)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement (B, R), and, if `columns`, the states (T+1, B) by name.
+        """Robustness of plans per requirement (before weight and scale), and the predicted states.
 
         Args:
-            x0: (B, n); the kernel computes in float64, the results have the dtype of `x0`.
-            u: (B, T, m).
+            x0: initial states, (B, n).
+            u: plans in physical units, (B, T, m).
             columns: whether to return the states.
+
+        Returns:
+            Robustness (B, R), and states name -> (T+1, B), empty without `columns`. The kernel computes in
+            float64; the results have the dtype of `x0`.
         """
         rho, seen = self.kernel.judge(
             x0.detach().double().numpy(),
@@ -112,9 +116,9 @@ class NativeJudge:
         """Improve plans by local search on the exact robustness.
 
         Args:
-            x0: (B, n).
+            x0: initial states, (B, n).
             plans: initial plans, (B, T, m).
-            bank: library of plans that solved other states, (k, T, m); may be empty.
+            bank: library of plans that satisfy the specification from other states, (k, T, m); may be empty.
             effort: options of the search.
 
         Returns:
@@ -138,8 +142,8 @@ class NativeGradient:
     """Native kernel for robustness and states of a task's plans, differentiable with respect to the plans.
 
     Attributes:
-        judge: computes the values.
-        adjoint: computes the gradient.
+        judge: kernel that computes the values.
+        adjoint: kernel that computes the gradient.
     """
 
     def __init__(self, judge: NativeJudge, adjoint: Adjoint) -> None:
@@ -150,7 +154,7 @@ class NativeGradient:
     def of(
         cls, system: System, rules: Sequence[CompiledRequirement], judge: NativeJudge | None
     ) -> NativeGradient | None:
-        """Build the kernel for a system and requirements; None if torch has to differentiate."""
+        """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
         if judge is None:
             return None
         fixed = [timer.name for timer in system.timers]
@@ -161,11 +165,11 @@ class NativeGradient:
         return None if library is None else cls(judge, Adjoint(library))
 
     def __call__(self, x0: Tensor, u: Tensor, *, slope: float) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable by `u`.
+        """Robustness per requirement (B, R), and states name -> (T+1, B), differentiable by `u`.
 
         Args:
-            x0: (B, n), not differentiated.
-            u: (B, T, m).
+            x0: initial states, (B, n), not differentiated.
+            u: plans in physical units, (B, T, m).
             slope: slope, per unit, that replaces the derivative of jumps and conditions.
         """
         each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
@@ -173,7 +177,7 @@ class NativeGradient:
 
 
 class _Judged(torch.autograd.Function):
-    """Autograd function whose values come from `judge` and whose gradients come from `pull`."""
+    """Autograd function: values by `NativeJudge.judge`, gradients by the kernel `NativeGradient.adjoint`."""
 
     @staticmethod
     def forward(
@@ -205,10 +209,10 @@ class _Judged(torch.autograd.Function):
 
 
 class NativeStep:
-    """Native functions for one exact step of a system, its observation and declared reward, on the CPU.
+    """Native functions for one exact step of a system, its observation and its declared reward, on the CPU.
 
     Attributes:
-        compiled: the compiled functions `advance` and `look`.
+        compiled: library of the compiled functions.
     """
 
     def __init__(self, compiled: Advance) -> None:
@@ -216,7 +220,7 @@ class NativeStep:
 
     @classmethod
     def of(cls, system: System, *, rewarded: bool) -> NativeStep | None:
-        """Build the functions for a system; None if torch has to be used.
+        """Build the functions for a system; None if there is no C code or compiler for it.
 
         Raises:
             UsageError: U101, a reward is wanted (`rewarded`), but the system file declares none.
@@ -241,7 +245,7 @@ class NativeStep:
             share: elapsed share of the episode after the step, the last entry of each observation.
 
         Returns:
-            States (B, n), observations (B, k + 1) float32, rewards (B,) or None.
+            States (B, n), observations (B, k + 1) float32, and rewards (B,), None if built without a reward.
         """
         after, seen, reward = self.compiled.advance(x.contiguous().numpy(), u.contiguous().numpy(), share)
         earned = None if reward is None else torch.from_numpy(reward)

@@ -1,4 +1,7 @@
-"""Robustness margins of pending `eventually@` goals (whose times count from the start of the mission).
+"""Robustness margins of pending goals of a mission.
+
+A goal is a requirement `eventually@[a, b]`, whose times count from the start of the mission. It is pending
+while it is neither satisfied nor violated.
 
 A goal such as `eventually@[0 s, 18 s] [x, y] in b` is reached at the first sample that satisfies it, with
 almost no margin; from then on the guidance cost (distance to the next goal) draws plans away. Therefore plans
@@ -36,10 +39,10 @@ class PendingGoal:
     """Goal `eventually@[a, b]`: a state formula to be satisfied once in steps a to b of a mission.
 
     Attributes:
-        status: name of the column (samples of one state over time) that holds whether it is satisfied.
+        status: name of the state that records whether the goal is satisfied, violated or pending (near 0).
         body: the state formula.
         first: first step of the mission at which satisfaction counts.
-        last: last such step.
+        last: last step of the mission at which satisfaction counts.
     """
 
     status: str
@@ -49,15 +52,15 @@ class PendingGoal:
 
 
 class PendingGoals:
-    """The pending goals of a mission.
+    """Goals `eventually@[a, b]` of a mission, and the margins of those that are pending.
 
     Attributes:
-        clock: name of the column that holds the time since the start of the mission; "" if there is none.
-        items: goals that are requirements by themselves; goals nested in other formulas are ignored.
+        clock: name of the state that counts the steps since the start of the mission; "" if there is none.
+        items: goals that are requirements by themselves; goals nested in other formulas are left out.
     """
 
     def __init__(self, compiled: Compiled, gamma: float) -> None:
-        """Collect the goals; `gamma` is the required margin."""
+        """Collect the goals of a compiled specification; `gamma` is the margin that plans are to reach."""
         self._gamma = gamma
         self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
         statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
@@ -69,7 +72,9 @@ class PendingGoals:
         self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Sum over pending goals of the amount by which their margins are below gamma: (batch,).
+        """Sum over pending goals of gamma less the margin that a plan reaches, at least 0: (batch,).
+
+        The goals are those that are pending at the first sample.
 
         Args:
             columns: predicted states, name -> (time, batch); the result is differentiable by them.
@@ -84,7 +89,9 @@ class PendingGoals:
         return lack
 
     def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Mask of the plans whose next step increases the margin of a goal that is satisfied now: (batch,).
+        """Mask of the plans whose first step increases the margin of a goal that the present state satisfies.
+
+        Only margins below gamma count. The mask is (batch,).
 
         Args:
             columns: predicted states, name -> (time, batch).
@@ -96,7 +103,7 @@ class PendingGoals:
         return found
 
     def _margins(self, columns: Mapping[str, Tensor], count: int) -> list[Tensor]:
-        """Margin of every goal at the first `count` samples, (count, batch) each."""
+        """Robustness of every goal's state formula at the first `count` samples, (count, batch) each."""
         env = {name: column[:count] for name, column in columns.items()}
         found: list[Tensor] = evaluate([goal.body for goal in self.items], env, ops=TORCH, count=count)
         return found

@@ -51,10 +51,10 @@ class PlanVerdicts:
 
     Attributes:
         rho: robustness of the whole specification, (batch,).
-        safe: robustness of phi_safe, (batch,); +inf where no requirement is tagged `@safety`.
+        safe: robustness of phi_safe (the requirements tagged `@safety`), (batch,); +inf if there are none.
         requirements: robustness per requirement, before weight and scale, (batch, requirements).
         plans: the judged plans, (batch, T, m).
-        columns: the predicted states, name -> (time, batch).
+        columns: the predicted states, name -> (time, batch); empty if they were not asked for.
     """
 
     rho: Tensor
@@ -72,10 +72,10 @@ class PlanVerdicts:
 
 
 def satisfied(rho: Tensor) -> Tensor:
-    """Return whether rho >= -1e-6, with a tolerance for rounding if rho is float32.
+    """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.
 
     Args:
-        rho: robustness, any shape; for float32 the tolerance is larger than for float64.
+        rho: robustness, any shape.
 
     Returns:
         A boolean tensor of the same shape.
@@ -88,11 +88,12 @@ class Task:
     """A specification compiled for a system: the problem for which a policy is trained.
 
     Attributes:
-        compiled: the specification in discrete time, with the timers that it adds to the state.
-        plain: the system without timers.
-        system: the system with the timers as its last columns.
-        graph: function for the robustness of the whole specification.
-        safety: function for the robustness of phi_safe (the requirements tagged `@safety`).
+        compiled: the specification in discrete time, with the timers and parameters that it adds to the
+            state.
+        plain: the system of the system file, without them.
+        system: the system whose last states are the timers and parameters of the specification.
+        graph: function that computes the robustness of the whole specification.
+        safety: function that computes the robustness of phi_safe (the requirements tagged `@safety`).
     """
 
     def __init__(self, compiled: Compiled, system: System) -> None:
@@ -121,7 +122,7 @@ class Task:
             values: parameters that get one fixed value in all trajectories; the policy still observes them.
 
         Raises:
-            UsageError: a value does not fit.
+            UsageError: a value in `overrides` or `values` is not admissible.
             SpecError: the specification is invalid, or does not fit the system.
         """
         decl = system.decl
@@ -161,7 +162,7 @@ class Task:
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """States under plans: (B, n), (B, T, m) -> (B, T+1, n).
 
-        Without gradient, plans of up to a horizon are rolled out by the native kernel.
+        Without gradient, plans of at most T (the horizon) steps are rolled out by the native kernel.
         """
         differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
         apart = differentiated or not switch.exact or u.shape[1] > self.horizon
@@ -173,29 +174,32 @@ class Task:
         return torch.stack([columns[name][: u.shape[1] + 1].t() for name in self.system.names], 2)
 
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
-        """Robustness at time 0: (B, T+1, n) -> (B,); exact (Eq. 4), or smoothed by k (Eq. 7)."""
+        """Robustness of trajectories at time 0: (B, T+1, n) -> (B,).
+
+        It is exact, or smooth with parameter k = `smoothing` (Meng and Fan 2023, Eq. 4 and 7).
+        """
         rho: Tensor = self.graph.robustness(x, smoothing)
         return rho
 
     def requirement_robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
-        """Robustness per requirement, before weight and scale: (B, T+1, n) -> (B, requirements)."""
+        """Robustness of trajectories per requirement, before weight and scale: (B, T+1, n) -> (B, R)."""
         each: Tensor = self.graph.per_requirement(x, smoothing)
         return each
 
     @cached_property
     def native(self) -> NativeJudge | None:
-        """Native kernel for verdicts and local search, which need no gradient; None if torch is used."""
+        """Native kernel for verdicts and local search, without gradient; None: torch is used."""
         return NativeJudge.of(self.system, self.rules)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
-        """Native kernel for robustness and states, differentiable by the plans; None if torch is used."""
+        """Native kernel for robustness and states, differentiable by the plans; None: torch is used."""
         return NativeGradient.of(self.system, self.rules, self.native)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Part of a training -> reason why it runs in torch; "" if it runs in C.
+        """Reasons why parts of a training run in torch: name of the part -> reason; "" if it runs in C.
 
-        The parts are `verdicts` of plans, `search` for better ones, and the `gradient` of robustness.
+        The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
 
         Args:
             device: type of the torch device.
@@ -238,7 +242,7 @@ class Task:
         return PlanVerdicts(rho, safe, each, u, columns)
 
     def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement, and predicted states, computed by the native kernel if possible."""
+        """Robustness per requirement (B, R) and predicted states name -> (T+1, B), in C if possible."""
         if x0.device.type == "cpu" and self.native is not None:
             return self.native.judge(x0, u, columns=states)
         rows = max(1, MOST_VALUES // self._values_of_a_row)
@@ -259,7 +263,7 @@ class Task:
 
     @cached_property
     def _values_of_a_row(self) -> int:
-        """Approximate number of values that torch holds per judged plan, those of all subformulas."""
+        """Approximate number of values that torch holds per plan while it judges plans."""
         parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
         return (self.horizon + 1) * (
             2 * len(self.system.names) + 2 * len(self.system.control_names) + 4 * parts
@@ -268,9 +272,9 @@ class Task:
     def cost(self, judged: PlanVerdicts) -> Tensor:
         """Cost by which satisfying plans are compared, without gradient: (batch,).
 
-        It consists of the performance terms, which count for every plan here. In a mission the guidance cost
-        (distance to the next goal) draws plans to the boundary of the present constraints; therefore
-        robustness margins below gamma cost too.
+        It consists of the performance terms, and in a mission also of the amount by which robustness is below
+        gamma: otherwise the guidance cost (distance to the next goal), one of the performance terms, would
+        draw plans to the boundary of the constraints.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)
@@ -280,7 +284,10 @@ class Task:
             return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Performance terms, here of every plan, with the goals and the guidance of a mission: (batch,).
+        """Sum of the performance terms, whether or not a plan satisfies the specification: (batch,).
+
+        In a mission the shortfall of the margins of pending goals and the guidance cost (distance to the next
+        goal) are added.
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -297,12 +304,12 @@ class Task:
 
     @cached_property
     def pending_goals(self) -> PendingGoals:
-        """Pending goals of the mission, with the margin that they require."""
+        """Goals `eventually@[a, b]` of the mission, with gamma as the margin that plans are to reach."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _guidance(self) -> ArrayProgram | None:
-        """Guidance cost at each sample: distance to the next goal of the mission."""
+        """Program for the guidance cost `gap` at each sample: distance to the next goal; None without one."""
         return (
             None
             if self.compiled.guidance_cost is None
@@ -310,7 +317,7 @@ class Task:
         )
 
     def alive(self, x: Tensor) -> Tensor:
-        """States from which the mission can still satisfy every requirement: (B, n) -> (B,) booleans."""
+        """Mask of the states from which the mission can still satisfy every requirement: (B, n) -> (B,)."""
         env = {name: column[None] for name, column in zip(self.system.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)

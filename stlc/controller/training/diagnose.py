@@ -132,9 +132,9 @@ def _motion(step: TrainingStep) -> StlcError | None:
 
 
 def _robustness(step: TrainingStep) -> StlcError | None:
-    """Error for a requirement whose value, or else whose gradient, is not finite although the states are.
+    """Error for a requirement whose robustness or gradient is not finite for finite states; None if none.
 
-    An infinite value spoils the gradients of all requirements, so values are checked first.
+    The values of all requirements are checked first, since an infinite one spoils the gradients of all.
     """
     checks = [
         _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
@@ -185,7 +185,7 @@ def _cost(step: TrainingStep) -> StlcError | None:
 
 
 def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness per requirement (B, R) and states (T+1, B), differentiable as in training."""
+    """Robustness per requirement (B, R), states name -> (T+1, B); differentiable by `u` as in training."""
     native = native_rolled(step.task, step.objective, step.x0, u)
     if native is not None:
         return native
@@ -195,7 +195,7 @@ def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Values per plan, (B,), and their gradients by the plans, (B, T, m)."""
+    """Values `value_of` of the plans, (B,), and their gradients by the plans, (B, T, m)."""
     u = step.u.detach().requires_grad_()
     value = value_of(u)
     if not value.requires_grad:
@@ -246,10 +246,11 @@ TRIES = 4000
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
-    """Diagnostic R404, for a task without a known plan, with the requirements that conflict.
+    """Diagnostic R404, which names requirements that no plan was found to satisfy together.
 
-    These are the requirements that provably have no plan. If there are none, requirements are removed as long
-    as no plan is found for the remaining ones, until `enough` returns True, and the rest is reported.
+    If bounds prove for a requirement that no plan satisfies it, the first such requirement is named.
+    Otherwise each requirement is removed if no plan is found for the others either, until `enough` returns
+    True; those that remain are named.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -267,7 +268,7 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
 
 
 def refuted(task: Task) -> bool:
-    """True if bounds prove for some requirement that no plan from any of `STARTS` states satisfies it."""
+    """True if bounds prove that some requirement is violated by every plan, from each fixed initial state."""
     return any(_impossible(task, rule) for rule in task.rules)
 
 
@@ -276,19 +277,19 @@ def _alone(task: Task, rules: Sequence[CompiledRequirement]) -> Task:
 
 
 def _starts(task: Task) -> torch.Tensor:
-    """Fixed initial states, (STARTS, n)."""
+    """Fixed initial states for the diagnosis: random ones with a fixed seed, (STARTS, n)."""
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
 def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
-    """The best plans found by local search for the requirements `rules` alone."""
+    """Search for plans from the fixed initial states that satisfy the requirements `rules` alone."""
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
     return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """True if exploration finds a plan that satisfies the requirements `rules`."""
+    """True if exploration from a few fixed initial states finds a plan that satisfies `rules` alone."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
@@ -336,7 +337,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Note on how long was searched, since a search without result proves nothing."""
+    """Note of the diagnostic on the extent of the search, since a search without result proves nothing."""
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
@@ -352,12 +353,16 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _impossible(task: Task, rule: CompiledRequirement) -> bool:
-    """True if bounds prove that no plan from any of the fixed initial states satisfies the requirement."""
+    """True if bounds prove that every plan from each fixed initial state violates the requirement."""
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
 
 def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
-    """Bounds on every state, by name, after each number of steps from state `x` under any controls."""
+    """Bounds on the states that any controls can reach from state `x`, (n,).
+
+    Returns:
+        For each instant 0 to T, the known bounds by name of the state.
+    """
     step, system = task.system.exact_step, task.system
     low, high = system.control_low.tolist(), system.control_high.tolist()
     controls = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
@@ -379,10 +384,14 @@ def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
 
 
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
-    """Upper bound on the robustness of a formula at time 0; inf if the bounds decide nothing.
+    """Upper bound on the robustness of a formula at time 0; inf if the bounds on the states imply none.
 
-    Formulas are in negation normal form, so their robustness does not decrease with that of their predicates:
-    the bound is the robustness for the upper bounds of the predicates over time.
+    Formulas are in negation normal form, so their robustness is a nondecreasing function of that of their
+    predicates. Hence each predicate is replaced by its upper bound at every instant.
+
+    Args:
+        formula: the formula.
+        reached: bounds on the states at instants 0 to T, from `_reached`.
     """
     columns = {"": np.zeros((len(reached), 1))}
 
@@ -445,7 +454,15 @@ def check_mirror(task: Task) -> None:
 
 
 def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:
-    """Raise S304 for the column that differs most, if more rows differ than near-ties explain."""
+    """Raise SystemFileError (S304) if two arrays differ in more rows than near-ties explain.
+
+    Args:
+        task: specification and system.
+        names: names of the last dimension.
+        found: values that were computed, (…, len(names)).
+        wanted: values that a mirror symmetry would give, of the same shape.
+        what: name of the values in the message, which shows the name for which most rows differ.
+    """
     found, wanted = found.reshape(-1, len(names)), wanted.reshape(-1, len(names))
     off = ~torch.isclose(found, wanted, rtol=NEAR, atol=NEAR, equal_nan=True)
     shares = off.double().mean(0)

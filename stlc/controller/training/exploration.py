@@ -1,4 +1,4 @@
-"""Plans found by exploration: a tree of plan prefixes, extended from those that reached new cells.
+"""Search for plans by exploration: a tree of plan prefixes, extended from those that reached new cells.
 
 Local search changes whole plans; where many goals have to be reached in order, hardly any change reaches one
 more without losing others. Therefore plans are built from prefixes here. For every prefix, bounds over all
@@ -62,7 +62,7 @@ RAISED = 250
 
 
 def pieces(formula: ir.Formula) -> list[ir.Formula]:
-    """Conjuncts of a formula, which can be satisfied or violated one by one."""
+    """Conjuncts of a formula, after `always` is distributed over `and`."""
     match formula:
         case ir.BoolOp("and", items):
             return [piece for item in items for piece in pieces(item)]
@@ -79,9 +79,9 @@ class Layer:
     Attributes:
         states: predicted trajectories, (rows, steps + 1, n).
         plans: controls, (rows, steps, m).
-        met: whether every continuation satisfies a piece, (rows, pieces).
-        kind: numbers that are equal for prefixes with the same satisfied pieces and with timers in the same
-            cells, (rows, columns).
+        met: whether every continuation of a prefix satisfies a piece, (rows, pieces).
+        kind: for each prefix the satisfied pieces and the cells of the timers, as whole numbers,
+            (rows, entries); prefixes with equal rows are of the same kind.
         worth: sum of the lower bounds on the robustness of undecided pieces, (rows,).
         visits: number of times that each prefix was extended, (rows,).
     """
@@ -97,11 +97,11 @@ class Layer:
         return len(self.worth)
 
     def rows(self, index: NDArray[np.int64]) -> Layer:
-        """Select rows."""
+        """Layer of the prefixes with the indices `index`, (k,)."""
         return Layer(*(getattr(self, name)[index] for name in Layer.__slots__))
 
     def joined(self, other: Layer) -> Layer:
-        """Concatenate the rows of both."""
+        """Layer of the prefixes of this layer, followed by those of `other`."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in Layer.__slots__)
         return Layer(*map(np.concatenate, pairs))
 
@@ -112,7 +112,7 @@ class ExplorationResult:
 
     Attributes:
         plan: satisfying plan, (T, m) float64; None if none was found.
-        sweeps: number of times that all layers were extended.
+        sweeps: number of sweeps made; a sweep extends every layer once.
     """
 
     plan: Tensor | None
@@ -156,7 +156,7 @@ class Exploration:
 
         Args:
             x: the initial state.
-            sweeps: maximum number of times that each layer (the prefixes of one length) is extended.
+            sweeps: maximum number of sweeps; a sweep extends every layer (the prefixes of one length) once.
             generator: random numbers of the exploration.
             enough: called before each sweep after the first; True ends the exploration.
         """
@@ -186,17 +186,21 @@ class Exploration:
         spare: float,
         enough: Callable[[], bool] = lambda: False,
     ) -> SearchResult:
-        """Find plans from some of the initial states, and from states that these plans pass.
+        """Find satisfying plans from some of the initial states, and from states that these plans pass.
 
-        The states are tried in order while sweeps remain. If the specification has memory, the states along a
-        plan are further initial states, which the remainder of the plan may solve.
+        The states are tried in order while sweeps remain. If the specification adds timers to the state, some
+        states that a plan passes serve as further initial states, since the remainder of the plan may satisfy
+        the specification from there.
 
         Args:
             starts: initial states, (k, n).
             sweeps: total number of sweeps for plans of `USUAL` steps; fewer for longer plans.
             generator: random numbers of the exploration.
-            spare: robustness that the plans are to reach.
+            spare: robustness up to which a local search improves the plans found.
             enough: called repeatedly; True ends the exploration.
+
+        Returns:
+            The plans found, with their initial states; empty if there are none.
         """
         sweeps = max(math.ceil(sweeps * min(1.0, (USUAL / self.task.horizon) ** 2)), 2)
         found = [
@@ -216,14 +220,18 @@ class Exploration:
     # ------------------------------------------------------------------ found plans
 
     def _raised(self, x: Tensor, plan: Tensor, spare: float) -> Tensor:
-        """Improve the plan (T, m) by local search until its robustness is `spare`."""
+        """Improve a plan (T, m) up to robustness `spare` by local search, if there is a native kernel."""
         if self.task.native is None:
             return plan
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
     def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """The initial state with its plan, and states along the plan with remainders that solve them."""
+        """The initial state with its plan, and states that it passes with the remainder of the plan.
+
+        Only states whose plan satisfies the specification are returned. Remainders are extended to T steps by
+        repeating their last control.
+        """
         states, plans = [x], [plan]
         if self.task.compiled.timers:
             path = self.task.rollout(x[None], plan[None])[0]
@@ -243,7 +251,11 @@ class Exploration:
     # ------------------------------------------------------------------ prefixes
 
     def _grown(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Extend some prefixes of a layer; keep those that may still satisfy the specification."""
+        """Extend some prefixes of a layer, all by the same random number of steps.
+
+        Returns:
+            Layer of the longer prefixes that may still satisfy the specification.
+        """
         chosen = self._chosen(layer, random)
         np.add.at(layer.visits, chosen, 1.0)
         horizon, before = self.task.horizon, layer.plans[chosen]
@@ -254,7 +266,12 @@ class Exploration:
         return self._layer(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _layer(self, states: Numbers, plans: Numbers) -> Layer:
-        """Layer of those given prefixes that may still satisfy the specification."""
+        """Layer of the prefixes that may still satisfy the specification, out of those given.
+
+        Args:
+            states: trajectories under the prefixes, (rows, steps + 1, n).
+            plans: controls of the prefixes, (rows, steps, m).
+        """
         good = np.isfinite(states).all((1, 2))
         states, plans = states[good], plans[good]
         whole = states.shape[1] == self.task.horizon + 1
@@ -269,7 +286,12 @@ class Exploration:
         return Layer(states, plans, met, kind, worth, np.zeros(len(worth)))
 
     def _bounds(self, states: Numbers, end: Boundary) -> Numbers:
-        """Bounds on the robustness of every piece over all continuations: (rows, samples, n) -> (rows, k)."""
+        """Bounds on the robustness of every piece over all continuations of trajectories: (rows, pieces).
+
+        Args:
+            states: trajectories, (rows, samples, n).
+            end: `lower` or `upper` bounds, or `strict`: the robustness itself, for whole trajectories.
+        """
         if not len(states):
             return np.empty((0, len(self.pieces)))
         env = dict(zip(self.task.system.names, np.moveaxis(states, (0, 1, 2), (2, 1, 0)), strict=True))
@@ -278,7 +300,10 @@ class Exploration:
         return np.stack([np.broadcast_to(each[0], len(states)) for each in found], 1)
 
     def _chosen(self, layer: Layer, random: np.random.Generator) -> NDArray[np.int64]:
-        """Draw prefixes to extend, (CHILDREN,), preferably with satisfied pieces, high worth, few visits."""
+        """Draw indices of prefixes to extend, (CHILDREN,).
+
+        Prefixes with many satisfied pieces, high worth or few visits are preferred.
+        """
         kind = _numbered(layer.kind)
         rank = np.empty(len(layer))
         for each in range(kind.max() + 1):
@@ -291,7 +316,11 @@ class Exploration:
         return chosen
 
     def _drawn(self, plans: Numbers, more: int, random: np.random.Generator) -> Numbers:
-        """Draw controls after prefixes, (rows, more, m): levels, range ends, changed controls, noise."""
+        """Draw the controls of the next `more` steps after prefixes, (rows, more, m).
+
+        Each row is of one of four kinds: constant random levels, constant controls at the low end, middle or
+        high end of their ranges, the last control with a constant change, or independent random values.
+        """
         rows, steps, controls = plans.shape
         span, shape = self._high - self._low, (rows, 1, controls)
         level = self._low + span * random.random(shape)
@@ -305,7 +334,10 @@ class Exploration:
         return drawn
 
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """The best prefix per cell, reduced to at most `KEPT` prefixes, with equal shares for all kinds."""
+        """Keep the prefix of greatest worth per cell, and of these at most `KEPT`.
+
+        If there are more, some are drawn at random, such that all kinds have about equal shares.
+        """
         if not len(layer):
             return layer
         parts = [layer.kind]
@@ -324,6 +356,6 @@ class Exploration:
 
 
 def _numbered(kinds: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the first row that each row equals: the same number for equal rows."""
+    """Number the distinct rows: (rows, entries) -> (rows,), the same number for equal rows."""
     numbers: NDArray[np.int64] = np.unique(kinds, axis=0, return_inverse=True)[1].reshape(-1)
     return numbers

@@ -39,8 +39,8 @@ class TrainingOutcome:
         seconds: duration of the training, evaluation on held-out states included.
         interrupted: whether `Watch.stop` ended it.
         ranks: number of processes that trained together.
-        why: diagnosis of the conflicting requirements if no plan was found from any initial state.
-        steps: total number of steps.
+        why: diagnosis of the conflicting requirements if no plan was found from any initial state, else None.
+        steps: number of training steps made.
         simulated: closed-loop results; None if there was no simulation.
     """
 
@@ -56,7 +56,7 @@ class TrainingOutcome:
 
 @dataclass(slots=True)
 class FinalEvaluation:
-    """Evaluation of a policy within the remaining time of its training.
+    """Evaluation of a trained policy, within the time that the training left of the budget.
 
     Attributes:
         writer: writer of the run's folder.
@@ -84,7 +84,10 @@ class FinalEvaluation:
         return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
 
     def of(self, policy: Policy, steps: int) -> TrainingOutcome:
-        """Evaluate a policy after `steps` training steps, store the result, and close the run's record."""
+        """Evaluate a policy after `steps` training steps, and write the result into the run's folder.
+
+        The status of the run becomes `finished`.
+        """
         self.trained = self.time.now()
         result = score(
             self.task, policy, n=self.config.held_out, enough=self._out_of_time, report=self.report
@@ -102,7 +105,7 @@ class FinalEvaluation:
         return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, simulated=simulated)
 
     def _simulated(self, run: Run) -> ClosedLoop | None:
-        """Closed-loop results of the policy, within the remaining time."""
+        """Simulate the policy in closed loop, within the remaining time; None if `config.drives` is 0."""
         if not self.config.drives:
             return None
         self.report("evaluation, closed-loop runs")
@@ -119,7 +122,7 @@ class FinalEvaluation:
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once the time for the closed-loop simulations is over."""
+        """True once the time for the diagnosis of conflicts is over: as long again as the evaluation's."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property

@@ -1,4 +1,4 @@
-"""Folder of a run before the first step: copies of its inputs, its options, versions, machine."""
+"""Creation of a run's folder, with copies of its inputs, its options, versions and the machine."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Launch:
     Attributes:
         root: folder of all runs.
         name: name of the run; random if None.
-        overrides: values of `--set`.
-        command: command line.
+        overrides: constants and keys of the system file that `--set` changed, name -> text.
+        command: command line, which the run's record keeps.
     """
 
     root: Path = RUNS
@@ -53,7 +53,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
 
     Raises:
         MissingError: R201, the folder cannot be written.
-        UsageError: U101, `name` cannot name a folder.
+        UsageError: U101, `launch.name` cannot name a folder, or an option is refused.
     """
     decl, launch = task.system.decl, launch or Launch()
     resolved = resolve_config(task, config)  # before the folder: a refused option leaves no run behind
@@ -110,7 +110,8 @@ def train_here(
             None.
         steps: number of optimiser steps; takes precedence over `budget`.
         seed: seed of all random numbers; None: that of the system file.
-        method: `guided` (search and distil) or `gradient` (the paper's); None: that of the system file.
+        method: name of the method, such as `guided` (search and distil) or `gradient` (Meng and Fan 2023);
+            None: that of the system file.
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
     return train(task, config, open_folder(task, config)).run

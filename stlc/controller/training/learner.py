@@ -2,9 +2,9 @@
 
 Search and distil: every few dozen steps the policy's plans from new states are judged, failing plans are
 repaired by a search that starts from them, and repaired plans are imitated for as long as the policy fails at
-their state. Each gradient step uses newly drawn (fresh) states and such failed (hard) ones. Of the network's
-plans the best one is trained (winner takes all), with a small weight on the mean so that none stays
-untrained.
+their state. Each gradient step uses newly drawn (fresh) states and states at which the policy failed before
+(hard states). The network proposes several plans per state, of which the best one is trained (winner takes
+all), with a small weight on the mean loss of all plans, so that none stays untrained.
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ RISE = 30
 
 
 class Trainer(Learner):
-    """Training of a plan network; on one machine, equal seeds and steps give equal weights."""
+    """Training of a network that proposes plans, by gradient steps on their robustness.
+
+    On one machine, equal seeds and numbers of steps give equal weights.
+    """
 
     def __init__(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
@@ -90,7 +93,10 @@ class Trainer(Learner):
         self.learnt = torch.empty(0, len(task.system.names), device=device)
 
     def advance(self) -> float:
-        """Make one gradient step; return its loss, or change nothing and return NaN if it is not finite."""
+        """Make one gradient step and return its loss.
+
+        If the loss or its gradient is not finite, the weights stay as they are and NaN is returned.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate
         value = self._loss()
@@ -122,13 +128,13 @@ class Trainer(Learner):
 
     @property
     def policy(self) -> BestOfKPolicy:
-        """The policy learned until now: the moving average of the weights, on the CPU."""
+        """Policy with the moving average of the network's weights, on the CPU."""
         on_processor = self.device.type == "cpu"
         return BestOfKPolicy(self.task, self.average if on_processor else deepcopy(self.average).cpu())
 
     @property
     def searching(self) -> bool:  # type: ignore[override]
-        """True while a repair search runs."""
+        """True while a search for better plans runs concurrently with the steps."""
         return self.repairing is not None and not self.repairing.done()
 
     @property
@@ -137,16 +143,20 @@ class Trainer(Learner):
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Part of the training -> reason why it runs in torch; "" if it runs in C."""
+        """Reasons why parts of the training run in torch, see `Task.torch_reasons`."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
     def wait(self, stop: Stop = never) -> bool:
-        """Wait for the end of the repair search; return False if `stop` ended the waiting."""
+        """Wait for the end of the concurrent search; return False if `stop` ended the wait, else True."""
         return self.repairing is None or self.repairing.result(stop) is not None
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Cause of a non-finite step on any rank, and whether the weights before it gave finite plans."""
+        """Find the cause of a step whose loss or gradient was not finite on any of the ranks (processes).
+
+        Returns:
+            The error that describes the cause, and whether the weights before the step gave finite plans.
+        """
         theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
         x0 = torch.cat((self.learnt, *theirs))
         step = TrainingStep.of(self.network, self.objective, x0, self.step, self.task)
@@ -155,10 +165,12 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Search for plans by exploration, if local search solved hardly any failing state in the last round.
+        """Explore plan prefixes for satisfying plans, if the last local search solved hardly any state.
 
-        The effort increases after every search without result. Returns False if `stop` ended the exploration;
-        then nothing has changed.
+        The plans found are imitated from then on. If there are none, the next exploration is longer.
+
+        Returns:
+            False if `stop` ended the exploration early, which then has no effect; else True.
         """
         if not self.barren:
             return True
@@ -184,10 +196,10 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Judge the policy's plans from new states; a method that searches starts to repair failing plans.
+        """Judge the policy's plans from newly drawn states, and start a search where they fail.
 
-        The repair runs concurrently with the training steps; its results are collected at the next
-        validation.
+        The search, which only some methods make, runs concurrently with the training steps. Its results are
+        collected by the next validation.
         """
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
@@ -224,11 +236,11 @@ class Trainer(Learner):
             self.repairing.cancel()
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
-        """Put the plans that the last search found into the replay buffer and the source of training states.
+        """Wait for the last search, and add its plans to the replay buffer and the source of training states.
 
         Returns:
-            Number of states searched, number solved, and the resulting estimate of the share of feasible
-            states.
+            Number of states searched, number of states for which a satisfying plan was found, and the
+            estimated share of states with a known satisfying plan; 0, 0 and None without a search.
         """
         if self.repairing is None:
             return 0, 0, None
@@ -280,16 +292,25 @@ class Trainer(Learner):
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
-        """Weighted mean square distance between repaired plans and the nearest proposed ones.
+        """Weighted mean of the squared distances between plans that a search found and the nearest proposed.
 
-        States that are already solved count as 0.
+        States for which the network already proposes a satisfying plan count as 0.
+
+        Args:
+            plans: proposed plans, (k, plans, T, m).
+            targets: plans that the search found, (k, T, m).
+            solved: whether a proposed plan satisfies the specification, (k,).
         """
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
         return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
-        """Feasible margin gamma: a share of the robustness that search reaches on the median state."""
+        """Margin gamma of the loss that is within reach: a share of the median robustness of search results.
+
+        The search starts from random states; only satisfying plans count. The margin is within
+        `MARGIN_RANGE`.
+        """
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
         x0 = self.supply.take(min(count, MARGIN_STATES))
@@ -305,14 +326,14 @@ class Trainer(Learner):
         return Searcher(self.task, self.generator, enough=enough, device=self.device)
 
     def _supply(self) -> Supply:
-        """Source of training states: along missions if the specification has memory, else random."""
+        """Source of training states: along missions if the specification adds timers, else random."""
         if not self.task.compiled.timers:
             return Draws(self.task, self.generator, self.device)
         policy = BestOfKPolicy(self.task, self.network)
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
     def _network(self) -> PlanNetwork:
-        """A network whose initial weights depend on the seed alone."""
+        """Make a network whose initial weights depend on the seed of the options alone."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
             return self.method.network(self.task, self.config).to(self.device)
@@ -395,7 +416,7 @@ class Trainer(Learner):
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """State for this rank, in which its own entries replace those of the first rank."""
+        """Tensors and numbers of a checkpoint for this rank, whose own entries replace those of the first."""
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")
@@ -417,11 +438,12 @@ def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 class NetworkMethod(Method):
-    """Training and loading of a network that proposes `config.plans` plans.
+    """Interface of the methods that train a network which proposes `config.plans` plans per state.
 
     Attributes:
-        searches: whether failing states are repaired by local search concurrently with the steps.
-        mirrored: whether the network uses the system's mirror symmetry.
+        searches: whether a local search for better plans, from states at which the policy fails, runs
+            concurrently with the steps.
+        mirrored: whether the network uses the mirror symmetry that the system file declares.
     """
 
     searches = False
@@ -429,20 +451,20 @@ class NetworkMethod(Method):
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
-        """Loss of the method, with the margin of the training."""
+        """Parameters of the method's loss, with `learner.margin` if the method adapts the margin."""
 
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Trainer:
-        """The training before its first step."""
+        """Make the learner, in its state before the first step."""
         return Trainer(task, config, steps=steps, device=device, ranks=ranks)
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
-        """A network with the options of a run and random weights, drawn from torch's global generator."""
+        """Make a network with random weights, drawn from torch's global generator."""
         return PlanNetwork(task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str = "cpu") -> BestOfKPolicy:
-        """Load the policy of a run, with averaged weights.
+        """Load the policy of a run, with the moving average of the network's weights.
 
         Raises:
             RunError: R101 or R102, see `Method.load`.

@@ -60,7 +60,7 @@ class SearchResult:
         return self.rho >= FLOAT32_SLACK
 
     def to(self, device: torch.device) -> SearchResult:
-        """A copy of the result on another device."""
+        """The result with its tensors on `device`."""
         return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
 
 
@@ -91,12 +91,12 @@ class Search:
         return search
 
     def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
-        """Start the search `climb` on a thread of `pool`."""
+        """Start the search `climb`, whose argument is its stop condition, on a thread; return this object."""
         self._found = pool.submit(climb, self._cancelled.is_set)
         return self
 
     def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
-        """Prepare the search `climb` to run in `steps` equal parts, one per call of `advance`."""
+        """Set up `climb` to run in `steps` equal parts, one per call of `advance`; return this object."""
         self._climb, self._share = climb, -(-climb.left // max(1, steps))
         return self
 
@@ -105,7 +105,7 @@ class Search:
         return self._found.done()
 
     def advance(self) -> None:
-        """Do one part of the work, unless another thread runs the search."""
+        """Do one part of a search in torch; nothing if a thread of its own runs the search."""
         if self._climb is not None and not self.done():
             for _ in range(self._share):
                 if not self._climb.generation():
@@ -113,7 +113,7 @@ class Search:
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
-        """Wait for the result and return it; None if `stop` ends the waiting first."""
+        """Wait for the result and return it; None if `stop` ended the wait before."""
         while not self.done():
             if stop():
                 return None
@@ -154,12 +154,12 @@ class Searcher:
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
     ) -> SearchResult:
-        """Improve plans until they have the target robustness or `tries` plans were judged.
+        """Improve plans until their robustness is `enough` or `tries` plans per state were judged.
 
         Args:
             x0: states, (B, n).
             plans: initial plans, (B, T, m).
-            bank: library of plans that solved other states, (k, T, m); may be empty.
+            bank: library of plans that satisfy the specification from other states, (k, T, m); may be empty.
             tries: maximum number of plans judged per state.
             stop: condition that ends the search early, with the best plans until then.
         """
@@ -190,7 +190,7 @@ class Searcher:
 
     @torch.no_grad()
     def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> SearchResult:
-        """Run `repair` without plan library on the calling thread, with as many threads as torch has."""
+        """Search like `repair`, without plan library, and with as many threads as torch has."""
         bank = plans.new_zeros(0, *plans.shape[1:])
         if self.task.native is None:
             return self._climb(x0, plans, bank, tries, self._seed()).finish()
@@ -202,7 +202,7 @@ class Searcher:
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
-        """Prepare a native search, with copies of its inputs and with random numbers of its own."""
+        """Prepare a native search, with copies of its inputs; the function returned runs it until `stop`."""
         native = self.task.native
         assert native is not None
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
@@ -223,10 +223,10 @@ class Searcher:
 
 
 class _TorchClimb:
-    """Local search like that of the native kernel, in torch, one generation (changed plans) at a time.
+    """Local search in torch, like that of the native kernel; a generation is one batch of changed plans.
 
     Attributes:
-        found: the best plans found.
+        found: the best plan of each state until now.
         left: maximum number of remaining generations.
     """
 
@@ -246,7 +246,11 @@ class _TorchClimb:
 
     @torch.no_grad()
     def generation(self, stop: Stop = never) -> bool:
-        """Try `TRIES` changed plans for every unfinished state; return False once nothing is left to do."""
+        """Try `TRIES` changed plans for every state whose plan has not reached the robustness `enough`.
+
+        Returns:
+            False if no generation is left or all plans have reached it, else True.
+        """
         still = (self.found.rho < self.enough).nonzero()[:, 0]
         if self.left == 0 or not len(still):
             return False
@@ -275,7 +279,7 @@ class _TorchClimb:
         found.rho[rows] = value[better]
 
     def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
-        """Changed plans, (B, tries, T, m), within the control bounds."""
+        """Random changes of plans (B, T, m), within the control bounds: (B, tries, T, m)."""
         quarter = tries // 4
         span = self.high - self.low
         start = plans[:, None]
@@ -289,7 +293,7 @@ class _TorchClimb:
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
-        """Plans that solved other states, (B, count, T, m); while there are few, piecewise constant plans."""
+        """Random plans of the library `bank`, (B, count, T, m); if it holds few, piecewise constant plans."""
         states, steps, controls = plans.shape
         if bank.shape[0] >= 64:
             return bank[self._randint(0, bank.shape[0], states, count)]

@@ -74,8 +74,8 @@ class Watch:
         stop: called after every step; True saves and ends the training.
         deferring: context manager around the steps, in which an interrupt is deferred until the step is
             finished and saved; outside of it an interrupt may be raised anywhere.
-        late: function of the wall-time budget that returns the seconds by which the work around the training
-            would exceed it.
+        late: function from the budget of wall time to the seconds by which the command as a whole is
+            predicted to exceed it, because of other work such as loading.
         evaluating: called with the progress of the final evaluation, as a short text.
     """
 
@@ -106,8 +106,8 @@ def train(
             writes.
 
     Raises:
-        SystemFileError: S301, hardly any initial state is admissible; S302, states are not finite; S304, the
-            declared mirror is no symmetry of the system.
+        SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
+            S304, the declared mirror is no symmetry of the system or the specification.
         MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, a rank is
             gone.
         RunError: R401, the loss or its gradient is not finite.
@@ -152,8 +152,8 @@ def resume(
     Args:
         folder: folder of the run.
         steps: new total number of steps.
-        budget: additional seconds; if neither is given, the rest of the run's budget is used, or its step
-            schedule is completed.
+        budget: additional seconds. If neither `steps` nor `budget` is given, the rest of the run's budget is
+            used, or its step schedule is completed.
         device: torch device.
         watch: callbacks.
         ranks: processes that train together; their number must be the same as before.
@@ -215,7 +215,7 @@ def resume(
 def _without_steps(
     method: Method, task: Task, config: ResolvedConfig, writer: RunWriter, time: TimeBudget, watch: Watch
 ) -> TrainingOutcome:
-    """Outcome of a run whose policy is a planner, which is evaluated without training."""
+    """Evaluate a run whose policy is a planner, without training, and write the result into its folder."""
     margin = task.system.decl.objective.gamma
     writer.note({"margin": margin, "steps": 0, "schedule": None})
     watch.started({**asdict(config), "margin": margin, "budget": time.allowed or None, "steps": 0})
@@ -239,7 +239,7 @@ def _require_as_many(before: int, now: int) -> None:
 
 
 def find_device(name: str) -> torch.device:
-    """Return a torch device.
+    """Return the torch device `name`; `auto` is the GPU if there is one, else the CPU.
 
     Raises:
         MissingError: R302, the device does not exist.
@@ -259,7 +259,7 @@ def find_device(name: str) -> torch.device:
 
 
 class _Session:
-    """Training session: from the learner's present state to the end of the training or an interruption."""
+    """Part of a training in one process: from the learner's present state to its end or an interruption."""
 
     def __init__(
         self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
@@ -280,7 +280,7 @@ class _Session:
         self.exhausted = False
 
     def finish(self) -> TrainingOutcome:
-        """Train to the end, evaluate, and close the record.
+        """Train to the end, evaluate, and write the status of the run.
 
         An interruption leaves the last checkpoint, from which `resume` continues.
         """
@@ -321,10 +321,13 @@ class _Session:
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
-        """Validate if that is due, and return whether another step follows; None: the training has to stop.
+        """Validate if that is due, and decide whether another step follows.
 
-        The end of training and a validation wait for the concurrent search. If that takes less time than
+        A validation and the end of the training wait for the concurrent search. If the wait is shorter than
         expected, further steps may fit into the budget.
+
+        Returns:
+            True if another step follows, False after the last one, None if the user ends the training early.
         """
         learner = self.learner
         ends = self._planned() <= learner.step
@@ -340,7 +343,10 @@ class _Session:
         return True
 
     def _planned(self) -> int:
-        """Total number of steps as planned at present, by the budget or by the schedule."""
+        """Plan the total number of steps by the budget or the schedule, and return it.
+
+        A new plan is recorded in the schedule and in the learner.
+        """
         learner = self.learner
         if self.time.allowed:
             left = self.time.started + self.time.seconds - self.evaluation.reserve - self.now()
@@ -361,7 +367,7 @@ class _Session:
         self.writer.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
     def _validate(self, began: float) -> None:
-        """Validate, and write the row of `train.jsonl`; `began`: clock reading before the validation."""
+        """Validate and write a row of `train.jsonl`; `began` is the clock reading before an exploration."""
         learner = self.learner
         found = learner.validate()
         self.pace.validated(learner.step, self.now() - began)
@@ -372,7 +378,7 @@ class _Session:
             self.refuted = learner.ranks.any(refuted(learner.task))
 
     def _wait_for_search(self) -> bool:
-        """Wait for the concurrent search; return False if the training has to stop before its end."""
+        """Wait for the concurrent search; return False if the user ends the training during the wait."""
         began = self.now()
         came = self.learner.wait(self.watch.stop)
         if self.learner.searches:
@@ -380,7 +386,11 @@ class _Session:
         return not self.learner.ranks.any(not came)
 
     def _hopeless(self) -> bool:
-        """True if policy and search never satisfied the specification, by proof or after all efforts."""
+        """True if no satisfying plan was ever found, and further search is useless.
+
+        Search is useless if no plan exists, as bounds proved, or if exploration with the largest effort and
+        enough steps have found none.
+        """
         learner = self.learner
         enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:
@@ -428,7 +438,10 @@ class _Session:
         self.watch.row(row)
 
     def _broken(self) -> StlcError:
-        """Error with the cause of a non-finite step; the weights before it are saved if they are finite."""
+        """Return the error with the cause of a step that was not finite, and record that the run failed.
+
+        The weights before that step are saved if they are finite.
+        """
         error, good = self.learner.diagnose()
         if good:
             self._save()

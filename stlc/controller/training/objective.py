@@ -1,4 +1,7 @@
-"""Training loss: truncated robustness plus performance terms, as in the paper (Eq. 8 to 10)."""
+"""Training loss: truncated robustness plus performance terms, as in Meng and Fan (2023, Eq. 8 to 10).
+
+"The paper" in this file is Meng and Fan (2023).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ class Objective:
     Attributes:
         margin: the paper's gamma; robustness above it does not reduce the loss.
         smoothing: the paper's k of smooth min and max; None: exact min and max with subgradients.
-        switch: form of jumps and indicators that is differentiated.
+        switch: functions whose derivatives replace those of jumps and conditions in the dynamics.
         saturation: s of `s log(1 + hinge / s)`, which keeps infeasible states from dominating; None: plain
             hinge.
         stl_weight: the paper's lambda.
@@ -41,7 +44,10 @@ class Objective:
 
 
 def paper_objective(task: Task) -> Objective:
-    """The paper's objective: hinge at gamma on log-sum-exp robustness, with tanh switching (Eq. 6 to 10)."""
+    """The paper's objective (Eq. 6 to 10): a hinge, at margin gamma, on smooth robustness.
+
+    Minima and maxima are smoothed by log-sum-exp, and conditions in the dynamics by tanh.
+    """
     declared = task.system.decl.objective
     return Objective(
         margin=declared.gamma,
@@ -53,7 +59,7 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """Objective of the method `guided`: exact min and max, and a saturating hinge at a feasible margin."""
+    """Objective of the method `guided`: exact min and max, and a saturating hinge at `margin`."""
     return Objective(
         margin=margin,
         smoothing=None,
@@ -90,9 +96,9 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
 def native_rolled(
     task: Task, objective: Objective, x0: Tensor, u: Tensor
 ) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, computed in C.
+    """Robustness per requirement (B, R), and states name -> (T+1, B), computed in C, differentiable by `u`.
 
-    None if the native kernel cannot compute what the objective requires, or if torch has to be used.
+    None if there is no native kernel for the objective (smooth robustness), the task or the device.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
@@ -102,7 +108,7 @@ def native_rolled(
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states (T+1, B) by name, differentiable; in C if that is equivalent."""
+    """Robustness (B,) and states name -> (T+1, B), differentiable by `u`; in C if possible, else torch."""
     native = native_rolled(task, objective, x0, u)
     if native is not None:
         return task.graph.overall(native[0]), native[1]

@@ -40,7 +40,7 @@ CONFIG = "config.resolved.yaml"
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A training run.
+    """A training run: its folder, task and policy.
 
     Attributes:
         dir: folder of the run.
@@ -62,10 +62,14 @@ class Run:
         overrides: Mapping[str, str] | None = None,
         scenario: str | None = None,
     ) -> Run:
-        """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
+        """Load a run with its policy, which `overrides` and `scenario` do not change.
 
-        `overrides` change constants and set parameters, as `--set` does; `scenario` is the one of the system
-        file to apply. The policy is unchanged.
+        Args:
+            where: folder, name or number of the run, or `latest`.
+            root: folder of all runs.
+            device: torch device of the policy.
+            overrides: changed constants and fixed parameters, as with `--set`, name -> text.
+            scenario: name of a scenario of the system file that is applied to the task.
 
         Raises:
             UsageError: the run does not exist.
@@ -143,7 +147,7 @@ class RunWriter:
             save_states(self.folder.path / "eval" / "held_out.npz", task, score)
 
     def close(self, status: Status, result: object = None) -> None:
-        """Record the status and the result with which the training ended."""
+        """Write the status and the result with which the training ended into `run.json`."""
         if self.writes:
             self.folder.finish(status, result)
 
@@ -151,9 +155,13 @@ class RunWriter:
 def load_task(
     folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
 ) -> Task:
-    """Compile the specification and the system in a run's folder, with `overrides` applied.
+    """Compile the specification and the system in a run's folder.
 
-    A parameter that the policy observes keeps its column (entry of the state), with the given value.
+    Args:
+        folder: folder of the run, whose own `--set` changes are applied first.
+        overrides: further changes, name -> text. A parameter that varied in training remains an entry of the
+            state, which the policy observes, with the value given here.
+        scenario: name of a scenario of the system file to apply.
     """
     trained = folder.record().get("overrides") or {}
     spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
@@ -167,20 +175,21 @@ def load_task(
 
 
 def spec_hash(folder: RunDir) -> str:
-    """SHA-256 of the specification in a run's folder and of its `--set` changes."""
+    """SHA-256 of the specification in a run's folder, of its imports, and of the run's `--set` changes."""
     return _hash(folder, SPEC, read_library(folder))
 
 
 def system_hash(folder: RunDir) -> str:
-    """SHA-256 of the system file in a run's folder and of its `--set` changes."""
+    """SHA-256 of the system file in a run's folder and of the run's `--set` changes."""
     return _hash(folder, SYSTEM)
 
 
 def trained_on(folder: RunDir) -> str:
-    """Hash of the system file that a policy was trained on, or else of the one in the run's folder.
+    """Hash that `load_checkpoint` compares with that of the system file in a run's checkpoint.
 
-    The former is returned if the system file was edited but the policy may still be deployed on it: the
-    fields that determine what a policy learns are unchanged; worlds, scenarios and backup may differ.
+    It is the hash of the system file at the start of the training if the file in the run's folder was edited
+    since, but only in fields that do not affect what a policy learns (worlds, scenarios, backup). Otherwise
+    it is the hash of the present file; after any other edit the checkpoint is refused.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")
@@ -228,7 +237,7 @@ def load_config(folder: RunDir) -> ResolvedConfig:
     """Read the resolved options of a run.
 
     Raises:
-        RunError: R101, they are damaged.
+        RunError: R101, their file is missing or damaged.
     """
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())

@@ -34,7 +34,7 @@ BLOCK = 8192
 
 
 class Supply(ABC):
-    """Source of training states.
+    """Interface of the sources of training states (initial states of the plans that are trained).
 
     Attributes:
         block: states drawn and not yet returned, (k, n).
@@ -60,10 +60,13 @@ class Supply(ABC):
         return taken
 
     def follow(self, states: Tensor, plans: Tensor) -> None:  # noqa: B027
-        """Use plans that solve states where the policy fails: (k, n), (k, T, m); by default ignored."""
+        """Draw further states along plans (k, T, m) that a search found from states (k, n).
+
+        By default nothing is done.
+        """
 
     def tensors(self) -> dict[str, Tensor]:
-        """State of the source, as tensors by name."""
+        """Tensors by name that determine the next states, together with the random numbers."""
         return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
@@ -80,7 +83,7 @@ class Draws(Supply):
 
 
 class FixedSet:
-    """A fixed training set: states of another source, reshuffled after each pass.
+    """A fixed set of training states, drawn once from another source and reshuffled after each pass.
 
     Attributes:
         states: all states of the set, (size, n).
@@ -142,7 +145,10 @@ class Missions(Supply):
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Continue some missions from states that are reached by plans found for failing states."""
+        """Continue some missions from states that plans (k, T, m) reach from states (k, n).
+
+        The plans were found by a search from states at which the policy failed.
+        """
         if len(states) and len(self.pool):
             judged = self.task.judge(states, plans)
             reached = self._at(judged, self._legs(len(states)))
@@ -154,7 +160,11 @@ class Missions(Supply):
 
     @torch.no_grad()
     def _more(self, _n: int) -> Tensor:
-        """Simulate every mission for a number of steps and return visited states in random order, (k, n)."""
+        """Simulate every mission under its present plan for a random number of steps.
+
+        Returns:
+            States visited on the way and some new initial states, in random order, (k, dim).
+        """
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
         judged = self._plan(self.pool)
@@ -170,19 +180,22 @@ class Missions(Supply):
         return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
-        """Restart missions that are over or can no longer succeed, and some of those whose plan failed."""
+        """Restart missions that are over or can no longer succeed, and some of those whose plan fails.
+
+        `good` tells for each mission whether its present plan satisfies the specification, (POOL,).
+        """
         given_up = ~good & (self._rand(len(good)) < GIVE_UP)
         ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
-        """Random numbers of steps for which plans are followed, at most half of the horizon, (n,) int64."""
+        """Draw for each of `n` plans a number of steps to simulate, 1 to half of the horizon: (n,) int64."""
         most = max(self.task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
-        """Predicted states after the number of steps that `steps` gives for each row: (n, dim)."""
+        """Predicted states under each judged plan after its number of steps, `steps` (n,): (n, dim)."""
         return torch.stack(
             [judged.columns[name].gather(0, steps[None])[0] for name in self.task.system.names], 1
         )
@@ -198,9 +211,10 @@ class Missions(Supply):
 
 
 def mission_steps(task: Task) -> int:
-    """Number of steps of a mission: a horizon past the last time in the specification.
+    """Number of steps for which a mission is simulated.
 
-    For a mission without end, it is a number of periods.
+    It ends one horizon after the last time that the specification names, or after four horizons if the
+    specification names none. If requirements recur forever, `ROUNDS` periods follow the last time instead.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
@@ -212,9 +226,10 @@ def mission_steps(task: Task) -> int:
 
 @torch.no_grad()
 def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
-    """States along missions simulated with the policy, (n, dim) float64.
+    """States that missions pass when simulated with the policy, in random order, (n, dim) float64.
 
-    The simulation ends once `enough` returns True.
+    The simulation ends early once `enough` returns True. Initial states are added if there are fewer than
+    `n`.
     """
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)
@@ -254,7 +269,7 @@ class ReplayBuffer:
 
     @classmethod
     def empty(cls, state: int, steps: int, controls: int, device: torch.device) -> ReplayBuffer:
-        """An empty buffer for states of `state` columns and plans of `steps` x `controls`."""
+        """Make an empty buffer for states (state,) and plans (steps, controls)."""
         return cls(
             torch.zeros(CAPACITY, state, device=device), torch.zeros(CAPACITY, steps, controls, device=device)
         )

@@ -62,7 +62,7 @@ class TensorBoardLogger:
 
 
 def find_writer() -> Opener:
-    """Return the log constructor of tensorboardX, else of torch with tensorboard.
+    """Return a function that opens the log in a run's folder, by tensorboardX or else by torch.
 
     Raises:
         MissingError: R301, neither is installed.
