@@ -125,7 +125,7 @@ def clear_artists(axes: Axes) -> None:
 
 
 def speed_up(frames: int, dt: float) -> int:
-    """Smallest integer speed-up at which the animation lasts at most `LONGEST`."""
+    """Smallest integer speed-up at which the animation lasts at most `LONGEST` seconds."""
     return max(1, int(np.ceil(frames * dt / LONGEST)))
 
 
@@ -253,8 +253,8 @@ def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
 def _palette(sheet: Image) -> Image:
     """Colour palette of a picture: its most frequent colours, then the colours worst represented by these.
 
-    White stays exactly white. A colour is added by its distance to the palette times its frequency, so that
-    small details such as a legend's dot or a violating line keep their colour.
+    White stays exactly white. The worst represented colour has the largest distance to the palette, weighted
+    by its frequency; small details such as a legend's dot or a violating line thus keep their colour.
     """
     from PIL import Image
 

@@ -51,7 +51,10 @@ def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
-    """Set limits that show all of the highest curve and most of the lowest; first points may be cut off."""
+    """Set vertical limits that show all of the highest curve and most of the lowest.
+
+    The first points of the lowest curve may be cut off.
+    """
     low = min((float(np.quantile(curve, 0.08)) for curve in values if len(curve)), default=0.0)
     high = max((float(curve.max()) for curve in values if len(curve)), default=1.0)
     low = max(0.0, np.floor(20 * (low - 0.02)) / 20)

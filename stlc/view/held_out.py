@@ -215,7 +215,7 @@ class _Values:
 
 
 def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
-    """Conditions that may be added to narrow the region."""
+    """Conditions that may be added to a conjunction to narrow `region`, the region that it describes."""
     found: list[Condition] = []
     bad = x0[region & failing]
     for column, kinds in enumerate(values):

@@ -75,7 +75,7 @@ def script() -> Html:
 
 
 def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], contents: RunContents) -> Html:
-    """A drawing area per run, and a still picture for readers without scripts."""
+    """HTML with a drawing area (canvas) per run, and a still picture for readers without scripts."""
     figures = [
         el(
             "figure",
@@ -261,7 +261,10 @@ def _area(times: Floats, base: Floats, values: Floats, limits: tuple[float, floa
 
 
 def _events(panels: Sequence[RunPanel]) -> Html | None:
-    """List of violations by requirement; each entry links to its instant. None without violations."""
+    """List of violations by requirement; each entry links to its instant.
+
+    None if no requirement was evaluated.
+    """
     names = list(dict.fromkeys(name for panel in panels for name in panel.requirements))
     if not names:
         return None

@@ -30,7 +30,10 @@ MAP_CAPTION = (
 
 
 def recorded_section(contents: RunContents) -> Section | None:
-    """Section with verdicts on the recorded traces; None without a trace."""
+    """Section with verdicts on the recorded traces, their signals, and causes of violations.
+
+    None without a trace.
+    """
     trace = contents.trace
     if trace is None:
         return None

@@ -352,7 +352,7 @@ class MapRegion:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Time intervals in which the region is active: a requirement refers to it.
+        """Time intervals in which a requirement refers to the region, which is then called active.
 
         In seconds since the start of the trace; empty if the region is always active.
         """
@@ -418,8 +418,7 @@ class Plane:
             count: number of grid points along each axis.
 
         Returns:
-            Horizontal coordinates (count,), vertical coordinates (count,), and distances (vertical,
-                horizontal), positive inside.
+            Horizontal and vertical coordinates, (count,) each, and distances (count, count), row by row.
         """
         (left, right), (low, high) = window
         xs, ys = np.linspace(left, right, count), np.linspace(low, high, count)

@@ -123,8 +123,8 @@ class CommandRenderer(RendererBase):
     ) -> None:
         """Record a line of text.
 
-        The recorded position is on the baseline, at the left end, centre or right end of the text by its
-        alignment.
+        The recorded position is on the baseline, at the left end, the centre or the right end of the text,
+        depending on its alignment.
         """
         wide, _, _ = self.get_text_width_height_descent(s, prop, ismath)
         align = "left" if mtext is None else mtext.get_horizontalalignment()

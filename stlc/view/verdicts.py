@@ -156,7 +156,7 @@ def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Stri
 def model_consistent(trace: Trace, agents: int) -> Mask | None:
     """True at samples from which the world behaves as the model for the length of a plan, (agents, samples).
 
-    None if that was not recorded.
+    None if the trace does not record where the world deviates from the model.
     """
     steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
     if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
@@ -166,7 +166,10 @@ def model_consistent(trace: Trace, agents: int) -> Mask | None:
 
 
 def least(rho: Floats, counts: Mask | bool = True) -> Floats:
-    """Least robustness over the agents with `counts`: (agents, samples) -> (samples,); NaN if unknown."""
+    """Least robustness over the agents where `counts` is true: (agents, samples) -> (samples,).
+
+    NaN if no robustness is known.
+    """
     known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
     return np.where(np.isfinite(known), known, np.nan)
 

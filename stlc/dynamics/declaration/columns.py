@@ -203,7 +203,7 @@ def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
 def name_columns(names: Names, about: str) -> None:
     """Make the columns in `names`, and the members of their enums, available as names in expressions.
 
-    `about` describes them in messages, for example "parameter".
+    `about` describes a column in messages, for example "parameter".
     """
     known = column_entries(names.columns, about=about)
     names.entries |= {name: entry for name, entry in known.items() if name not in names.entries}
@@ -229,7 +229,7 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
 
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
-    """Return (name, value) of the members of an enum, written `{stop: 0, light: 1}` or `[stop, light]`."""
+    """Return (name, value) of each member of an enum, written `{stop: 0, light: 1}` or `[stop, light]`."""
     members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
         words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
@@ -276,8 +276,8 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
 def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
     """Read the timers: states with `timer: up` or `timer: down`.
 
-    Returns their flow and one jump per timer: a timer counts seconds while its condition `run` holds, and its
-    jump sets it to `to` when `reset_when` holds.
+    Returns the flow of the timers and one jump per timer. A timer counts seconds while its condition `run`
+    holds; the jump resets it to the value of its key `to` when `reset_when` holds.
     """
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
@@ -371,7 +371,7 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 
 
 def _even(column: Column) -> tuple[ir.Num, str]:
-    """Return the uniform distribution over the values that a column can take, and its text."""
+    """Return the uniform distribution over the values that a column can take, as expression and as text."""
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
         return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"

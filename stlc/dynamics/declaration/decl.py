@@ -43,7 +43,7 @@ class SystemDecl:
     """A system file, read and validated.
 
     Attributes:
-        name: of the system, from the file.
+        name: name of the system, from the file.
         doc: description of the system in one line.
         path: path of the system file.
         source: text of the system file.
@@ -58,7 +58,8 @@ class SystemDecl:
         controls: planned variables, in order: the inputs, or their deviations from `feedback`.
         flow: derivative in unit per second (or next value) of each column; columns not listed are constant.
         jumps: discrete transitions, in file order.
-        clamps: column -> (low, high), to which it is limited after every step.
+        clamps: column -> (low, high), the range to which the column is limited after every step.
+        init, objective, policy, train, backup, test: the sections of these names.
         feedback: inner feedback law; None if plans are the actuator commands themselves.
         scenarios: named changes of the system for deployments.
         scenario: the scenario applied to this declaration, or None.
@@ -127,7 +128,10 @@ class SystemDecl:
         return tuple(judge for judge in named if judge is not None)
 
     def judges_by(self, spec: Path) -> bool:
-        """True if the file names `spec` as judge of closed-loop runs; it is then checked on traces."""
+        """True if the file names `spec` as judge of closed-loop runs.
+
+        Such a specification is compiled for recorded traces, not for plans.
+        """
         return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
 
     @property

@@ -172,7 +172,7 @@ class JudgeRef:
 
     Attributes:
         path: path of the file.
-        written: the path as the system file writes it; run folders store a copy of the file under this path.
+        written: the path as the system file writes it; the index of the copies in a run folder has it as key.
         span: source location of the path.
     """
 
@@ -199,7 +199,10 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
 
 @reads({"type": ["string", "null"]})
 def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
-    """Read the path of the specification that judges closed-loop runs, relative to the file that names it."""
+    """Read the path of the specification that judges closed-loop runs, relative to the file that names it.
+
+    Returns None for a null, and for an invalid path, which is reported.
+    """
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
     if text is None:
         return None

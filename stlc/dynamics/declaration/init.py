@@ -328,7 +328,10 @@ def _grid(node: Node, cx: Context) -> GridDecl:
 
 
 def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
-    """Return the values of a column along its axis of the grid, in its unit; an invalid value becomes 0."""
+    """Return the values of a column along its axis of the grid, in the unit of the column.
+
+    An invalid value is reported and becomes 0.
+    """
     where = f"the values of `{column.name}`"
     if isinstance(entry.value, Mapping):
         return _spaced(column, entry.value, where, cx)

@@ -236,11 +236,11 @@ def latch_name(jump: str) -> str:
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """Return assignments in which a sampler, such as `uniform(0, 1)`, that several share is drawn once.
+    """Make assignments draw a sampler that several of them share, such as `uniform(0, 1)`, only once.
 
-    An assignment to a local name, placed before them, draws it. `p: "uniform(0, 1) * [1, 2]"` multiplies one
-    random number by each component; `p: "uniform(low, high)"` with vectors draws one random number per
-    component.
+    A preceding assignment to a local name draws the sampler; the other assignments read this name. `p:
+    "uniform(0, 1) * [1, 2]"` multiplies one random number by each component; `p: "uniform(low, high)"` with
+    vectors draws one random number per component.
     """
     if len(assigns) < 2:
         return tuple(assigns)

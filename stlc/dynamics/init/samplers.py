@@ -101,7 +101,7 @@ class Drawing:
         return value.expand(rows.count)
 
     def _extract(self, num: ir.Num) -> ir.Num:
-        """Replace every sampler in a number by a column that receives its draws, and add it to `_calls`."""
+        """Return a number with every sampler replaced by a column; append the samplers to `_calls`."""
         if id(num) in self._seen:
             return self._seen[id(num)]
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:

@@ -221,7 +221,7 @@ class Hoist:
         return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """Rewrite a choice whose condition is loop-invariant: the condition becomes a mask in `early`."""
+        """Rewrite an if-then-else with a loop-invariant condition, which becomes a mask in `early`."""
         if yes == ir.Const(0.0):
             keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))

@@ -115,7 +115,10 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
 
 
 def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
-    """Return `I yes + (1 - I) no` with the smooth indicator I_w of Eq. 6 (exact where I is 0 or 1)."""
+    """Return `I yes + (1 - I) no`, where I is the smooth indicator of `cond` (I_w of Eq. 6).
+
+    The result is exactly `yes` or `no` where I is 1 or 0.
+    """
     weight = ir.Indicator(cond, sharpness)
     kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
     return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)

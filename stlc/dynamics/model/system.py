@@ -88,7 +88,7 @@ class System:
         """Return the same system with the parameters and timers of a specification as its last state columns.
 
         Parameters are drawn once per trajectory. Timers are updated from the previous states, without
-        gradient. At initial states the mission starts, so timers have their initial values.
+        gradient; initial states contain their initial values.
         """
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
@@ -157,8 +157,7 @@ class System:
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """Append the columns that a specification adds: (B, n - added) -> (B, n).
 
-        The parameters of the specification are drawn; its timers get their values at the start of the
-        mission.
+        The parameters of the specification are drawn; its timers get their initial values.
         """
         if not self.added:
             return states
@@ -285,8 +284,7 @@ class System:
     ) -> Tensor:
         """Draw n initial states, (n, dim), including the parameters and timers that a specification adds.
 
-        Timers have their values at the start of the mission. The same seed gives the same states, whatever
-        the dtype.
+        Timers have their initial values. The same seed gives the same states, whatever the dtype.
 
         Raises SystemFileError (S301) if `where` rejects (nearly) every state.
         """

@@ -35,9 +35,9 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """Return the other files that a system file refers to.
+    """Return the other files that a system file refers to: name -> path.
 
-    These are the files that it extends, those of its functions, and those of initial states. The key is the
+    These are the files that it extends, those of its functions, and those of initial states. The name is the
     path below the folder of the system file, or else the file name.
     """
     home = decl.path.parent.resolve()

@@ -198,7 +198,7 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> 
 
 
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) -> Point:
-    """Translate a point along an axis by `length`."""
+    """Translate a point along an axis by `length`, in metres."""
     return tuple(
         writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
         for part, share in zip(point, axis, strict=True)

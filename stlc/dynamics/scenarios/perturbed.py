@@ -65,7 +65,7 @@ class Perturbable:
 
 
 def perturbable(decl: SystemDecl) -> Perturbable:
-    """Return the declaration with each uncertain number of its dynamics multiplied by a factor."""
+    """Multiply each uncertain number of a declaration's dynamics by a factor; return the result."""
     parts = moving_parts(decl)
     names = parts.cx.names
     used, listed = _UsedNumbers(names), decl.test.uncertain

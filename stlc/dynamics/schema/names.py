@@ -105,7 +105,7 @@ class Names:
         return tuple(dict.fromkeys(base_name(column.name) for column in self.columns))
 
     def vector(self, name: str) -> bool:
-        """True if the state is a vector."""
+        """True if the state `name` is a vector."""
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:

@@ -58,7 +58,7 @@ class Reader:
     # ------------------------------------------------------------------ collections
 
     def entries(self, node: Node | None, where: str) -> tuple[Entry, ...]:
-        """Read the entries of a mapping whose keys are free; empty for a missing or null node."""
+        """Read the entries of a mapping with arbitrary keys; empty for a missing or null node."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Mapping):
@@ -186,7 +186,7 @@ class Reader:
         return self._valid(node, where, "`true` or `false`", value)
 
     def option(self, node: Node | None, where: str, options: Collection[str]) -> str | None:
-        """Read one of a few words."""
+        """Read a word, which must be one of `options`."""
         word = self.text(node, where)
         if node is None or word is None or word in options:
             return word

@@ -129,7 +129,7 @@ def values_of(
 
 
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
-    """Read a mapping into a record; missing or invalid values get their defaults."""
+    """Read a mapping into a record; invalid values are reported and, as missing ones, get their defaults."""
     return record(**values_of(record, cx, node, of, label))
 
 

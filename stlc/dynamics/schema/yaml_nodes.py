@@ -242,7 +242,10 @@ class _Builder:
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, start: Any, end: Any = None) -> Span:
-        """Return the source location from event `start` to `end` (or of `start`), less trailing blanks."""
+        """Return the source location from event `start` to event `end`, less trailing blanks.
+
+        Without `end`, it is the location of `start`.
+        """
         first, last = start.start_mark.index, (end or start).end_mark.index
         last = first + len(self.source.text[first:last].rstrip())
         return self.source.span(first, max(last, min(first + 1, len(self.source.text))))
