@@ -197,9 +197,11 @@ def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """Yield the left side of each implication that must hold whenever the formula holds.
+    """Yield the left sides of the implications that a formula requires to hold.
 
-    Implications below a negation, an `or` or an `eventually` are not visited.
+    The implications are looked for in the formula itself, the items of `and`, the operands of `always` and
+    `freeze`, and the right sides of implications. An implication below a negation, `or` or `eventually` is
+    left out.
     """
     match formula:
         case typed.Logic(_, "->", (left, right)):

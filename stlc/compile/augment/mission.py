@@ -71,7 +71,7 @@ class GoalLeaf:
 
 @dataclass(frozen=True, slots=True)
 class GoalBranch:
-    """Conjunction or disjunction (`op`) of goals."""
+    """Conjunction or disjunction (`op`) of goals, as an inner node of the tree that a goal is."""
 
     op: Literal["and", "or"]
     items: tuple[Goal, ...]

@@ -106,7 +106,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
 
 
 def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
-    """Return `left - right`, which is in kelvin if both are temperatures in degC.
+    """Return `left - right`, which is in kelvin if one of them is a temperature in degC.
 
     Raises:
         Failed: the units do not agree (E203).
@@ -173,7 +173,7 @@ def too_large(span: Span | None) -> Diagnostic:
 
 
 def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
-    """Return a number that was written without a unit as a number of `unit`: 30 becomes 30 deg.
+    """Return a number that was written without a unit as a number of `unit`: for deg, 30 becomes 30 deg.
 
     Raises:
         Failed: the result exceeds the range of double precision (E005).

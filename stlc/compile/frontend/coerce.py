@@ -61,7 +61,8 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
     """Return a value as a number; unlike in `as_number`, a bool is allowed and counts as 0 or 1.
 
     Raises:
-        Failed: the value is a formula (E202), or anything else that is no number (E205).
+        Failed: the value is a formula other than `true` and `false` (E202), or anything else that is no
+            number (E205).
     """
     match value:
         case Number():

@@ -48,7 +48,7 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
 
     Args:
         expr: syntax tree of the expression.
-        scope: names that it may use; findings are appended to `scope.sink`.
+        scope: names that the expression may use; findings are appended to `scope.sink`.
         what: role of the formula, for messages: "a guard".
 
     Raises:

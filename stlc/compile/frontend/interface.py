@@ -54,5 +54,5 @@ class Interface:
 
     @property
     def where(self) -> str:
-        """Path of the system file or, without one, the name of the system; for messages."""
+        """Path of the system file, or the name of the system if the path is unknown; for messages."""
         return self.path or self.name

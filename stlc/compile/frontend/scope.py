@@ -246,7 +246,10 @@ class Scope:
         raise Failed
 
     def unknown(self, name: ast.Name, *, called: bool = False) -> NoReturn:
-        """Report an undeclared name (E101) and raise Failed; `called` if it is used as a function."""
+        """Report an undeclared name (E101) and raise Failed.
+
+        `called`: whether the name is used as a function.
+        """
         candidates = [*self.locals, *self.entries]
         if called:
             candidates += [*callable_names(), *(sampler_names() if self.samplers else ())]

@@ -121,7 +121,8 @@ def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
 def _invalid(interval: typed.Interval, lo: Fraction, hi: Fraction | None) -> Diagnostic | None:
     """Return the error of an invalid interval, or None.
 
-    E302: it starts before the present sample; E301: it ends before it starts; E005: it is too long.
+    E301 is an interval that ends before it starts, E302 one that starts before the present sample, E005 one
+    of more than `MAX_STEPS` steps.
     """
     if lo < 0:
         text, span = "an interval starts before now", interval.lo.span or interval.span

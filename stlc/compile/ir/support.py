@@ -51,7 +51,7 @@ class Analysis(ABC, Generic[V]):
 
 
 def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
-    """Return the value that an analysis assigns to a formula."""
+    """Return the value that an analysis computes for a formula, from the leaves upwards."""
     match formula:
         case ir.Truth():
             return analysis.constant()

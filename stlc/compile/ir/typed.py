@@ -67,7 +67,7 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Base of typed formulas."""
+    """Base of typed formulas, with the source location (`span`) of the formula."""
 
     span: Span = field(compare=False, repr=False)
 
