@@ -114,7 +114,7 @@ class Guard:
 
         Args:
             x: (agents, n) states.
-            previous: remainder of the previous decision; see `GuardDecision.later`.
+            previous: remainder of the previous decision (see `GuardDecision.later`); None at first.
 
         Returns:
             The decision. With mode "none", a plan that is not finite is followed, with robustness -inf.
@@ -194,8 +194,13 @@ class Guard:
     def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
         """Remainders of plans in states (agents, n), extended at their ends by the policy.
 
-        `taken`: number of executed steps per agent, (agents,). As many actions at the end of a remainder,
-        where the last action is held, are replaced by the policy's.
+        `previous` continues each plan after its end by holding its last action. Instead, the policy plans
+        from the state at the end of the plan; the first actions of this plan are appended.
+
+        Args:
+            x: (agents, n) states.
+            previous: remainder of the previous decision.
+            taken: number of steps of each plan that were executed, and so of actions to append, (agents,).
         """
         x, plan = x.to(torch.float64), previous.plan.clone()
         length = plan.shape[1]
@@ -212,7 +217,11 @@ class Guard:
     def _with_previous(
         self, x: Tensor, previous: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
-        """The policy's plans `fresh` with verdicts; previous plans replace those that rank no higher."""
+        """The policy's plans `fresh` with their verdicts `judged`, or previous plans that are better.
+
+        A previous plan is taken if it satisfies the specification and ranks no lower, or increases the margin
+        of a pending goal; see `decide`.
+        """
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
         if previous is None:
@@ -225,7 +234,7 @@ class Guard:
         return found
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Mask of the agents whose remaining plan increases the margin of a reached goal, (agents,)."""
+        """Mask of the agents whose remaining plan increases the margin of a satisfied goal, (agents,)."""
         if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
         return self.task.pending_goals.deepened(rest.columns)

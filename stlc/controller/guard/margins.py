@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
     """The task whose safety requirements are tightened: their robustness is reduced by their margins.
 
-    Predicates on time and constants, which never determine a robustness, are unchanged.
+    Predicates on time and constants, which decide truth but do not bound the robustness, are unchanged.
     """
     if not any(margin.values()):
         return task
@@ -74,8 +74,8 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
         share: share of the plans whose loss the margin exceeds or equals.
 
     Returns:
-        Requirement -> margin, at least 0; empty if the scenario has no errors or the policy makes no safe
-        plan.
+        Requirement -> margin, without margins of 0; empty if the scenario has no errors or the policy makes
+        no safe plan.
     """
     x0 = task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
     disturbance = Disturbance(task.plain, [seeded(SEED, 1)], STARTS)
@@ -125,10 +125,12 @@ class MarginRequest:
     share: float | None = None
 
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
-        """Margins of the safety requirements of a task, whose agents replan every `replan` steps.
+        """Return the requested margin of each safety requirement, without margins of 0.
+
+        If requested, margins are calibrated.
 
         Raises:
-            UsageError: U101, a name is not that of a safety requirement.
+            UsageError: U101, `named` contains a name that is not that of a safety requirement.
         """
         names = [rule.name for rule in task.compiled.safety]
         for name in self.named:

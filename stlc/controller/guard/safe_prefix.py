@@ -17,11 +17,12 @@ BEYOND = "#beyond"
 
 
 def open_ended(formula: ir.Formula) -> ir.Formula:
-    """The formula in which every predicate holds at samples where the column `BEYOND` is positive.
+    """The formula as an upper bound: predicates are true at samples where the column `BEYOND` is positive.
 
-    In negation normal form the robustness of a formula does not decrease with that of its predicates. So,
-    with `BEYOND` positive after the known samples, it is the upper bound over all continuations of the trace;
-    it is negative exactly if the known samples already violate the formula.
+    The column is to be positive at all samples after the known ones. As the formula is in negation normal
+    form, a predicate that becomes true never decreases the robustness; so the result is the upper bound on
+    the robustness over all continuations of the known samples. It is negative exactly if these already
+    violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -29,10 +30,11 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """The formula whose predicates on the initial state decide truth but do not bound the robustness.
+    """The formula in which predicates on the initial state count only as true or false.
 
-    All plans share the initial state. For `a -> always b`, plans that violate it are therefore compared by
-    the violation of b, not by the robustness of a.
+    Their robustness is +inf or -inf, so it never determines that of a satisfiable plan. All plans have the
+    same initial state: for `a -> always b`, plans that violate the formula are thus compared by the violation
+    of b, not by the robustness of a.
     """
     match formula:
         case ir.Predicate():
@@ -46,10 +48,14 @@ def anchored(formula: ir.Formula) -> ir.Formula:
 def robustness_until(
     formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
 ) -> Tensor:
-    """Minimum over formulas of the upper bound on robustness given only the samples 0 to `last`: (batch,).
+    """Upper bound on the robustness of formulas given the samples 0 to `last`, (batch,).
 
-    `columns`: name -> samples (time, batch), as long as the formulas' horizon. `last`: one index, or
-    (batch,).
+    It holds for all continuations of these samples. The minimum over the formulas is returned.
+
+    Args:
+        formulas: formulas in negation normal form.
+        columns: name -> samples, (time, batch), as many as the longest formula needs.
+        last: index of the last known sample, one number or (batch,).
     """
     like = next(iter(columns.values()))
     index = torch.arange(len(like), device=like.device)[:, None].expand(like.shape)
@@ -59,14 +65,16 @@ def robustness_until(
 
 
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """Minimum over the `anchored` formulas of the upper bound on robustness given each prefix of a trace.
+    """Upper bound on the robustness of formulas given each prefix of a trace; the minimum over the formulas.
 
     Args:
         formulas: the safety requirements.
         columns: name -> samples, (time, batch).
 
     Returns:
-        (time, batch); entry k is the bound given the samples 0 to k, so entries do not increase over time.
+        (time, batch); entry k is the bound over all continuations of the samples 0 to k, so entries do not
+        increase over time. Predicates on the initial state are treated as in `anchored`. +inf without
+        formulas.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

@@ -1,4 +1,4 @@
-"""Staged search for better plans, without and with robustness margins."""
+"""Search for better plans by the stages (search methods) of a guard, without and with robustness margins."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 
 class StagedSearch:
-    """Search by the stages of a guard, in order.
+    """Search for better plans: runs the stages (search methods) of a guard in order.
 
     Args:
         task: specification and system.
-        policy: continues prefixes.
+        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
         guard: name of the guard: "paper" or "full".
-        grid: values of the controls in prefixes; by default those of the system file.
+        grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision; the defaults of `Limits` if None.
     """
 
@@ -53,7 +53,7 @@ class StagedSearch:
         """Search for better plans in states whose plan was rejected.
 
         Args:
-            x: (agents, n) float64.
+            x: states, (agents, n) float64.
             plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
             previous: (agents, T, m), remainders of the previous plans.
 
@@ -76,16 +76,16 @@ class StagedSearch:
 
 
 class RelaxedSearch:
-    """Full guard with margins; if no plan has them, the safe plan with the largest margin is taken.
+    """Search of the guard "full" with robustness margins of safety requirements.
 
-    A safe plan with a smaller margin is better than a prefix that has the full margin for some steps and is
-    then unsafe: a rover beside a wall can stay there.
+    If no plan has the margins, the safe plan with the largest margin is taken. It is better than a prefix
+    that has the full margin for some steps and is then unsafe: a rover beside a wall can stay there.
 
     Args:
         task: specification without margins, and system.
         strict: the task with margins.
-        policy: continues prefixes.
-        grid: values of the controls in prefixes; by default those of the system file.
+        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
+        grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision.
     """
 
@@ -103,17 +103,18 @@ class RelaxedSearch:
 
     @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Search for better plans in states whose plan was rejected; verdicts are those of the strict task.
+        """Search for better plans in states whose plan was rejected; verdicts are those with margins.
 
         Args:
-            x: (agents, n) float64.
+            x: states, (agents, n) float64.
             plan: (agents, T, m), the policy's plan.
             previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan per agent: that of the full guard, or if its margin is too small, the safe plan with the
-            largest margin that was found. If already the present state has less than the margin, so has every
-            plan; the search then starts from plans that satisfy, or are safe, without margin.
+            One plan per agent: the best plan of the stages, or if it lacks the margin, the safe plan with the
+            largest margin that was found. If the present state itself lacks the margin, so does every plan;
+            the stages then search without margin, and a search for the largest margin starts from their
+            plans.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -135,7 +136,10 @@ class RelaxedSearch:
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """Plans of the guard without margins for agents `lacking` the margin; unjudged plans for others."""
+        """Plans of the stages without margins for the agents `lacking` the margin, moved towards the margin.
+
+        The other agents get unjudged plans. `lacking`: (agents,).
+        """
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]
         if len(rows):
@@ -148,7 +152,17 @@ class RelaxedSearch:
         return found
 
     def _closer(self, found: Candidates, rows: Tensor, x: Tensor, start: Tensor) -> Tensor:
-        """Search from `start`, (rows, T, m), put safe plans into `found`; return the rows without one."""
+        """Search from the plans `start` for safe plans with the largest margin, and put them into `found`.
+
+        Args:
+            found: plans of all agents; changed in place.
+            rows: indices of the agents to treat, (k,).
+            x: states of all agents, (agents, n).
+            start: starting plans, (k, T, m).
+
+        Returns:
+            The entries of `rows` without a safe plan.
+        """
         if not len(rows):
             return rows
         climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)

@@ -1,4 +1,4 @@
-"""Parallel training: local jobs, Ray, and several ranks for one training."""
+"""Parallel training: several runs at a time (local processes, Ray), or one run in several processes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
 
 
 def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
-    """Executor of a command: local processes, or a Ray cluster if an address is given.
+    """Return an executor of training jobs in local processes, or on a Ray cluster if an address is given.
 
     Args:
         workers: number of local processes.
-        cluster: its address; None for this machine.
-        cores: CPUs per job on a cluster, which limits how many run at a time.
+        cluster: address of the Ray cluster; None: local processes.
+        cores: CPUs reserved per job on a cluster, which limits the number of simultaneous jobs.
         gpus: GPUs per job on a cluster.
     """
     if cluster is None:

@@ -1,7 +1,8 @@
 """Job bundles for other machines: inputs are sent, and runs returned, as archives.
 
-A worker that shares the caller's file system runs in the caller's folders. Any other recreates them in a
-temporary folder, with every file under its whole path, so that references between files stay valid.
+A worker (machine that runs a job) with the caller's file system uses the caller's folders. Any other worker
+recreates them in a temporary folder, with every file under its whole path, so that references between files
+stay valid.
 """
 
 from __future__ import annotations
@@ -58,7 +59,11 @@ class JobBundle:
 
     @classmethod
     def of(cls, job: Job, cores: int) -> JobBundle:
-        """Bundle a job. Raises MissingError (R201) where its runs cannot be written."""
+        """Pack a job's input files and create its probe file.
+
+        Raises:
+            MissingError: R201, the folder of the job's runs cannot be written.
+        """
         folder, runs = Path.cwd(), _absolute(job.runs or RUNS)
         inputs = tuple(dict.fromkeys(map(_absolute, job.inputs)))
         probe = runs / f".probe-{secrets.token_hex(8)}"
@@ -75,7 +80,7 @@ class JobBundle:
         return all(Path(path).exists() for path in seen)
 
     def close(self) -> None:
-        """Remove the probe file."""
+        """Delete the probe file, which also asks a worker that shares the file system to save and stop."""
         with suppress(OSError):
             Path(self.probe).unlink(missing_ok=True)
 
@@ -105,14 +110,15 @@ class BundleResult:
 
 
 def _absolute(path: Path) -> Path:
-    """Absolute path without `..`; links are kept."""
+    """Absolute path without `..`; symbolic links are not resolved."""
     return Path(os.path.normpath(Path.cwd() / path))
 
 
 def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
-    """Store a run sent by a worker among the caller's runs, under the next free number.
+    """Store the run that a worker sent back, and return the result of its job.
 
-    A resumed run is overwritten.
+    A new run gets the next free number in the folder of runs; a resumed run is overwritten. A worker with the
+    caller's file system sends no run.
     """
     document = document_of(found.out)
     if found.run is not None:
@@ -132,7 +138,7 @@ def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
 
 
 def run_bundle(bundle: JobBundle) -> BundleResult:
-    """Run a job on this machine, in the caller's folders or in a copy of them."""
+    """Run a job on this machine (the worker), in the caller's folders or in a copy of them."""
     if bundle.version != __version__:
         said = f"{socket.gethostname()} has stlc {__version__}; {bundle.version} is needed"
         return BundleResult(_OTHER_VERSION, "", said, 0)
@@ -165,7 +171,10 @@ def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> Bund
 def _ran(
     arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
 ) -> BundleResult:
-    """Train in a subprocess; after Ctrl-C, or once the file `probe` is deleted, it saves and ends."""
+    """Train in a subprocess and return its result, without files.
+
+    After Ctrl-C, or once the file `probe` is deleted, the subprocess is asked to save and end.
+    """
     process = start(arguments, share, folder)
     try:
         out, said = _awaited(process, probe)
@@ -177,7 +186,13 @@ def _ran(
 
 
 def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:
-    """Output of a process, polled in short steps so that an interrupt by Ray is noticed."""
+    """Wait for a process to end and return its standard output and standard error.
+
+    It is polled in short steps, so that an interrupt by Ray is noticed.
+
+    Raises:
+        KeyboardInterrupt: the file `probe` has been deleted.
+    """
     while True:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=0.5)
@@ -187,7 +202,10 @@ def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, s
 
 @contextmanager
 def claimed(count: int) -> Iterator[frozenset[int]]:
-    """Claim cores that no other job on this machine uses; all cores if too few are free."""
+    """Context that reserves `count` cores which no other job on this machine uses; yields their numbers.
+
+    If too few are free, all cores are yielded.
+    """
     everything = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     try:
         import fcntl
@@ -221,12 +239,12 @@ def claimed(count: int) -> Iterator[frozenset[int]]:
 
 
 def mirrored(root: Path, path: str) -> Path:
-    """Location of an absolute path in the worker's copy."""
+    """Path of the copy of `path`, an absolute path on the caller's machine, in the worker's folder `root`."""
     return root / Path(path).relative_to(Path(path).anchor)
 
 
 def pack(entries: dict[str, Path]) -> bytes:
-    """Archive of files and folders under their names. Links are followed."""
+    """Pack files and folders into a compressed archive: name in the archive -> path. Links are followed."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz", dereference=True, compresslevel=1) as archive:
         for name, path in entries.items():
@@ -235,7 +253,11 @@ def pack(entries: dict[str, Path]) -> bytes:
 
 
 def unpack(data: bytes, folder: Path) -> None:
-    """Extract an archive into a folder. Raises `tarfile.FilterError` for paths outside it."""
+    """Extract an archive into a folder.
+
+    Raises:
+        tarfile.FilterError: the archive contains a path outside the folder.
+    """
     with tarfile.open(fileobj=io.BytesIO(data), mode="r:gz") as archive:
         archive.extractall(folder, filter="data")
 
@@ -246,7 +268,9 @@ def unpack(data: bytes, folder: Path) -> None:
 def input_files(
     path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
 ) -> tuple[Path, ...]:
-    """Input files of a training that can be read; errors in them are reported by the training itself.
+    """Paths of the input files of a training.
+
+    The files that a file with errors names may be missing; the training itself reports the errors.
 
     Args:
         path: path of the specification.

@@ -1,8 +1,9 @@
 """Data-parallel training by several processes (`torchrun`): ranks, collectives, agreement.
 
 Every rank draws its own states, searches on its own, and learns from the mean of all gradients, so that all
-ranks have the same weights. Decisions that must be equal (steps, margin, when to save, when to stop) are
-agreed on, and only the first rank writes the run. gloo communicates tensors on CPUs, nccl those on GPUs.
+ranks have the same weights. Collective operations make decisions equal that must be (steps, margin, when to
+save, when to stop), and only the first rank writes the run. gloo communicates tensors on CPUs, nccl those on
+GPUs.
 """
 
 from __future__ import annotations
@@ -32,12 +33,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Ranks:
-    """This process among the ranks of a training; a single one does not communicate.
+    """Process of a training that is distributed over several processes (ranks).
+
+    If it is the only one, its collective operations do not communicate.
 
     Attributes:
         rank: index of this process, from 0.
         size: number of processes.
-        local: rank on this machine.
+        local: index of this process on its machine.
     """
 
     rank: int = 0

@@ -34,7 +34,7 @@ class Setup:
 
     Attributes:
         task: specification and system.
-        policy: continues prefixes.
+        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
         grid: values of the controls in prefixes, and lengths of prefixes.
         limits: computational limits of a decision.
         guard: name of the guard.
@@ -50,7 +50,7 @@ class Setup:
 
     @property
     def enough(self) -> float:
-        """Target robustness at which the search for a plan ends."""
+        """Robustness at which the search for a plan ends."""
         return TO_SPARE * self.task.system.decl.objective.gamma
 
 
@@ -63,7 +63,8 @@ class Rejected:
         plan: the policy's plans, (agents, T, m); finite.
         previous: remainders of the previous plans, (agents, T, m), or None.
         best: the best plans of the stages that have run, (agents,).
-        tried: plans that the previous stage judged, by groups of agents; empty if it keeps none.
+        tried: plans that the previous stage judged and stored for the next one, by groups of agents; empty if
+            it stored none.
     """
 
     x: Tensor
@@ -90,7 +91,7 @@ class GuardStage(ABC):
     """Stage of a guard: one method to find a better plan.
 
     Attributes:
-        turns: name of a guard -> position of the stage in the guard's order.
+        turns: name of a guard -> position of the stage among the guard's stages.
     """
 
     turns: ClassVar[Mapping[str, int]]
@@ -101,17 +102,17 @@ class GuardStage(ABC):
 
     @abstractmethod
     def wanted(self, best: Candidates) -> Tensor:
-        """Mask of the agents that the stage may help, given their best plans until now: (agents,)."""
+        """Mask of the agents for which the stage is to search, (agents,), given their best plans so far."""
 
     @abstractmethod
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Propose a plan for each of the rejected agents with indices `rows`, (k,): candidates (k,).
+        """Search for a plan for each rejected agent with an index in `rows`, (k,); return candidates (k,).
 
         The stage may store the plans that it judged in `rejected.tried` for the next stage.
         """
 
 
 def stages_of(guard: str) -> tuple[type[GuardStage], ...]:
-    """The stages of a guard in order."""
+    """The classes of a guard's stages in order."""
     found = [stage for stage in map(STAGES.get, STAGES) if guard in stage.turns]
     return tuple(sorted(found, key=lambda stage: stage.turns[guard]))

@@ -64,7 +64,7 @@ class GradientAscent:
     Args:
         task: specification and system.
         generator: random numbers of the perturbations, which are drawn once.
-        enough: target robustness; the search for a state ends once one of its plans has it.
+        enough: target robustness; the search for a state ends once one of its plans reaches it.
     """
 
     def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
@@ -89,7 +89,7 @@ class GradientAscent:
 
         Args:
             x: states, (agents, n) float64.
-            places: starting plans, (agents, places, T, m); finite.
+            places: starting plans, (agents, places, T, m); finite. The first is the policy's.
             until: deadline, as a reading of `perf_counter()`.
         """
         if len(x) == 0:
@@ -115,15 +115,19 @@ class GradientAscent:
         return best
 
     def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """The best plans of one round of ascent, (agents, KEPT, T, m), and their values, the best first."""
+        """Run one round of ascent; return the best plans, (agents, KEPT, T, m), and their values, best first.
+
+        Values (agents, KEPT) are those of `_worth`. `plans`: (agents, k, T, m). `rate`: initial step size.
+        """
         plans, value = self._raised(x, plans, rate, until)
         order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
         return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
-        """Plans (agents, T, m) on the line from the policy's plans `own` to the repaired plans `found`.
+        """Move repaired plans `found` back towards the policy's plans `own`, (agents, T, m) each.
 
-        Taken is the one nearest to the policy's plan that has the target robustness.
+        Of `SHARES` points on the line between both, the nearest to `own` with the target robustness is
+        returned.
         """
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
@@ -134,7 +138,11 @@ class GradientAscent:
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Ascend from plans (agents, k, T, m); return the best iterate of each and its value, (agents, k)."""
+        """Run gradient ascent from plans (agents, k, T, m).
+
+        Returns:
+            The best iterate from each plan, (agents, k, T, m), and its value (see `_worth`), (agents, k).
+        """
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
         best, value = rows.copy(), np.full(len(rows), -np.inf)
@@ -163,8 +171,8 @@ class GradientAscent:
     def _worth(self, each: Numbers) -> Numbers:
         """Values by which plans are compared, from their robustness per requirement, (rows, R) -> (rows,).
 
-        Robustness of phi plus `APART` if phi holds; robustness of phi if only phi_safe holds; else robustness
-        of phi_safe minus `APART`.
+        The value is the robustness of the specification plus `APART` if the plan satisfies it; its robustness
+        if the plan is only safe; else the robustness of the safety requirements minus `APART`.
         """
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
@@ -175,8 +183,8 @@ class GradientAscent:
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
         """Scaled robustness per requirement, (rows, R), and a function for its gradient by the plans.
 
-        NaN counts as -inf. The function maps weights (rows, R) to the gradient of the weighted sum
-        (vector-Jacobian product), (rows, T, m).
+        A robustness of NaN becomes -inf. The function maps weights (rows, R) to the gradient of the weighted
+        sum of the robustness values (vector-Jacobian product), (rows, T, m).
         """
         if self._native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
@@ -195,7 +203,7 @@ class GradientAscent:
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
-        """Robustness per requirement, (rows, R), and its vector-Jacobian product, as `_judged`, in torch."""
+        """Unscaled robustness per requirement, (rows, R), and gradient function of `_judged`, by torch."""
         with torch.enable_grad():
             u = u.requires_grad_()
             columns = self.task.system.rollout_columns(x, u, StraightThrough(SLOPE))
@@ -210,14 +218,17 @@ class GradientAscent:
         return each.detach().clone().numpy(), pull
 
     def _changed(self, plans: Numbers) -> Numbers:
-        """The plans (agents, k, T, m) and perturbations of them, (agents, NEAR, T, m)."""
+        """Plans (agents, k, T, m) and random perturbations of them, together (agents, NEAR, T, m)."""
         agents, places, *shape = plans.shape
         changed = plans[:, :, None] + self._changes[: NEAR // places]
         changed[:, :, 1:] = self._bounded(changed[:, :, 1:])
         return changed.reshape(agents, -1, *shape)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
-        """Random perturbations of plans, (count, T, m): shifts or noise over a time; the first is zero."""
+        """Random perturbations of plans, (count, T, m): constant or white over a random interval of time.
+
+        The first perturbation is zero.
+        """
         steps, controls = self.task.horizon, len(self._low)
         begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()
         length = torch.randint(1, steps + 1, (count, 1, controls), generator=generator).numpy()
@@ -240,7 +251,7 @@ class GradientAscent:
 
 
 class GradientRefine(GuardStage):
-    """Gradient ascent from the policy's plan and from the previous plan, within half of the decision time."""
+    """Guard stage: gradient ascent from the policy's and the previous plan, in half of the decision time."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 10}
 
@@ -249,11 +260,11 @@ class GradientRefine(GuardStage):
         self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """All agents are helped."""
+        """Mask of all agents: the stage always searches."""
         return torch.ones_like(best.is_safe)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best refined plan of each agent; the two best are left for the next stage."""
+        """The best refined plan of each agent; the two best are stored for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
         raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))

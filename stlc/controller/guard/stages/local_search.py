@@ -1,4 +1,4 @@
-"""Local search on the exact robustness, starting from the plans of the previous stage."""
+"""Local search (random changes of plans) on the exact robustness, from the plans of the previous stage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 class LocalSearch(GuardStage):
-    """Local search for a plan that satisfies phi, or if nothing safe is found, phi_safe alone."""
+    """Guard stage: local search for a plan that satisfies the specification.
+
+    From an unsafe result, a second search is for the requirements tagged `@safety` alone.
+    """
 
     turns: ClassVar[Mapping[str, int]] = {"full": 20}
 
@@ -35,7 +38,7 @@ class LocalSearch(GuardStage):
         return best.rho < self.whole.enough
 
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
-        """The best plan that the searches from all starting plans have found."""
+        """The best of each agent's present plan and the results of local searches from all starting plans."""
         x, found = rejected.x[rows], rejected.best.of(rows)
         every = torch.arange(len(rows), device=rows.device)
         found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))
@@ -50,9 +53,10 @@ class LocalSearch(GuardStage):
 def best_climbed(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """Best plan per agent of local searches from all starting plans: (agents, k, T, m) -> (agents,).
+    """Run a local search from each starting plan, (agents, k, T, m); return the best plan per agent.
 
-    `task`: task whose specification judges the plans found; that of `searcher` if None.
+    `task`: task that judges the plans found; that of `searcher` if None. `tries`: number of plans judged per
+    search.
     """
     found = climbed_from(searcher, x, starts, tries, task)
     return found.pick(rank(found).argmax(1))
@@ -61,9 +65,10 @@ def best_climbed(
 def climbed_from(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
-    """Results of local searches from each starting plan: (agents, k, T, m) -> candidates (agents, k).
+    """Run a local search from each starting plan, (agents, k, T, m); return their results, (agents, k).
 
-    `task`: task whose specification judges the plans found; that of `searcher` if None.
+    `task`: task that judges the plans found; that of `searcher` if None. `tries`: number of plans judged per
+    search.
     """
     rows = x.repeat_interleave(starts.shape[1], 0)
     plans = searcher.at_once(rows, starts.flatten(0, 1), tries=tries).plans.to(x.device)
@@ -73,7 +78,8 @@ def climbed_from(
 def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
     """Starting plans for the agents with indices `rows`, (k, starts, T, m).
 
-    They are the plans that the previous stage tried for all agents; else the policy's and the previous plan.
+    They are the plans that the previous stage stored if it did so for all agents; else the policy's plan and
+    the previous plan, if there is one.
     """
     if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
         order = rejected.tried[0].rows.argsort()

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 class LongestSafePrefix(GuardStage):
-    """Plan with the longest safe prefix; ties are broken by robustness, then by the latest violation."""
+    """Guard stage: the plan with the longest safe prefix; among equal ones, that of highest robustness.
+
+    Equal robustness is decided by the latest violation.
+    """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
 
@@ -33,14 +36,14 @@ class LongestSafePrefix(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """One plan per agent, chosen among the plans of prefix shooting."""
+        """Of the plans that prefix shooting tried, the one with the longest safe prefix for each agent."""
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
         return found.of(rows)
 
     def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
-        """Plans of prefix shooting for the agents `rows`: stored ones, others recomputed."""
+        """Plans of prefix shooting for the agents `rows`: stored ones, or else recomputed ones."""
         missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
         missing[rows] = True
         for tried in rejected.tried:

@@ -3,8 +3,8 @@
 For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a random
 sample of them if these are too many, is applied from the present state, and the policy plans from its end.
 The first T0 with a plan that satisfies phi, or else phi_safe, is chosen. One addition to the paper (decision
-37): the remainder of the previous plan is a candidate too, so that a safe plan is not lost after its first
-action.
+record 37 in `docs/decisions`): the remainder of the previous plan is a candidate too, so that a safe plan is
+not lost after its first action.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ HANDED_ON = 65_536
 
 
 class PrefixShooting(GuardStage):
-    """Plan with the shortest prefix that allows it to satisfy phi, or else phi_safe.
+    """Guard stage: the plan with the shortest prefix after which the policy can satisfy the specification.
 
-    Among prefixes of that length the order is by robustness, then by the performance terms of the objective
-    (because robustness does not differ where a deadline cannot be met), then by closeness to the policy's
-    plan.
+    If no prefix of a length leads to such a plan, a safe plan is accepted. Among the plans of the shortest
+    such length the order is by robustness, then by the performance cost of the objective (because robustness
+    does not differ where a deadline cannot be met), then by closeness to the policy's plan.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
@@ -48,7 +48,10 @@ class PrefixShooting(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan of the smallest T0 that has a satisfying or safe one; else an unjudged plan."""
+        """The best plan of the smallest prefix length T0 with a satisfying or safe plan, for each agent.
+
+        An agent without such a plan gets an unjudged one.
+        """
         deadline = Deadline() if self.patient else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
         todo = torch.arange(len(rows), device=rows.device)
@@ -73,11 +76,11 @@ class PrefixShooting(GuardStage):
     def candidates(
         self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
     ) -> Iterator[tuple[Tensor, Candidates]]:
-        """Candidate plans of one prefix length T0 for the agents `rows[todo]`, group by group.
+        """Candidate plans of the prefix length T0 = `length` for the agents `rows[todo]`, group by group.
 
         Yields:
-            Positions of the group's agents, (k,), and their candidates, (k, choices). Choice 0 has the prefix
-            of the policy's own plan; the last choice is the remainder of the previous plan.
+            The entries of `todo` in a group, (k,), and their agents' candidates, (k, choices). Choice 0 has
+            the prefix of the policy's own plan; the last choice is the remainder of the previous plan.
         """
         prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
         for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
@@ -92,9 +95,11 @@ class PrefixShooting(GuardStage):
             yield group, found
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
-        """Plans that continue prefixes, with verdicts, in batches of at most `grid.batch` trajectories.
+        """Let the policy plan from the end of each prefix, (M, T0, m), and judge the plans: (agents, M + 1).
 
-        If there is a single agent, the deadline is checked after each batch.
+        The first prefix is that of the policy's own plan `own`, (agents, T, m). At most `grid.batch`
+        trajectories are computed at a time; for a single agent, the computation ends after a batch if the
+        deadline is over.
         """
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)

@@ -1,4 +1,4 @@
-"""Random restarts: a search for phi_safe alone that does not use the policy."""
+"""Random restarts: a search for a safe plan that does not use the policy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Restarts(GuardStage):
-    """Plans from `feasibility.solve` with random starting plans, until the deadline."""
+    """Guard stage: search for a safe plan by `feasibility.solve` until the deadline."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 30}
 
@@ -24,7 +24,7 @@ class Restarts(GuardStage):
         self._safety = safety_task(setup.task) if setup.task.compiled.safety else setup.task
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Mask of the agents without a safe plan."""
+        """Mask of the agents without a safe plan; all False if `Limits.rescue` is False."""
         return ~best.is_safe & self.rescue
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:

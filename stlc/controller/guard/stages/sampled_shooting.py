@@ -1,7 +1,7 @@
 """Sampled shooting: a few sampled actions, then the policy's plan from there.
 
-The paper's backup policy tries all prefixes, T0 by T0. Here a sample of each length is judged in one batch,
-and local search starts from the best plans.
+The paper's backup policy tries all prefixes of the length T0 = 1, then those of the next length, and so on.
+Here samples of all lengths are judged in one batch, and local search starts from the best plans.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 class SampledPrefixes:
-    """Prefixes sampled once for one task and policy.
+    """Prefixes (first actions of plans), sampled once; the policy plans from their ends.
 
     Args:
         task: specification and system.
-        policy: continues the prefixes.
+        policy: policy that plans from the ends of the prefixes.
         grid: values of the controls, and lengths of prefixes.
         most: maximum number of prefixes per length; if the grid has more, a random sample is used.
     """
@@ -48,7 +48,9 @@ class SampledPrefixes:
         self._most = max(grid.batch // max(len(self.heads), 1), 1)
 
     def finished(self, x: Tensor) -> Candidates:
-        """Plans that continue all prefixes from states (agents, n) float64, with verdicts: (agents, k).
+        """Let the policy plan from the ends of all prefixes, and judge the plans: (agents, k).
+
+        `x`: states in which the prefixes begin, (agents, n) float64.
 
         They are computed in batches of at most `grid.batch` trajectories.
         """
@@ -73,7 +75,7 @@ class SampledPrefixes:
 
 
 class SampledShooting(GuardStage):
-    """Best plan of sampled prefixes, and of local searches from some of these plans."""
+    """Guard stage: the best plan of sampled prefixes, and of local searches from the best of these."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 40}
 
@@ -83,15 +85,16 @@ class SampledShooting(GuardStage):
         self._searcher = Searcher(setup.task, setup.generator, enough=setup.enough)
 
     def wanted(self, best: Candidates) -> Tensor:
-        """Mask of the agents whose plan does not satisfy phi.
+        """Mask of the agents whose plan does not satisfy the specification.
 
-        With `limits.rescue`, only agents with a safe plan; another stage has searched for phi_safe alone.
+        If `Limits.rescue` is True, agents without a safe plan are excluded, because the stage of random
+        restarts has already searched for one. All False if the grid has no prefixes.
         """
         none = len(self.prefixes.heads) == 0
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan per agent; an unsafe one is returned unjudged, so that it replaces nothing."""
+        """The best plan per agent; instead of an unsafe one an unjudged one, which replaces nothing."""
         found = Candidates.unjudged(rejected.plan[rows])
         if deadline.over:
             return found
