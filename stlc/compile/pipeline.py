@@ -266,10 +266,11 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Replace absolute operators (`always@[a, b]`, whose interval counts from the start of the mission).
+        """Replace the absolute operators of a requirement, and for training its past operators.
 
-        For recorded traces the mission starts with the first sample. For training, both absolute and past
-        operators are replaced by formulas over added states.
+        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission; for
+        recorded traces that is the first sample. For training, both kinds of operators are replaced by
+        formulas over added states.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

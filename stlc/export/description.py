@@ -69,7 +69,7 @@ class CostTerm:
 
 
 def cost_terms(task: Task) -> Iterator[CostTerm]:
-    """Yield the summands of `Task.cost`."""
+    """Yield the summands of a plan's cost, whose sum is `Task.cost`."""
     states, controlled = task.system.objective
     compiled, samples, goals = task.compiled, task.horizon + 1, task.pending_goals
     gamma = ir.Const(task.system.decl.objective.gamma)

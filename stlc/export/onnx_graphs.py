@@ -72,7 +72,7 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
 
 class _Rollout:
-    """Rollout that is computed stage by stage, for all steps of a stage at once where possible.
+    """Rollout that is computed stage by stage, for all time steps at once where possible.
 
     `states` holds the states computed by previous stages, (steps + 1, batch). `now` holds all values at the
     start of each step, intermediate variables included: (steps, batch), or (1, batch) if constant in time.
@@ -88,7 +88,7 @@ class _Rollout:
         self.now |= controls
 
     def run(self, stage: RolloutStage) -> None:
-        """Compute a stage: states and variables that depend only on earlier stages and on one another."""
+        """Compute the states and variables of a stage, which depend only on earlier stages or each other."""
         if stage.early:
             self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
         for state, source in stage.follows.items():
@@ -327,7 +327,7 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
 
 
 def rank(found: Verdicts) -> Value:
-    """Rank of plans, as by `stlc.controller.problem.task.rank`, (1, batch)."""
+    """Rank of plans, (1, batch): larger is better; equal to `stlc.controller.problem.task.rank`."""
     rho, cost = found.rho, found.cost
     unknown = cost.apply("IsNaN", kind="bool")
     paid = ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None)

@@ -157,10 +157,11 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans for one prefix length T0, with verdicts; safety robustness on prefixes with `falls`.
+        """All plans for one prefix length T0, with verdicts.
 
         The first T0 controls of a plan are a prefix from the backup policy's grid; in the first plan they are
-        those of the policy's own plan. The later controls come from the policy.
+        those of the policy's own plan. The later controls come from the policy. With `falls`, the safety
+        robustness on every prefix of the plans is computed as well.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
@@ -170,10 +171,10 @@ class Guarding(nn.Module):
         return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
-        """Plans that begin with controls `heads` (B, C, L, m) and continue by the policy, and verdicts.
+        """Plans that begin with the controls `heads` and continue by the policy, and their verdicts.
 
-        Returns plans, rho, safe, requirements, cost, and with `falls` the safety robustness on every prefix:
-        (B, C, …) each.
+        `heads` is (B, C, L, m): for each state C sequences of L controls. Returns plans, rho, safe,
+        requirements, cost, and with `falls` the safety robustness on every prefix: (B, C, …) each.
         """
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
@@ -192,7 +193,8 @@ class Guarding(nn.Module):
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
     """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
 
-    Among equal plans the one of highest robustness is taken, then the one with the latest violation.
+    Among plans that keep them equally long, the highest robustness decides, then the least violation,
+    averaged over all prefixes.
     """
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)

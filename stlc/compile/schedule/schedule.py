@@ -128,7 +128,7 @@ class IndexRange:
 
     @property
     def single(self) -> bool:
-        """True for a single instant."""
+        """True if the range consists of a single instant."""
         return bool(self.start == self.last)
 
     @property

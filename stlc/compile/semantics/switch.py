@@ -47,7 +47,7 @@ class Switch(Protocol):
 @final
 @dataclass(frozen=True, slots=True)
 class Hard:
-    """Exact switching: 0 or 1, without gradient and without tolerance."""
+    """Exact switch: conditions are 0 or 1, without gradient and without tolerance."""
 
     exact: ClassVar[bool] = True
 
@@ -67,9 +67,9 @@ class Hard:
 @final
 @dataclass(frozen=True, slots=True)
 class Tanh:
-    """Smooth switching by `(1 + tanh(w rho)) / 2 = sigmoid(2 w rho)` (Meng and Fan 2023, Eq. 6).
+    """Smooth switch by `(1 + tanh(w rho)) / 2 = sigmoid(2 w rho)` (Meng and Fan 2023, Eq. 6).
 
-    `if cond then a else b` becomes I a + (1 - I) b, where I is the indicator above.
+    `if cond then a else b` becomes I a + (1 - I) b, where I is the value above for the margin rho of `cond`.
     """
 
     exact: ClassVar[bool] = False
@@ -92,7 +92,7 @@ class Tanh:
 @final
 @dataclass(frozen=True, slots=True)
 class StraightThrough:
-    """Exact switching whose gradient is that of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
+    """Exact switch whose gradient is that of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
 
     A choice has the value and gradient of the branch taken, plus the gradient of the condition.
     """
@@ -101,7 +101,7 @@ class StraightThrough:
     slope: float = 10.0
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """Return 1 where the condition holds, else 0, with the smooth gradient."""
+        """Return 1 where the condition holds, else 0, with the gradient of `(1 + tanh(slope rho)) / 2`."""
         return ops.straight_through(rho, strict, self.slope)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:

@@ -62,7 +62,7 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Yield the robustness at instants at which a bound value is undefined, in chunks.
+        """Yield the robustness at instants at which a value bound by `freeze` is undefined, in chunks.
 
         A predicate that reads an undefined value is unknown if the trace is open (continues beyond its last
         sample), and false otherwise.
@@ -196,7 +196,11 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 
 
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
-    """Return `body` with each predicate that reads an undefined value, one of `names`, made constant."""
+    """Return `body` with each predicate that reads an undefined value, one of `names`, made constant.
+
+    If the trace is open (continues beyond its last sample), the constant is the bound that is computed: true
+    for an upper bound, false for a lower one. Otherwise the inequality of the predicate counts as false.
+    """
     match body:
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:

@@ -100,10 +100,10 @@ def _domain(
 
 @lru_cache(maxsize=512)
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the cached plan that evaluates `formulas` at the instants `run` of traces of one length.
+    """Return the evaluation plan of `formulas` at the instants `run`, for traces of one length; cached.
 
     Raises:
-        ValueError: an instant, or a window if `domain.end` is "strict", lies beyond the trace.
+        ValueError: an instant lies outside the trace, or a window does and `domain.end` is "strict".
     """
     samples = domain.samples
     if run.start < 0 or (run.last >= samples and not domain.open):
@@ -147,7 +147,7 @@ def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list
 
 
 def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps of a plan, `(count, batch)` each.
+    """Return the values of all steps of an evaluation plan, `(count, batch)` each.
 
     Raises:
         TraceError: E306, more than `MAX_BEYOND` instants, or `MAX_VALUES` values, lie beyond the trace.

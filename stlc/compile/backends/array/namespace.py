@@ -76,7 +76,7 @@ class Ops(Protocol):
     maximum: Callable[..., Array]
 
     def sqrt(self, x: Array) -> Array:
-        """Square root; its gradient at 0 is 0, so that distances of 0 stay finite."""
+        """Square root; its gradient at 0 is 0, so that the gradient of a distance of 0 is finite."""
 
     def pow(self, a: Array | float, b: Array | float) -> Array:
         """`a ^ b`."""
@@ -175,7 +175,7 @@ class Ops(Protocol):
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
-        """Key of arrays that can share converted constants (such as dtype and device)."""
+        """Key of an array, such as (dtype, device): arrays with equal keys can share converted constants."""
 
     def constant(self, value: float, like: Array) -> Array | float:
         """Convert a number to the form that is fastest in operations with `like`."""
@@ -205,4 +205,4 @@ class Ops(Protocol):
         """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context manager: division by zero and invalid operations give inf and NaN without a warning."""
+        """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""

@@ -175,7 +175,7 @@ class NumpyOps:
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context manager: division by zero and invalid operations give inf and NaN without a warning."""
+        """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
 

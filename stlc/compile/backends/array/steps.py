@@ -90,7 +90,7 @@ class ArrayPlan:
 
 
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the plan that evaluates `formulas` at the instants `run`: its steps and their programs."""
+    """Return the evaluation plan of `formulas` at the instants `run`: the steps and their programs."""
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
@@ -98,10 +98,10 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
 
 
 def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
-    """Group the predicates over the same instants into programs; return them, and each predicate's source.
+    """Group the predicates over the same instants into programs.
 
-    The source has the predicate's step number as its key. A predicate whose margin is just a signal needs no
-    program.
+    Returns the programs, and a mapping from the step number of a predicate to the source of its values. A
+    predicate whose margin is just a signal needs no program.
     """
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
     predicates: dict[int, StepSource] = {}
@@ -231,7 +231,8 @@ class Machine:
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
         """Function for an operator over future windows at the instants `run`.
 
-        On an open trace, an unbounded window that starts beyond the final length of the trace is unknown.
+        On an open trace, an operator has an unknown value where its unbounded window starts beyond the final
+        length of the trace.
         """
         rows = run.count
         beyond = neutral(pick)

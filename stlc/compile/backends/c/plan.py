@@ -173,7 +173,8 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 class _Scope(StepScope):
     """Scope of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
 
-    `read` names the values that change from iteration to iteration; `own` numbers the steps in the scope.
+    `read` names the values that change from iteration to iteration; `own` lists the step numbers in the
+    scope.
     """
 
     read: frozenset[str] = frozenset()
@@ -356,7 +357,7 @@ def _offset(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
-    """Names of the frozen values and signals that a formula reads and does not bind itself."""
+    """Names of the signals that a formula reads, and of the values that an enclosing `freeze` binds."""
     match formula:
         case ir.Predicate(num):
             return frozen_in(num) | columns_of(num)

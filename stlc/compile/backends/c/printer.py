@@ -261,7 +261,7 @@ class _Extremum(StepForm):
 
 
 class _AtStart(StepForm):
-    """C code of the value at the first sample."""
+    """C code of a formula's value at the first sample, which is the same at every instant."""
 
     def forward(self) -> list[str]:
         return [f"{loop(self.run)} LANE {self.out['k']} = {self.args[0][0]};"]

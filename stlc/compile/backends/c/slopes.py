@@ -59,7 +59,7 @@ class SlopeWriter(NumberWriter):
         """Return C statements that compute expressions and add up the gradients of the signals in them.
 
         Args:
-            outputs: pairs of an expression and the C expression of the derivative with respect to it.
+            outputs: pairs of an expression and the C expression of the output's derivative by its value.
         """
         seeds: dict[str, str] = {}
         for num, own in outputs:

@@ -101,7 +101,7 @@ Operand: TypeAlias = SymbolicColumn | float
 @final
 @dataclass(frozen=True, slots=True)
 class StackedColumns:
-    """Several time series, stacked along a new first axis to take an extremum over it."""
+    """Several time series, stacked along a new first axis, over which an extremum is computed."""
 
     parts: tuple[SymbolicColumn, ...]
 
@@ -112,7 +112,7 @@ class StackedColumns:
         return self.parts[index]
 
     def rows(self) -> list[SymbolicColumn]:
-        """The stacked time series."""
+        """List of the stacked time series."""
         return list(self.parts)
 
 
@@ -190,7 +190,7 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask` is true, else -inf; +-`GREAT` where the mask is symbolic, not 0 or 1."""
+        """+inf where `mask` is true, else -inf; +-`GREAT` where the mask depends on variables."""
         rows = []
         for each in mask.rows():
             size = math.inf if each.entries.is_constant() else GREAT

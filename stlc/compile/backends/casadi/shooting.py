@@ -57,7 +57,7 @@ class Eased:
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """Smooth indicator `(1 + tanh(w rho)) / 2` of the margin `rho`.
 
-        Its slope w is `sharpness`, but at most that of the switch, which is also the default.
+        w is the `sharpness` of the switch, or the argument `sharpness` if that is less.
         """
         width = self.sharpness if sharpness is None else min(self.sharpness, sharpness)
         return ops.sigmoid(rho * (2.0 * width))

@@ -3,9 +3,9 @@
 Signals that no control affects are constants, and expressions of constants are evaluated at once. The
 encoding is tight or relaxed. In a tight encoding the conditions in the dynamics hold or fail with a margin of
 at least `MARGIN`, so that every solution is a plan. A relaxed encoding has every satisfying plan among its
-solutions, so that its infeasibility proves that there is none. Both are exact up to `MARGIN` except for
-norms, whose circles are replaced by polygons with `SIDES` sides, such that a condition becomes stronger in
-the tight encoding and weaker in the relaxed one.
+solutions, so that its infeasibility proves that no plan satisfies the specification. Both are exact up to
+`MARGIN` except for norms, whose circles are replaced by polygons with `SIDES` sides, such that a condition
+becomes stronger in the tight encoding and weaker in the relaxed one.
 """
 
 from __future__ import annotations

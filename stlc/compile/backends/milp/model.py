@@ -157,7 +157,7 @@ class Model:
         return self.variable(0.0, 1.0, integer=True)
 
     def is_binary(self, index: int) -> bool:
-        """True for a binary variable."""
+        """True if the variable with this index is binary."""
         return self._integer[index] and self._lower[index] == 0.0 and self._upper[index] == 1.0
 
     def bounds(self, form: Affine) -> tuple[float, float]:

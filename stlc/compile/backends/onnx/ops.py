@@ -1,7 +1,7 @@
 """Array operations on symbolic values, and robustness: operations are recorded as an ONNX graph.
 
 Switching and robustness are exact; gradients and smooth extrema are not supported. Numbers are float64. If
-the runtime has a function in float32 only (`atan`), one Newton step gives full precision.
+the ONNX runtime has a function in float32 only (`atan`), one Newton step gives full precision.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Recorder of ONNX graphs: symbolic arrays and the operations between them.
 
 A `Value` behaves like an array in the evaluators: shape, slicing along time, arithmetic. Each operation
-becomes a node of the graph that the value belongs to; equal nodes are shared. `stlc.export.onnx_file` writes
+becomes a node of the graph that the value belongs to; equal nodes are shared. `stlc.export.onnx_write` writes
 graphs to files; this module does not import ONNX.
 """
 
@@ -288,7 +288,8 @@ class Value:
         return self.transposed(1, 0)
 
     def expand(self, *shape: int, like: Value | None = None) -> Value:
-        """Expand axes of length 1 to a shape; a `BATCH` (unknown length) in it is the last axis of `like`."""
+        """Expand axes of length 1 to a shape; `BATCH` in it is the unknown length of the last axis of `like`.
+        """
         if self.shape == shape:
             return self
         parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]

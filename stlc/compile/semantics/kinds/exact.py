@@ -16,8 +16,9 @@ from stlc.compile.semantics.protocol import Associative
 class Exact(Associative):
     """Exact minimum and maximum (Fainekos and Pappas 2009; Donzé and Maler 2010).
 
-    Sound: a positive value means satisfied, a negative one violated, and the verdict is unchanged while no
-    predicate changes by as much as the value. The subgradient is that of operands that attain the extremum.
+    Sound: a positive value means satisfied, a negative one violated, and the verdict does not change as long
+    as every predicate changes by less than the magnitude of the value. The subgradient is that of operands
+    that attain the extremum.
     """
 
     exact: ClassVar[bool] = True
