@@ -288,8 +288,7 @@ class Value:
         return self.transposed(1, 0)
 
     def expand(self, *shape: int, like: Value | None = None) -> Value:
-        """Expand axes of length 1 to a shape; `BATCH` in it is the unknown length of the last axis of `like`.
-        """
+        """Expand axes of length 1 to a shape; `BATCH` in it is the unknown length of `like`'s last axis."""
         if self.shape == shape:
             return self
         parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]
