@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from stlc.trace import Trace
 
     def compile(spec: ast.Spec, system: System) -> Task:
-        """Compile a specification for a system: the package `stlc.compile` called as a function."""
+        """Compile a specification for a system: the package `stlc.compile`, called as a function."""
 
 else:
     import stlc.compile as compile
@@ -81,10 +81,12 @@ def __dir__() -> list[str]:
 
 
 def load(path: Path | str) -> ast.Spec:
-    """Read and parse a specification; the path is kept to find the system that the specification names.
+    """Read and parse a specification file.
+
+    Its path is stored in the result, because a system that the specification names is looked for beside it.
 
     Raises:
-        UsageError: there is no such file.
+        UsageError: U102, there is no such file.
         SpecError: the text is not a specification; the error carries all diagnostics.
     """
     from stlc.files import find_spec, read_source
@@ -94,7 +96,7 @@ def load(path: Path | str) -> ast.Spec:
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:
-    """Parse the text of a specification, called `name` in messages. Raises SpecError."""
+    """Parse the text of a specification; `name` names the text in messages. Raises SpecError."""
     from stlc.grammar.parse.parser import parse as parse_source
     from stlc.source import Source
 
@@ -102,13 +104,15 @@ def parse(text: str, name: str = "<text>") -> ast.Spec:
 
 
 class _CallablePackage(ModuleType):
-    """The package `stlc.compile`, which is also the function of that name.
+    """Class of the package `stlc.compile`, which makes the package callable as a function.
 
-    Python looks up `__call__` in the class, so the package object gets a callable class.
+    Python looks up `__call__` in the class of an object, so the package gets this class.
     """
 
     def __call__(self, spec: ast.Spec, system: System) -> Task:
-        """Compile the specification for the system, whose states are extended by the specification's timers.
+        """Compile the specification for the system; return the task, for training, planning and simulation.
+
+        The states of the system are extended by the timers that the specification needs.
 
         Raises:
             SpecError: the specification is invalid, or does not fit the system.

@@ -1,4 +1,4 @@
-"""`python -m stlc` is `stlc`."""
+"""Execution of stlc as `python -m stlc`."""
 
 import sys
 
@@ -6,7 +6,7 @@ from stlc import stopping
 
 
 def main() -> int:
-    """Run the command line; Ctrl-C while it is being imported is an interruption like any other."""
+    """Run the command line and return its exit code; Ctrl-C while modules are imported gives 130."""
     try:
         stopping.arm()
         from stlc.cli.framework.app import main as run

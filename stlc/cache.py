@@ -1,4 +1,4 @@
-"""The cache folder: reproducible artefacts shared by processes, protected from other users.
+"""The cache folder: files that can be computed again, shared by processes, protected from other users.
 
 Code is loaded from here, so the folder and each file read from it must belong to the user, be no link, and be
 writable by the user only. Otherwise, or if no such folder can be created, a temporary folder of the process
@@ -38,7 +38,7 @@ class Unusable(Exception):  # noqa: N818 - an answer that callers catch
 
     Attributes:
         why: reason, printed after the name of the folder.
-        distrusted: another user could have changed its content.
+        distrusted: whether the reason is that another user could have changed its content.
     """
 
     def __init__(self, why: str, *, distrusted: bool = False) -> None:
@@ -52,16 +52,19 @@ class Cache:
     """A cache folder that only the user can write to.
 
     Attributes:
-        shown: path of the folder.
-        folder: path through an open file descriptor, where the system supports that: the path of the checked
-            folder even if a parent folder is renamed or replaced.
+        shown: path of the folder, for messages.
+        folder: path used to read and write. Where the system supports that, it leads through an open file
+            descriptor to the folder that was checked, even if a parent folder is renamed or replaced.
     """
 
     shown: Path
     folder: Path
 
     def read(self, name: str) -> bytes | None:
-        """Return the content of a file; None if it is missing or another user may have written it."""
+        """Return the content of a file; None if it is missing, or if another user may have changed it.
+
+        In the second case the file is removed, with a warning.
+        """
         flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         path = self.folder / name
         try:
@@ -82,7 +85,7 @@ class Cache:
         return data
 
     def refuse(self, name: str, why: str) -> None:
-        """Remove an untrusted file and warn about it."""
+        """Remove the file `name`, which is not trusted, and warn about it with the reason `why`."""
         with suppress(OSError):
             (self.folder / name).unlink()
         _warn(f"`{self.shown / name}` {why}", "it is made anew")
@@ -103,20 +106,26 @@ class Cache:
         return True
 
     def names(self, start: str) -> list[str]:
-        """Names of the files with a prefix."""
+        """Names of the files that begin with `start`; empty if the folder cannot be read."""
         try:
             return sorted(entry.name for entry in os.scandir(self.folder) if entry.name.startswith(start))
         except OSError:
             return []
 
     def size(self) -> tuple[int, int]:
-        """Number of files, and their total size in bytes."""
+        """Number and total size in bytes of the files that stlc has written to the folder."""
         sizes = [found.st_size for _, found in _entries(self)]
         return len(sizes), sum(sizes)
 
 
 def _require_own(found: os.stat_result, right_kind: bool, otherwise: str) -> None:
-    """Raise Unusable if another user could have changed a file or folder."""
+    """Raise Unusable if another user could have changed a file or folder.
+
+    Args:
+        found: status of the file or folder.
+        right_kind: whether it is of the expected kind (file or folder).
+        otherwise: reason given in the error if it is of another kind.
+    """
     if not right_kind:
         raise Unusable(otherwise, distrusted=True)
     if os.name != "posix":
@@ -135,7 +144,11 @@ def _warn(problem: str, instead: str) -> None:
 
 
 def place() -> Path:
-    """Folder of the cache: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`. Raises Unusable."""
+    """Path of the cache folder: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`.
+
+    Raises:
+        Unusable: there is no home directory.
+    """
     home = os.environ.get("XDG_CACHE_HOME", "")
     if home and Path(home).is_absolute():  # relative ones are to be ignored, says the XDG specification
         return Path(home) / "stlc"
@@ -164,7 +177,7 @@ def persistent() -> Cache | None:
 
 
 def why_not() -> str:
-    """Reason for which there is no persistent cache; "" if there is one."""
+    """Reason why there is no persistent cache; "" if there is one."""
     try:
         opened()
     except Unusable as refused:
@@ -175,10 +188,10 @@ def why_not() -> str:
 
 
 def opened() -> Cache:
-    """Open the user's cache folder.
+    """Open the user's cache folder, which is created if missing.
 
     Raises:
-        Unusable: the folder cannot be used.
+        Unusable: the folder cannot be created, or another user could have changed its content.
     """
     return private(place())
 
@@ -188,10 +201,10 @@ _descriptors: dict[Path, int] = {}
 
 
 def private(path: Path) -> Cache:
-    """Open a folder to which only the user can write, as a cache; it is created if missing.
+    """Open the folder `path` as a cache, to which only the user can write; it is created if missing.
 
     Raises:
-        Unusable: it cannot be created, or another user could have changed its content.
+        Unusable: the folder cannot be created, or another user could have changed its content.
     """
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -209,7 +222,10 @@ def private(path: Path) -> Cache:
 
 
 def _checked_folder(path: Path) -> Path:
-    """Check owner and mode of a folder; return its path through an open file descriptor."""
+    """Check the owner of a folder and set its mode to 0700; return its path through an open file descriptor.
+
+    Where the system has no such paths, `path` is returned. Raises Unusable if the folder has another owner.
+    """
     open_one = _descriptors.get(path)
     fresh = open_one is None or not os.path.samestat(os.fstat(open_one), path.lstat())
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else open_one
@@ -238,7 +254,7 @@ def _checked_folder(path: Path) -> Path:
 
 
 def temporary() -> Cache | None:
-    """A temporary folder of this process, removed at its end; None if the disk is full."""
+    """A temporary cache folder, removed when the process ends; None if none can be created."""
     return _temporary(os.getpid())
 
 
@@ -267,12 +283,12 @@ def _temporary(process: int) -> Cache | None:
 
 @cache
 def _prune_once(store: Cache) -> None:
-    """Prune the cache, once per process."""
+    """Remove old files from the cache, only at the first call in a process; see `prune`."""
     prune(store)
 
 
 def prune(store: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
-    """Remove files that were not used for `most_days`, then the oldest ones beyond `most_bytes`."""
+    """Remove files that were not used for `most_days` days, then the oldest ones beyond `most_bytes`."""
     now, left = time.time(), most_bytes
     for name, found in sorted(_entries(store), key=lambda entry: entry[1].st_mtime, reverse=True):
         days = (now - found.st_mtime) / _DAY
@@ -283,7 +299,7 @@ def prune(store: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST
 
 
 def _entries(store: Cache) -> Iterator[tuple[str, os.stat_result]]:
-    """The files in the cache folder that stlc has written, with their status."""
+    """Yield name and status of the files in the cache folder that stlc has written."""
     with suppress(OSError), os.scandir(store.folder) as entries:
         for entry in entries:
             if entry.name.startswith((*KINDS, _UNFINISHED)):

@@ -14,7 +14,7 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A secondary source location and its message."""
+    """A secondary source location of a finding, and the text shown beside it."""
 
     span: Span
     text: str = ""
@@ -22,7 +22,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Edits that repair the finding: (span, replacement) pairs."""
+    """Edits that repair a finding, (source location, replacement) pairs, and their effect in words."""
 
     edits: tuple[tuple[Span, str], ...]
     text: str = ""
@@ -30,14 +30,14 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """A finding about an input or about the machine.
+    """An error or a warning about an input or about the machine.
 
     Attributes:
         code: an entry of `CODES`; codes that start with W are warnings.
         message: one terse headline, in the user's terms.
-        span: place in the text; None if there is no text.
-        label: text beside the carets.
-        labels: secondary places.
+        span: location in the source; None for a finding that concerns no text.
+        label: text shown beside the underlined location.
+        labels: secondary locations, each with a text.
         help: advice, a line per entry.
         note: reasons, a line per entry.
         fix: edits that repair the finding.
@@ -71,7 +71,7 @@ class Findings(list[Diagnostic]):
         self._indexed = 0
 
     def tell(self, finding: Diagnostic) -> None:
-        """Append a finding unless one with its code, place and headline is present."""
+        """Append a finding unless one with the same code, location and message is in the list."""
         for known in self[self._indexed :]:
             self._known.add((known.code, known.span, known.message))
         key = (finding.code, finding.span, finding.message)
@@ -82,7 +82,7 @@ class Findings(list[Diagnostic]):
 
 
 def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
-    """Append a finding to a list unless one with its code, place and headline is present."""
+    """Append a finding to a list unless one with the same code, location and message is in it."""
     if isinstance(sink, Findings):
         sink.tell(finding)
         return
@@ -92,7 +92,10 @@ def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
 
 
 class StlcError(Exception):
-    """Base of errors in user input; `exit_code` is the exit code of the command line."""
+    """Base class of the errors that a user can correct; `exit_code` is that of the command line.
+
+    Its `diagnostics` are the findings to show.
+    """
 
     exit_code = 3
 
@@ -106,34 +109,34 @@ class StlcError(Exception):
 
 
 class SpecError(StlcError):
-    """A specification is invalid."""
+    """Error: a specification is invalid."""
 
 
 class SystemFileError(StlcError):
-    """A system file is invalid."""
+    """Error: a system file is invalid."""
 
 
 class TraceError(StlcError):
-    """A trace cannot be used."""
+    """Error: a trace cannot be read, or does not fit its specification."""
 
 
 class RunError(StlcError):
-    """A run folder or checkpoint does not fit the request."""
+    """Error: a run folder or checkpoint is damaged, or cannot be used for what was requested."""
 
 
 class UsageError(StlcError):
-    """The command line is wrong, or a named file does not exist."""
+    """Error: the command line is wrong, or a file named in it does not exist."""
 
     exit_code = 2
 
 
 def usage(message: str, *advice: str) -> UsageError:
-    """The error U101, a wrong command line, with a message and advice."""
+    """Return the error U101 (wrong command line) with a message and advice; the caller raises it."""
     return UsageError(Diagnostic("U101", message, help=advice))
 
 
 class MissingError(StlcError):
-    """The environment lacks something: a package, a compiler, room on the disk."""
+    """Error: a package, a compiler, memory or room on the disk is missing on this machine."""
 
     exit_code = 5
 
@@ -147,12 +150,12 @@ class Notice(UserWarning):
 
 
 def os_reason(error: OSError) -> str:
-    """The reason of a system error in lower case, such as `permission denied`."""
+    """Reason of an operating-system error in lower case, such as `permission denied`."""
     return (error.strerror or type(error).__name__).lower()
 
 
 def notice(finding: Diagnostic) -> None:
-    """Warn about a property of the machine, such as a missing compiler."""
+    """Issue a Python warning (`Notice`) about the machine, such as a missing compiler."""
     warnings.warn(Notice(finding), stacklevel=3)
 
 

@@ -30,7 +30,10 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def visible(text: str) -> str:
-    """A name for one line of a terminal: without control characters, line breaks or bidi overrides."""
+    """Return a name that is safe in one line of a terminal.
+
+    Control characters, line breaks and characters that change the text direction are replaced by symbols.
+    """
     return text if text.isascii() and text.isprintable() else _INVISIBLE.sub(_sign, text)
 
 
@@ -41,11 +44,12 @@ def unseen(text: str) -> str:
 
 
 def screen(text: str, *, styled: bool = False) -> str:
-    """A multi-line text for a terminal, without control characters except line breaks and tabs.
+    """Return a text that is safe for a terminal: only line breaks and tabs remain as control characters.
 
     Args:
-        text: lines.
-        styled: whether it contains colour codes; then every name in it must have been made `visible`.
+        text: text of one or more lines.
+        styled: whether `text` contains colour codes, which are kept. Then its caller must have applied
+            `visible` to every name in it.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -66,12 +70,15 @@ def _sign(match: re.Match[str]) -> str:
 
 
 def shell(words: Iterable[str]) -> str:
-    """A command line to copy: each word is quoted as one argument, without control characters."""
+    """Return a command line that can be copied into a shell: each word is quoted as one argument.
+
+    Control characters are written as escape sequences.
+    """
     return " ".join(_word(word) for word in words)
 
 
 def operand(path: str) -> str:
-    """A path as a command-line argument; one that begins with a dash is not taken for an option."""
+    """Return a path for use as a command-line argument; `./` is put before a leading dash."""
     return f"./{path}" if path.startswith("-") else path
 
 
@@ -127,12 +134,12 @@ def lawful(text: str) -> str:
 
 
 def html(text: str) -> str:
-    """Text, or the value of an attribute between double quotes, in HTML."""
+    """Escape a text for HTML, for use between tags or as an attribute value in double quotes."""
     return _html.escape(lawful(text), quote=True)
 
 
 def script_json(text: str) -> str:
-    """A JSON text for a `<script>` element: it cannot end the element or open a comment."""
+    """Escape a JSON text for a `<script>` element, so that it cannot end the element or open a comment."""
     return text.translate(_IN_SCRIPT)
 
 
@@ -144,18 +151,21 @@ _KEPT_IN_MARKUP = re.compile(
 
 
 def xml(text: str) -> str:
-    """Text, or the value of an attribute between double quotes, in XML 1.0; line breaks and tabs are kept."""
+    """Escape a text for XML 1.0, for use between tags or as an attribute value in double quotes.
+
+    Line breaks and tabs are kept as character references.
+    """
     return html(text).replace("\n", "&#10;").replace("\t", "&#9;")
 
 
 def markdown(text: str) -> str:
-    """Text in a line or table cell of Markdown: mark-up, links, HTML and `|` are escaped."""
+    """Escape a text for a line or table cell of Markdown: mark-up, links, HTML and `|` lose their meaning."""
     words = re.sub(r"[\\`*_{}\[\]()#+\-.!|<>~&$:@=]", r"\\\g<0>", visible(text))
     return re.sub(r"^ +| +\Z", lambda match: "\N{NO-BREAK SPACE}" * len(match[0]), words)
 
 
 def markdown_code(text: str) -> str:
-    """A name as inline code in Markdown; it may contain back quotes."""
+    """Return a name as inline code in Markdown; back quotes in the name are kept."""
     words = visible(text)
     longest = max(map(len, re.findall("`+", words)), default=0)
     fence = "`" * (longest + 1)
@@ -164,27 +174,27 @@ def markdown_code(text: str) -> str:
 
 
 def workflow_data(text: str) -> str:
-    """The message of a workflow command of GitHub, on one line."""
+    """Escape the message of a workflow command of GitHub Actions (`::error::message`), in one line."""
     return visible(text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A"))
 
 
 def workflow_property(text: str) -> str:
-    """The value of a property of a workflow command of GitHub."""
+    """Escape the value of a property of a workflow command of GitHub Actions, such as its file name."""
     return workflow_data(text).replace(":", "%3A").replace(",", "%2C")
 
 
 def sarif_message(text: str) -> str:
-    """A plain message of SARIF 2.1.0: links and placeholders are escaped (sections 3.11.5 and 3.11.6)."""
+    """Escape links and placeholders in a plain message of SARIF 2.1.0 (sections 3.11.5 and 3.11.6)."""
     return re.sub(r"\](?=\()", r"\\]", re.sub(r"\{(\d+)\}", r"{{\1}}", text))
 
 
 def uri(path: str) -> str:
-    """A path as a relative URI reference, percent-encoded."""
+    """Return a path as a relative URI reference, in which special characters are percent-encoded."""
     return quote(path.replace("\\", "/"), safe="/-._~+@=,()", errors="surrogateescape")
 
 
 def dot(text: str) -> str:
-    """A quoted word of Graphviz, quotes included."""
+    """Return a text as a string in double quotes for the graph language of Graphviz."""
     return '"' + visible(text).replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
@@ -196,23 +206,33 @@ LABEL = 60
 
 
 def picture(text: str) -> str:
-    """A label in a picture, truncated; legends omit a leading underscore, so it gets a thin space."""
+    """Return a label for a picture, truncated to `LABEL` characters.
+
+    Matplotlib omits labels with a leading underscore from legends, so a thin space is put before the
+    underscore.
+    """
     words = visible(text if len(text) <= LABEL else f"{text[: LABEL - 1]}…")
     return f"\N{THIN SPACE}{words}" if words.startswith("_") else words
 
 
 def tag(name: str) -> str:
-    """A name as one part of a TensorBoard tag: injective, without group separators."""
+    """Return a name as one part of a TensorBoard tag, without the `/` that separates groups.
+
+    Different names have different results.
+    """
     return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)
 
 
 def topic(name: str, *, empty: str) -> str:
-    """A name as one part of a topic of messages: letters, digits, `_`, `-` and `.`."""
+    """Return a name as one part of the topic of a message: letters, digits, `_`, `-` and `.`.
+
+    Other characters become `_`; `empty` replaces an empty name.
+    """
     return re.sub(r"[^\w.-]+", "_", name) or empty
 
 
 def json_text(text: str) -> str:
-    """A JSON text for a file or terminal: invisible characters are escaped."""
+    """Return a JSON text in which invisible characters are escaped, for a file or a terminal."""
     if text.isascii() and "\x7f" not in text:
         return text
     return _ON_SCREEN.sub(lambda match: _unit(match[0]), text)
@@ -229,12 +249,15 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def spreadsheet(text: str) -> str:
-    """A table cell that no spreadsheet takes for a formula."""
+    """Return the text of a table cell that no spreadsheet program interprets as a formula.
+
+    A quote is put before a text that looks like one.
+    """
     return f"'{text}" if _FORMULA.match(text) else text
 
 
 def from_spreadsheet(text: str) -> str:
-    """The inverse of `spreadsheet`."""
+    """Return the original text of a table cell that `spreadsheet` wrote."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
@@ -245,11 +268,11 @@ _RESERVED = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.I)
 
 
 def file_part(name: str, *, empty: str) -> str:
-    """A name as one path component: letters, digits, `_`, `-`, `.`; at most `LONGEST` bytes.
+    """Return a name as one path component: letters, digits, `_`, `-`, `.`; at most `LONGEST` bytes.
 
     Args:
         name: any name.
-        empty: replacement for a name without any allowed character.
+        empty: result for a name without any allowed character.
     """
     part = re.sub(r"[^\w.-]+", "-", visible(name).replace("\ufffd", "-")).strip("-.") or empty
     if len(part.encode()) <= LONGEST and not _RESERVED.fullmatch(part):

@@ -28,11 +28,12 @@ _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
 
 
 def read_source(path: Path | str) -> Source:
-    """The text of a file; `-` is the standard input.
+    """Read a text file in UTF-8; `-` is the standard input.
 
     Raises:
         UsageError: U102, there is no such file, or it cannot be opened.
-        SpecError: E003, a mesh, a binary file or not UTF-8; E005, larger than `MAX_BYTES`.
+        SpecError: E003, the file is a 3-D mesh (also `.stl`), another binary file, or not UTF-8; E005, it is
+            larger than `MAX_BYTES`.
     """
     name = str(path)
     if name == "-":
@@ -80,7 +81,10 @@ def _decode(name: str, data: bytes) -> Source:
 
 
 def _is_binary_mesh(data: bytes) -> bool:
-    """True for binary stereolithography: 80 bytes of header, the number of triangles, 50 bytes for each."""
+    """True if the data are a 3-D mesh in binary stereolithography format, whose suffix is also `.stl`.
+
+    Such a file has a header of 80 bytes, the number of triangles, and 50 bytes for each triangle.
+    """
     return len(data) >= 84 and b"\0" in data and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
 
 
@@ -116,7 +120,7 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
     """Write a file atomically: a reader sees the old or the new content, never a part.
 
     Raises:
-        MissingError: R201, no room or no permission; the old file is untouched.
+        MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
@@ -124,12 +128,14 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path with the same suffix that replaces `path` if the block succeeds.
+    """Context that yields a temporary path; the file written there replaces `path` if the block succeeds.
 
-    Missing folders are created. A path that is not a regular file (a pipe, `/dev/null`) is written in place.
+    The temporary path has the same suffix. Missing folders are created. A path that is not a regular file (a
+    pipe, `/dev/null`) is written in place.
 
     Raises:
-        MissingError: R201, no room or no permission; the old file is untouched, the new one removed.
+        MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged, and
+            the temporary one removed.
     """
     path = Path(path)
     target = path.resolve()
@@ -152,7 +158,10 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def reported(action: str) -> Iterator[None]:
-    """Turn a system error within the block into R201: "cannot " and the action, such as "write `a.json`"."""
+    """Context that turns an error of the operating system into MissingError (R201).
+
+    Its message is "cannot " followed by `action`, such as "write `a.json`".
+    """
     try:
         yield
     except OSError as error:
@@ -163,9 +172,13 @@ def reported(action: str) -> Iterator[None]:
 
 
 def find_system(name: str, spec_path: Path | None = None) -> Path:
-    """The system file called `name`: as given, beside the spec, in `systems`, in `examples`, or installed.
+    """Find the system file called `name` and return its path.
 
-    The suffix `.yaml` may be omitted. Raises UsageError (U102) with the searched places.
+    It is searched as given, then beside the specification, in `systems`, in `examples`, and among the
+    installed files. The suffix `.yaml` may be omitted.
+
+    Raises:
+        UsageError: U102, it is in none of these places, which the message lists.
     """
     folders = [Path()]
     if spec_path is not None:
@@ -180,9 +193,9 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
 
 
 def find_spec(name: Path | str) -> Path:
-    """The specification called `name`: as given, else among the installed ones, with or without `specs/`.
+    """Find the specification called `name`: the given path, else an installed one, with or without `specs/`.
 
-    A name that is not found is returned unchanged, so that reading it raises the error.
+    A name that is not found is returned unchanged; an attempt to read it then raises the error.
     """
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
@@ -191,15 +204,19 @@ def find_spec(name: Path | str) -> Path:
 
 
 def _straight(path: Path) -> Path:
-    """Shorten `specs/../examples/car.yaml` to `examples/car.yaml`, unless a link makes that another file."""
+    """Shorten a path such as `specs/../examples/car.yaml` to `examples/car.yaml`.
+
+    It is returned unchanged if the short path leads to another file because of a symbolic link.
+    """
     short = Path(os.path.normpath(path))
     return short if short.is_file() and short.samefile(path) else path
 
 
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:
-    """The trace called `name`: as given, then in the newest run below `runs`.
+    """Find the trace called `name`: the given path, else in the folder of the newest run below `runs`.
 
-    Raises UsageError (U102) with the searched places.
+    Raises:
+        UsageError: U102, it is in neither place; the message lists both.
     """
     folders = [Path(), runs / "latest"]
     for folder in folders:
@@ -210,7 +227,7 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
 
 
 def _is_bag(path: Path) -> bool:
-    """True if a path is the folder of a ROS 2 bag."""
+    """True if a path is the folder of a ROS 2 bag (a recording of messages)."""
     with suppress(OSError):
         return path.is_dir() and ((path / "metadata.yaml").is_file() or any(map(is_stored, path.iterdir())))
     return False
@@ -239,9 +256,10 @@ def _shown(path: Path) -> str:
 
 
 def beside(home: Path, name: str) -> Path:
-    """The file that a text in the folder `home` refers to: at the given path, else in `home` itself.
+    """Return the path of the file `name` to which a file in the folder `home` refers.
 
-    The folder of a run holds copies of such files, without their subfolders.
+    It is the path relative to `home` if that exists, else the file of that name in `home` itself: a run
+    folder holds copies of such files without their subfolders.
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there

@@ -1,4 +1,4 @@
-"""JSON that every reader accepts: no NaN tokens, arrays as lists, paths and fractions as text or numbers."""
+"""JSON that every reader accepts: numbers that are not finite become texts, arrays lists, paths texts."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 
 
 def plain(value: object) -> Json:
-    """`value` as JSON data.
+    """Convert a value to JSON data: None, booleans, numbers, texts, lists and dictionaries.
 
     Numbers that are not finite become the texts "inf", "-inf" and "nan"; mappings, dataclasses,
     sequences, sets, arrays and array scalars are converted recursively; paths become texts.
 
     Raises:
-        TypeError: `value` contains an object that is not data.
+        TypeError: `value` contains an object of another type.
     """
     match value:
         case None | bool() | str():
@@ -61,7 +61,7 @@ def _number(value: float) -> float | str:
 
 
 def dumps(value: object, *, indent: int | None = None) -> str:
-    """`value` as a JSON text, by the rules of `plain`; on one line unless `indent` is given.
+    """Return the JSON text of a value, converted as by `plain`; on one line unless `indent` is given.
 
     Invisible characters, and lone surrogates, which UTF-8 cannot encode, are escaped.
     """
@@ -75,7 +75,7 @@ def loads(text: str) -> Any:
     """Parse untrusted JSON text; lone surrogates, which UTF-8 cannot encode, become U+FFFD.
 
     Raises:
-        ValueError: it is not JSON.
-        RecursionError: it is nested too deeply.
+        ValueError: the text is not JSON.
+        RecursionError: the text is nested too deeply.
     """
     return json.loads(_ESCAPES.sub(lambda match: match[1] or "\ufffd", text))

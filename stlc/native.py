@@ -1,8 +1,8 @@
-"""Native kernels: C text compiled by the system's compiler on first use, cached and loaded.
+"""Native kernels: C code compiled by the system's compiler on first use, cached, and loaded as a library.
 
-Without a working compiler there is no kernel, and the caller uses its fallback. The name of a cached library
-holds a hash of its inputs (text, compiler, its version, flags, processor) and of its content; a library whose
-hash does not match is not loaded.
+Without a working compiler there is no kernel, and its callers compute with NumPy or torch. The name of a
+cached library contains a hash of its inputs (C code, compiler, its version, flags, processor) and one of its
+content; a library whose content does not match is not loaded.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ Stop: TypeAlias = Callable[[], bool]
 
 
 def never() -> bool:
-    """A stop condition that never holds."""
+    """Stop condition that is never true."""
     return False
 
 
@@ -71,12 +71,15 @@ class SearchOptions:
 
     Attributes:
         bounds: lowest and highest value of each control, and 1 for a periodic angle, (3, m).
-        factors: scale of each requirement's robustness in the total, (R,).
-        bank: library of plans that solved other states, (k, T, m).
-        generations: number of generations, in each of which `LANES` changed plans are tried.
-        enough: target robustness at which the search of a row (one initial state) ends.
+        factors: weight / scale of each requirement, (R,); the search maximises the least of the robustness
+            values multiplied by these.
+        bank: plans that satisfied the specification from other states, (k, T, m); a change may replace the
+            last part of a plan, or all of it, by that of one of these.
+        generations: largest number of iterations, in each of which `LANES` changes of the best plan are
+            tried.
+        enough: robustness at which the search for one initial state ends.
         seed: seed of the random changes.
-        stop: condition that ends the search before all rows are done.
+        stop: function that returns True to end the search before all initial states are done.
     """
 
     bounds: NDArray[np.float64]
@@ -89,9 +92,9 @@ class SearchOptions:
 
 
 class Kernel:
-    """Library with the compiled functions `judge` (robustness of plans) and `climb` (local search).
+    """Loaded library with the compiled functions `judge` (robustness of plans) and `climb` (local search).
 
-    Their C code comes from `stlc.compile.backends.c.emit`.
+    Its C code comes from `stlc.compile.backends.c.emit`.
     """
 
     def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
@@ -109,13 +112,13 @@ class Kernel:
         """Roll out plans with the exact dynamics and compute their robustness.
 
         Args:
-            x0: (B, n), contiguous float64.
-            u: (B, T, m), contiguous float64.
+            x0: initial states, (B, n).
+            u: plans, (B, T, m).
             threads: number of threads.
-            columns: whether the states are returned too.
+            columns: whether the states along the plans are returned too.
 
         Returns:
-            Robustness per requirement (B, R), and the states (n, T+1, B) or None.
+            Robustness of each requirement, (B, R), and the states, (n, T+1, B), or None without `columns`.
 
         Raises:
             MemoryError: there is not enough memory.
@@ -139,14 +142,15 @@ class Kernel:
         """Improve plans by batched local search on the exact robustness.
 
         Args:
-            x0: (B, n), contiguous float64.
-            plans: initial guesses, (B, T, m).
+            x0: initial states, (B, n).
+            plans: plans at which the search starts, (B, T, m).
             search: parameters of the search.
             threads: number of threads; the result does not depend on it.
 
         Returns:
-            Plans (B, T, m) and their robustness (B,); -inf if the dynamics give NaN. If the search was
-            stopped early, the plans of the last rows are unchanged, and their robustness is NaN.
+            Improved plans, (B, T, m), and their robustness, (B,), which is -inf if a state is NaN. If the
+                search was stopped early, plans that were not reached are unchanged, and their robustness is
+                NaN.
 
         Raises:
             MemoryError: there is not enough memory.
@@ -166,12 +170,13 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveSlopes:
-    """Derivatives of an objective by robustness and states.
+    """Derivatives of an objective by robustness and states, from which `Adjoint` computes its gradient.
 
     Attributes:
         by_rho: derivative by the robustness of each requirement, (B, R).
         by_columns: derivative by the states, (n, T+1, B); None if the objective does not depend on states.
-        slope: slope of smoothed conditions, per unit.
+        slope: k in tanh(k z), which replaces the sign of z in conditions z >= 0 of the dynamics, per unit of
+            z.
     """
 
     by_rho: NDArray[np.float64]
@@ -180,7 +185,7 @@ class ObjectiveSlopes:
 
 
 class Adjoint:
-    """Library with the compiled function `pull`, the gradient of an objective by the plans.
+    """Loaded library with the compiled function `pull`: the gradient of an objective by the plans.
 
     Its C code comes from `stlc.compile.backends.c.adjoint`.
     """
@@ -197,7 +202,7 @@ class Adjoint:
         *,
         threads: int = 1,
     ) -> NDArray[np.float64]:
-        """Gradient, by the plans, of an objective that depends on robustness and states.
+        """Compute the gradient, by the plans, of an objective that depends on their robustness and states.
 
         Args:
             x0: initial states, (B, n).
@@ -226,13 +231,13 @@ class Adjoint:
 
 
 class Advance:
-    """Library with the compiled functions `advance` (one step) and `look` (observations).
+    """Loaded library with the compiled functions `advance` (one step) and `look` (observations of a policy).
 
-    Their C code comes from `stlc.compile.backends.c.advance`.
+    Its C code comes from `stlc.compile.backends.c.advance`.
 
     Args:
         library: library that contains the two functions.
-        seen: number of values that the policy reads, k.
+        seen: number k of inputs that the policy computes from a state.
         rewarded: whether the library computes a reward.
     """
 
@@ -260,10 +265,11 @@ class Advance:
         Args:
             x: states, (B, n), contiguous.
             u: controls, (B, m), contiguous.
-            share: last value of every observation.
+            share: elapsed share of the episode, stored as the last value of every observation.
 
         Returns:
-            The states after the step (B, n), their observations (B, k + 1), and the rewards (B,) or None.
+            The states after the step, (B, n), their observations, (B, k + 1), and the rewards, (B,), or None
+                if the library computes none.
         """
         after = np.empty_like(x)
         seen = np.empty((len(x), self._seen + 1), dtype=np.float32)
@@ -273,7 +279,10 @@ class Advance:
         return after, seen, reward
 
     def look(self, x: NDArray[np.float64], share: float) -> NDArray[np.float32]:
-        """Observations of states, (B, n) contiguous -> (B, k + 1), with `share` as the last value."""
+        """Return the observations of contiguous states, (B, n) -> (B, k + 1).
+
+        The last value of an observation is `share`, the elapsed share of the episode.
+        """
         seen = np.empty((len(x), self._seen + 1), dtype=np.float32)
         self._look(len(x), x.ctypes.data, share, seen.ctypes.data)
         return seen
@@ -282,13 +291,13 @@ class Advance:
 def _share(
     rows: Callable[[int, int], int], batch: int, threads: int, *, grain: int = GRAIN, stop: Stop = never
 ) -> None:
-    """Call `rows(first, last)` on short parts of a batch, on several threads.
+    """Call `rows(first, last)` for consecutive short ranges of the rows of a batch, on several threads.
 
-    Python code runs between two parts: there, an interruption or `stop` ends the work, and the remaining rows
-    are not processed.
+    Between two calls, an interruption or `stop` ends the work; then the remaining rows are not processed. The
+    number of rows per call is a multiple of `grain`.
 
     Raises:
-        MemoryError: a part returned a value other than 0.
+        MemoryError: a call returned a value other than 0.
     """
     queue = _Parts(batch, grain, stop)
     if threads < 2:
@@ -307,7 +316,10 @@ def _share(
 
 
 class _Parts:
-    """Division of a batch into parts of about `PART` seconds each, whose sizes are multiples of `grain`."""
+    """Queue of the row ranges of a batch, shared by threads; a range takes about `PART` seconds.
+
+    The number of rows of a range is a multiple of `grain`.
+    """
 
     def __init__(self, batch: int, grain: int, stop: Stop) -> None:
         self.failed = False
@@ -315,11 +327,11 @@ class _Parts:
         self._lock = Lock()
 
     def end(self) -> None:
-        """Hand out no more parts."""
+        """End the work: no further range is processed."""
         self._next = self._batch
 
     def work(self, rows: Callable[[int, int], int]) -> None:
-        """Process parts until none are left; the size of the next follows from the time of the last."""
+        """Process ranges of rows until none are left; the time of one determines the size of the next."""
         grains = 1
         while not self.failed:
             with self._lock:
@@ -336,7 +348,10 @@ class _Parts:
 
 
 def load(text: str) -> ctypes.CDLL | None:
-    """Library compiled from a C text, or loaded from the cache; None if that fails."""
+    """Return the library compiled from C code, built now or loaded from the cache; None if that fails.
+
+    A compiler that cannot be used causes a warning (W702).
+    """
     using = compiler()
     if using is None:
         return None
@@ -349,7 +364,7 @@ def load(text: str) -> ctypes.CDLL | None:
 
 
 def why_none(text: str) -> str:
-    """Reason for which `load` returned None for a text, as a clause after "because"."""
+    """Reason why `load` returned None for a C code, as a clause that continues "because"."""
     using = compiler()
     if using is None:
         return "there is no C compiler"
@@ -361,10 +376,12 @@ def why_none(text: str) -> str:
 
 
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
-    """Library of a C text for the compiler `using`, from the cache or newly built.
+    """Return the library of a C code for the compiler `using`, from the cache or newly built.
+
+    It is None if it cannot be built or loaded for lack of room.
 
     Raises:
-        CompilerError: the compiler cannot be used.
+        CompilerError: the compiler cannot be used, or failed for this code a short while ago.
     """
     key = _key(text, using)
     store = cache.persistent()
@@ -400,7 +417,7 @@ _temporary: dict[str, Cache | None] = {}
 
 
 def _key(text: str, using: str) -> str:
-    """Hash of all inputs of a build, the name of the library in the cache.
+    """Hash of all inputs of a build (code, compiler, flags, processor), a part of the library's file name.
 
     Raises:
         CompilerError: the compiler cannot be used.
@@ -410,7 +427,10 @@ def _key(text: str, using: str) -> str:
 
 
 def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
-    """Library with the name `key` in the cache; None if it is missing or its content has changed."""
+    """Load the library with the hash `key` from the cache.
+
+    Return None if it is missing; a library whose content has changed is removed with a warning.
+    """
     for name in place.names(f"kernel-{key}-"):
         data = place.read(name)
         if data is None:
@@ -423,7 +443,7 @@ def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
 
 
 def _load(place: Cache, name: str) -> ctypes.CDLL | None:
-    """Load a library; None if the system refuses, such as from a `noexec` disk."""
+    """Load a library; None if the operating system refuses, as for a disk mounted with `noexec`."""
     try:
         return ctypes.CDLL(str(place.folder / name))
     except OSError:
@@ -431,10 +451,10 @@ def _load(place: Cache, name: str) -> ctypes.CDLL | None:
 
 
 def _built(text: str, using: str, key: str) -> bytes | None:
-    """Build a library and return its bytes; None if the disk is full.
+    """Compile C code to a library and return its bytes; None if the disk is full.
 
     Raises:
-        CompilerError: the compiler cannot be used.
+        CompilerError: the compiler cannot be used, or fails for this code.
     """
     try:
         with tempfile.TemporaryDirectory(prefix="stlc-") as folder, leaving(lambda _code: rmtree(folder)):
@@ -447,7 +467,13 @@ def _built(text: str, using: str, key: str) -> bytes | None:
 
 
 def _compile(using: str, source: Path, target: Path, key: str) -> None:
-    """Compile a C text with optimisation, or with less if the compiler exceeds its time or memory limit."""
+    """Compile C code with optimisation, or without if that exceeds the compiler's time or memory limit.
+
+    A failure is remembered under `key`, so that it is not repeated soon.
+
+    Raises:
+        CompilerError: the compiler cannot be used, or fails for this code.
+    """
     try:
         try:
             why = _attempted(using, source, target, "-O3" if source.stat().st_size < LONG else "-O2")
@@ -462,13 +488,13 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Compile with vectorised sine and similar functions if the C library has them, else without.
+    """Compile C code once, with vectorised sine and similar functions if the C library has them.
 
     Returns:
-        The reason of a failure, or "".
+        The reason if the compiler failed, else "".
 
     Raises:
-        CompilerError: the compiler exceeded its limits.
+        CompilerError: the compiler cannot be used, or exceeded its time or memory limit.
     """
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
     for attempt in (*fast, []):
@@ -479,7 +505,7 @@ def _attempted(using: str, source: Path, target: Path, level: str) -> str:
 
 
 def _processor() -> str:
-    """Features of the processor, on which `-march=native` depends."""
+    """Instruction-set features of the processor, which `-march=native` makes use of; "" if unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

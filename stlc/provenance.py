@@ -32,7 +32,10 @@ def versions() -> dict[str, str]:
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:
-    """Commit and dirty flag of the git repository of `folder` (default: current folder), if any."""
+    """Commit of the git repository of `folder` (by default the current one), and whether it has changes.
+
+    None if there is no repository.
+    """
     commit = _git(folder, "rev-parse", "HEAD")
     if commit is None:
         return None
@@ -51,7 +54,7 @@ def _git(folder: Path | None, *arguments: str) -> str | None:
 
 @cache
 def hardware() -> dict[str, Any]:
-    """The machine: operating system, processor, cores, memory in GiB (None where unknown)."""
+    """Facts about the machine: operating system, processor, cores, memory in GiB (None where unknown)."""
     return {
         "system": f"{platform.system()} {platform.release()}",
         "machine": platform.machine(),

@@ -22,10 +22,10 @@ _LONGEST = 100
 
 
 def closest(name: str, candidates: Iterable[str]) -> str | None:
-    """Return the candidate nearest to a misspelt `name`, or None if none is near.
+    """Return the candidate that is most similar to a misspelt `name`, or None if none is similar.
 
-    First a candidate that differs only in case; then one within an edit distance (with transpositions) of a
-    third of the letters, at least one; then difflib's closest match.
+    A candidate that differs only in case comes first; then one whose edit distance (with transpositions) is
+    at most a third of the number of letters, or 1; then the most similar one by Python's difflib.
     """
     pool = sorted({word for word in candidates if 0 < len(word) <= _LONGEST and word != name})
     if len(name) > _LONGEST:
@@ -40,7 +40,7 @@ def closest(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def did_you_mean(name: str, candidates: Iterable[str], *otherwise: str) -> tuple[str, ...]:
-    """Advice that names the candidate nearest to a misspelt `name`, else `otherwise`."""
+    """Advice that names the candidate most similar to a misspelt `name`; `otherwise` if none is similar."""
     near = closest(name, candidates)
     return otherwise if near is None else (f"did you mean `{near}`?",)
 
@@ -65,7 +65,7 @@ def _distance(left: str, right: str) -> int:
 
 
 class Registry(Generic[T]):
-    """A table of plugins of one kind, filled by a decorator.
+    """A table of plugins of one kind, such as integrators, each registered under a name by a decorator.
 
     Args:
         kind: noun for an entry in messages, such as "integrator".
@@ -76,7 +76,7 @@ class Registry(Generic[T]):
         self._entries: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[U], U]:
-        """A decorator that registers an entry as `name`. Raises ValueError if the name is taken."""
+        """Return a decorator that registers an object as `name`. Raises ValueError if the name is taken."""
 
         def enter(entry: U) -> U:
             if name in self._entries:
@@ -87,7 +87,11 @@ class Registry(Generic[T]):
         return enter
 
     def get(self, name: str) -> T:
-        """The entry `name`. Raises UsageError (U101) with the nearest name and all names."""
+        """Return the plugin called `name`.
+
+        Raises:
+            UsageError: U101, there is none; the message lists all names and the most similar one.
+        """
         if name in self._entries:
             return self._entries[name]
         if name not in self:
@@ -96,7 +100,7 @@ class Registry(Generic[T]):
         return self._entries[name]
 
     def suggest(self, name: str) -> str:
-        """Help in one line for a misspelt `name`."""
+        """Advice in one line for a misspelt `name`: the most similar name, and all names."""
         known = f"{self.kind}s: {', '.join(self.names)}" if self.names else f"there is no {self.kind}"
         near = closest(name, self.names)
         return known if near is None else f"did you mean `{near}`?  {known}"
@@ -117,15 +121,15 @@ class Registry(Generic[T]):
 
 
 class PackageRegistry(Registry[T]):
-    """A table whose entries are the modules of a package: a plugin is one file, `NAME.py`.
+    """A table of plugins whose entries are modules of a package: the plugin `NAME` is the file `NAME.py`.
 
     Listing the names imports no module. Modules whose names begin with `_` are no entries.
 
     Args:
-        kind: noun for an entry in messages.
+        kind: noun for an entry in messages, such as "method".
         package: dotted name of the package.
-        attribute: name of the entry in its module.
-        default: name of the default entry, the first of the names.
+        attribute: name of the variable that holds the plugin in its module.
+        default: name of the default plugin, which comes first in `names`.
     """
 
     def __init__(self, kind: str, package: str, attribute: str, *, default: str) -> None:
@@ -134,14 +138,18 @@ class PackageRegistry(Registry[T]):
         self._package, self._attribute = package, attribute
 
     def get(self, name: str) -> T:
-        """The entry `name`; its module is imported. Raises UsageError (U101) as `Registry.get`."""
+        """Return the plugin called `name`, after importing its module.
+
+        Raises:
+            UsageError: U101, there is none; the message lists all names and the most similar one.
+        """
         if name not in self._entries and name in self:
             self._entries[name] = getattr(import_module(f"{self._package}.{name}"), self._attribute)
         return super().get(name)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The default, then the others in alphabetical order."""
+        """Names of the plugins: the default one first, then the others in alphabetical order."""
         found = sorted(
             module.name
             for module in iter_modules(self._folders())
@@ -150,7 +158,7 @@ class PackageRegistry(Registry[T]):
         return tuple(sorted(found, key=lambda name: name != self.default))
 
     def _folders(self) -> list[str]:
-        """Folders of the package; it is not imported for this, nor are the packages around it."""
+        """Paths of the package's folders, found without importing the package or its parents."""
         if self._package in sys.modules:
             return list(sys.modules[self._package].__path__)
         root, *inner = self._package.split(".")

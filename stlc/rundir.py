@@ -1,4 +1,4 @@
-"""Folder of a run, self-describing: `runs/<spec>/<number>-<words>`.
+"""Folder of a training run, `runs/<spec>/<number>-<words>`, with everything needed to repeat the run.
 
 A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
 to the newest. Whole files are written atomically; rows are appended so that a kill loses at most the last
@@ -63,7 +63,7 @@ class RunDir:
 
     @classmethod
     def create(cls, root: Path, spec_name: str, words: str | None = None) -> RunDir:
-        """Make the folder of a new run and point the links at it.
+        """Create the folder of a new run, and redirect the links `latest` to it.
 
         Args:
             root: folder of all runs.
@@ -72,7 +72,7 @@ class RunDir:
 
         Raises:
             UsageError: U101, `words` cannot be part of a folder's name.
-            MissingError: R201, the folder cannot be made.
+            MissingError: R201, the folder cannot be created.
         """
         words = _checked(words) if words is not None else draw_words()
         home = root / _slug(spec_name)
@@ -121,7 +121,7 @@ class RunDir:
         return _by_name(str(where), root).checked()
 
     def checked(self) -> RunDir:
-        """This run, after a check that its record can be read. Raises RunError (R101)."""
+        """Return this run if its record (`run.json`) can be read. Raises RunError (R101) if not."""
         self.record()
         return self
 
@@ -129,7 +129,7 @@ class RunDir:
 
     @property
     def name(self) -> str:
-        """Number and words, such as `0007-quiet-heron`."""
+        """Name of the folder: number and words, such as `0007-quiet-heron`."""
         return self.path.name
 
     @property
@@ -146,7 +146,7 @@ class RunDir:
         write_atomic(self.path / name, dumps(value, indent=2) + "\n")
 
     def read_json(self, name: str) -> Any:
-        """The content of the JSON file `name`. Raises RunError (R101) if it is missing or damaged."""
+        """Read the JSON file `name` of the run. Raises RunError (R101) if it is missing or damaged."""
         try:
             return json.loads((self.path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError) as error:
@@ -166,7 +166,7 @@ class RunDir:
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
-        """Update `run.json` (created if missing) with `facts`, and return its whole content."""
+        """Set the entries `facts` in `run.json` (created if missing) and return its whole content."""
         before = self.record() if (self.path / RECORD).exists() else {}
         after = {**before, **facts}
         self.write_json(RECORD, after)
@@ -179,7 +179,7 @@ class RunDir:
         return status
 
     def finish(self, status: Status, result: object = None) -> None:
-        """Record the status, the end time and the result of the run."""
+        """Write status, end time and, if given, the result of the run to `run.json`."""
         ended = {"status": status, "finished": now()}
         self.update(ended if result is None else {**ended, "result": result})
 
@@ -202,10 +202,10 @@ class RunDir:
             os.write(file.fileno(), data)
 
     def rows(self, name: str = ROWS) -> list[dict[str, Any]]:
-        """The rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
+        """Read the rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
 
         Raises:
-            RunError: R101, a whole line is not JSON.
+            RunError: R101, a complete line is not a JSON object.
         """
         try:
             data = (self.path / name).read_bytes()
@@ -221,22 +221,25 @@ class RunDir:
         return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
-        """Remove all rows but the `wanted` ones: a resumed run drops the rows after its checkpoint."""
+        """Remove all rows from a file of JSON lines for which `wanted` is False.
+
+        A resumed run removes the rows after its checkpoint.
+        """
         kept = [row for row in self.rows(name) if wanted(row)]
         write_atomic(self.path / name, "".join(dumps(row) + "\n" for row in kept))
 
 
 def every_run(root: Path = RUNS) -> list[RunDir]:
-    """Runs below `root` that have a record, by spec and number."""
+    """Runs below `root` that have a record (`run.json`), ordered by specification and number."""
     paths = (path for path in root.glob("*/*") if not path.is_symlink() and _NUMBERED.fullmatch(path.name))
     return [RunDir(path) for path in sorted(paths) if (path / RECORD).is_file()]
 
 
 def remove_run(run: RunDir) -> None:
-    """Delete the folder of a run. A link to it is redirected to the newest remaining run.
+    """Delete the folder of a run; links `latest` to it are redirected to the newest remaining run.
 
     Raises:
-        MissingError: R201, it cannot be deleted.
+        MissingError: R201, the folder cannot be deleted.
     """
     home = run.path.parent
     with reported(f"remove `{run.shown}`"):
@@ -278,7 +281,11 @@ def _by_name(where: str, root: Path) -> RunDir:
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
-    """The newest run trained for a specification file, or for one with the same name."""
+    """Newest run trained for the specification file `path`, else for any specification of that name.
+
+    Raises:
+        UsageError: R101, there is none.
+    """
     runs = every_run(root)
     trained = [run for run in runs if _spec_path(run) == path.resolve()]
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
@@ -289,7 +296,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
 
 
 def _spec_path(run: RunDir) -> Path | None:
-    """The specification file of a run; None if its record cannot be read."""
+    """Path of the specification file from which a run was trained; None if its record cannot be read."""
     try:
         return Path(str(run.record().get("spec_path"))).resolve()
     except RunError:
@@ -297,13 +304,16 @@ def _spec_path(run: RunDir) -> Path | None:
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:
-    """Names by which a run can be called: folder, number with and without zeros, words."""
+    """Names by which a run can be called: folder name, number with and without leading zeros, words."""
     number, _, words = run.name.partition("-")
     return run.name, number, str(int(number)), words
 
 
 def _folder_of(path: Path) -> Path:
-    """The run folder of a path: the path itself, or its nearest parent with a record."""
+    """Return the run folder that contains `path`: the path itself or its nearest parent with a `run.json`.
+
+    If there is none, `path` is returned.
+    """
     candidates = (path, *path.parents)
     return next((folder for folder in candidates if (folder / RECORD).is_file()), path)
 
@@ -322,10 +332,11 @@ def _checked(words: str) -> str:
 
 
 def _reserve(home: Path, words: str) -> Path:
-    """Create a run folder with the next free number, which no concurrent process can get.
+    """Create a run folder with the next free number and return its path.
 
-    Folders of one number may have different words, so creating the folder does not reserve the number. The
-    process that creates the marker file of a number owns it, and then checks again that the number is unused.
+    No concurrent process gets the same number: the process that creates the marker file of a number owns it,
+    and then checks again that the number is unused. Creating the folder does not suffice, because folders of
+    one number may have different words.
     """
     number = max(_numbers(home), default=0)
     while True:
@@ -356,7 +367,7 @@ def _marker(path: Path) -> Iterator[bool]:
 
 
 def _point(link: Path, target: str) -> None:
-    """Make `link` point to `target`, atomically; without effect where links are not allowed."""
+    """Make the symbolic link `link` point to `target`, atomically; no effect where links are not allowed."""
     temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}")
     try:
         temporary.symlink_to(target, target_is_directory=True)

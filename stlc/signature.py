@@ -1,4 +1,4 @@
-"""Signature of a state tensor or a trace: its ordered, named columns."""
+"""Signature of a state tensor or a trace: its named scalar signals (columns), in order."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ Role = Literal["input", "output", "state", "env", "timer"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A scalar column.
+    """Description of a scalar signal, one column of a state tensor or trace.
 
     Attributes:
         name: name in specifications and system files.
         unit: physical unit of the stored numbers.
         kind: type of the signal; a bool is stored as 0 or 1, an enum as a value of `labels`.
-        role: role of the signal; `timer` columns are appended by the compiler.
-        low: nominal lower end of the range, in `unit`; None if unknown.
-        high: nominal upper end of the range, in `unit`; None if unknown.
+        role: role of the signal, such as state or parameter; the compiler appends columns with the role
+            `timer`.
+        low: lower end of the range, in `unit`; None if unknown.
+        high: upper end of the range, in `unit`; None if unknown.
         labels: (label, value) pairs of an enum.
-        fact: whether the range is enforced (by a clamp, or as the values of a bool or enum), not only
-            nominal.
+        fact: whether values outside of the range cannot occur (because of a clamp, or as the signal is a bool
+            or enum); otherwise the range is nominal.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Ordered columns; timers added by the compiler come last."""
+    """Ordered columns of a state tensor or trace; the timers that the compiler adds come last."""
 
     columns: tuple[Column, ...]
 
@@ -65,5 +66,5 @@ class Signature:
         return self.names.index(name)
 
     def extended(self, *columns: Column) -> Signature:
-        """A signature with `columns` appended."""
+        """Return a signature with `columns` appended at the end."""
         return Signature((*self.columns, *columns))

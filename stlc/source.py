@@ -1,4 +1,4 @@
-"""Source texts and spans of them."""
+"""Source texts and locations (spans) in them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class Source:
-    """A text and its name in messages, a path as the user gave it."""
+    """A text, and its name in messages: the path of its file as the user gave it."""
 
     name: str
     text: str = field(repr=False)
@@ -32,13 +32,13 @@ class Source:
         return self.text[start : None if end < 0 else end].rstrip("\r")
 
     def span(self, start: int, end: int) -> Span:
-        """The span from offset `start` to offset `end` (exclusive)."""
+        """Location from offset `start` to offset `end` (exclusive)."""
         return Span(self, start, end)
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A half-open range of characters of a source."""
+    """A location in a source: the characters from offset `start` to offset `end` (exclusive)."""
 
     source: Source
     start: int
@@ -60,5 +60,5 @@ class Span:
         return self.source.text[self.start : self.end]
 
     def to(self, other: Span) -> Span:
-        """The span from the start of this one to the end of `other`."""
+        """Location from the start of this one to the end of `other`."""
         return Span(self.source, self.start, other.end)

@@ -1,9 +1,9 @@
-"""Forced exit of an interrupted command that does not unwind in time.
+"""Forced exit of an interrupted command that does not end in time.
 
 Ctrl-C and SIGTERM raise an exception in the main thread, but only after a running library call returns. So a
-watchdog thread receives the signal too, through a file descriptor. If the command is still running `PATIENCE`
-seconds later it runs the registered clean-up (`leaving`: child processes, temporary files, the status of a
-run) and ends the process.
+second thread, the watchdog, receives the signal too, through a file descriptor. If the command is still
+running `PATIENCE` seconds later, the watchdog calls the functions that were registered by `leaving` (they end
+child processes, remove temporary files, and set the status of a run) and ends the process.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ _numbers = iter(range(1 << 62))
 
 @contextmanager
 def leaving(undo: Callable[[int], object]) -> Iterator[None]:
-    """Register `undo` for the block: a forced exit calls it with the exit code, in another thread."""
+    """Context during which a forced exit calls `undo` with the exit code, in another thread.
+
+    Callers use it to remove temporary files and the like.
+    """
     key = undoing(undo)
     try:
         yield
@@ -41,14 +44,17 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 
 
 def undoing(undo: Callable[[int], object]) -> int:
-    """Register `undo`, which a forced exit calls, until the process ends; return its key."""
+    """Register `undo` for the rest of the process: a forced exit calls it with the exit code.
+
+    Return the key under which it is registered.
+    """
     key = next(_numbers)
     _undone[key] = undo
     return key
 
 
 def arm() -> None:
-    """Start the watchdog of this process; call it in the main thread of a command."""
+    """Start the watchdog thread, which forces an interrupted command to exit; call it in the main thread."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     try:
@@ -64,15 +70,15 @@ def arm() -> None:
 
 
 def age() -> float:
-    """Seconds since the command started; 0 if stlc is used as a library."""
+    """Seconds since `arm` was called at the start of a command; 0 if stlc is used as a library."""
     return time.perf_counter() - _armed[0] if _armed else 0.0
 
 
 def finish(code: int) -> int:
-    """End an interrupted process at once, with flushed buffers: libraries take long to unload.
+    """End an interrupted process at once with the exit code `code`, since libraries take long to unload.
 
-    Returns the code if the process was not interrupted; a signal while libraries are unloaded then does not
-    change the exit code.
+    If the process was not interrupted, `code` is returned; from then on signals are ignored, so that they do
+    not change the exit code.
     """
     if not _asked and code not in (128 + signal.SIGINT, 128 + signal.SIGTERM):
         with suppress(ValueError):  # not the main thread

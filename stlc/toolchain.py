@@ -1,4 +1,4 @@
-"""The system's C compiler: search, version, and runs under resource limits.
+"""The system's C compiler: search, version, and execution under resource limits.
 
 A compiler that hangs, or takes too much time or memory, is killed with its child processes. One that hangs is
 not started again by this process, nor for `REMEMBERED` seconds by other processes of the user.
@@ -40,7 +40,7 @@ _PROBE = "#include <math.h>\nint works(void) { return 1; }\n"
 
 
 class CompilerError(Exception):
-    """The compiler cannot be used; `why` is printed after its name."""
+    """Error: the compiler cannot be used; `why` is the reason, printed after the compiler's name."""
 
     def __init__(self, why: str) -> None:
         super().__init__(why)
@@ -48,11 +48,17 @@ class CompilerError(Exception):
 
 
 class TooMuchError(CompilerError):
-    """The compiler exceeds the time or memory limit for a text."""
+    """Error: the compiler exceeds its time or memory limit for a text."""
 
 
 class HangsError(Exception):
-    """Error: the compiler needs more time or memory for a text than the limit."""
+    """Error: a program was ended because it hung or exceeded a limit.
+
+    Attributes:
+        why: reason in words.
+        worked: whether it exceeded the limit of processor time or memory; False: it used no processor time
+            for too long.
+    """
 
     def __init__(self, why: str, *, worked: bool = False) -> None:
         super().__init__(why)
@@ -62,7 +68,7 @@ class HangsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ProgramResult:
-    """Result of a program: exit code, standard output, standard error."""
+    """Result of a program that ended: exit code, standard output (`out`), standard error (`errors`)."""
 
     code: int
     out: str
@@ -76,11 +82,11 @@ def compiler() -> str | None:
 
 
 def compiled(using: str, arguments: Sequence[str]) -> ProgramResult:
-    """Run a compiler.
+    """Run the compiler `using` with arguments and return its result, also if it fails.
 
     Raises:
-        TooMuchError: it exceeded the time or memory limit.
-        CompilerError: it hangs, did so a short while ago, or cannot be started.
+        TooMuchError: the compiler exceeded its time or memory limit.
+        CompilerError: the compiler hangs, did so a short while ago, or cannot be started.
     """
     key = _identity(using)
     why = trouble(key)
@@ -101,7 +107,11 @@ _versions: dict[str, str] = {}
 
 
 def version(using: str) -> str:
-    """Version text of a compiler, with the date and size of its file. Raises CompilerError."""
+    """Text that identifies a compiler: a hash of its path and file status, and its output for `--version`.
+
+    Raises:
+        CompilerError: the compiler cannot be used.
+    """
     key = _identity(using)
     why = trouble(key)
     if why:
@@ -112,7 +122,7 @@ def version(using: str) -> str:
 
 
 def _identity(using: str) -> str:
-    """Key of a compiler among remembered failures; it changes with the compiler's file."""
+    """Key under which failures of a compiler are remembered: a hash of its path, file size and time."""
     try:
         found = Path(using).stat()
         facts = f"{using} {found.st_size} {found.st_mtime_ns} {found.st_ino}"
@@ -122,10 +132,10 @@ def _identity(using: str) -> str:
 
 
 def works(using: str) -> str:
-    """Test whether a compiler can build a library, and clear remembered failures if it can.
+    """Test whether the compiler `using` can build a library; remembered failures are forgotten first.
 
     Returns:
-        The reason why it cannot; "" if it can.
+        The reason if it cannot, else "".
     """
     forget()
     try:
@@ -142,7 +152,7 @@ def works(using: str) -> str:
 
 
 def failure(done: ProgramResult) -> str:
-    """Error message of a compiler in one line."""
+    """Reason for a compiler's failure in one line: its exit code and first error message."""
     lines = [line.strip() for line in (done.errors or done.out).splitlines() if line.strip()]
     message = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
     return f"fails with exit code {done.code}" + (f": {message[:160]}" if message else "")
@@ -155,7 +165,7 @@ _known: dict[str, str] = {}
 
 
 def trouble(key: str) -> str:
-    """Reason of a recent compiler failure, in this process or another; "" if there was none."""
+    """Reason of a failure remembered under `key`, by this process or another; "" if there is none."""
     if key in _known:
         return _known[key]
     store = cache.persistent()
@@ -171,7 +181,10 @@ def _recorded(store: Cache, name: str) -> str:
 
 
 def remember(key: str, why: str, *, seconds: float | None = None) -> None:
-    """Remember a failure of the compiler, which is then not tried, for `seconds` (`REMEMBERED`)."""
+    """Remember a failure of the compiler under `key` for `seconds`, by default `REMEMBERED`.
+
+    During that time the compiler is not tried again for the same purpose.
+    """
     _known[key] = why
     store = cache.persistent()
     if store is not None:
@@ -180,7 +193,7 @@ def remember(key: str, why: str, *, seconds: float | None = None) -> None:
 
 
 def remembered() -> list[str]:
-    """Reasons of remembered failures, because of which commands do not use the compiler at present."""
+    """Reasons of all remembered compiler failures, because of which the compiler is not tried at present."""
     store = cache.persistent()
     found = [] if store is None else [_recorded(store, name) for name in store.names(_TROUBLE)]
     return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
@@ -207,7 +220,7 @@ def _file(key: str) -> str:
 def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
     """Run a program in its own session; kill it with its child processes if it exceeds the limits.
 
-    No process is left when the wait is interrupted.
+    If the wait is interrupted, the program and its child processes are killed, too.
 
     Args:
         command: the program and its arguments.
@@ -249,7 +262,10 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Context in which stop signals are deferred, since a process that is being started cannot be killed."""
+    """Context in which SIGINT and SIGTERM are deferred while a process is started.
+
+    Otherwise an interruption could leave a process that is not yet known, and so cannot be killed.
+    """
     if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
         yield
         return
@@ -269,7 +285,7 @@ def _signals_deferred() -> Iterator[None]:
 
 
 def _limit_time(process: subprocess.Popen[bytes]) -> None:
-    """Limit the processor time of a program and its children, in case this process dies."""
+    """Limit the processor time of a program and its children, for the case that this process dies first."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         import resource
 
@@ -278,7 +294,7 @@ def _limit_time(process: subprocess.Popen[bytes]) -> None:
 
 
 def _await(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a process. Raises HangsError."""
+    """Wait until a process ends. Raises HangsError if it hangs or exceeds a limit, without killing it."""
     begun = since = time.monotonic()
     used = 0.0
     while True:
@@ -300,14 +316,14 @@ def _await(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """Resources used by the processes of a session: processor seconds, bytes of memory."""
+    """Resources used by all processes of a session: processor time in seconds, memory in bytes."""
 
     seconds: float
     memory: int
 
 
 def _use(session: int) -> _Use | None:
-    """Resources used by the processes of a session, ended ones included; None if unknown."""
+    """Resources used by the processes of a session, including ended child processes; None if unknown."""
     ticks, pages, known = 0, 0, False
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):
@@ -320,7 +336,7 @@ def _use(session: int) -> _Use | None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate, then kill all processes of a session."""
+    """Terminate all processes of a session; kill those that do not end in time."""
     if os.name != "posix":
         process.kill()
         process.wait()
@@ -337,6 +353,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill all processes of a session."""
+    """Kill all processes of a session at once."""
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)

@@ -1,8 +1,8 @@
-"""Physical units: dimensions as exponent vectors, scales to SI as exact fractions.
+"""Physical units: dimensions as exponent vectors, conversion factors to SI as exact fractions.
 
-`degC` is an affine unit with its zero at 273.15 K: differences are in kelvin (`Unit.interval`), and it is not
-a factor of products. Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`. `steps`
-is not a physical unit; the reader of an interval handles it.
+`degC` is an affine unit with its zero at 273.15 K: differences are in kelvin (`Unit.interval`), and it cannot
+be a factor of a product. Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`.
+`steps` is not a physical unit; the code that reads an interval handles it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _MAX_POWER = 99
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A physical unit. Units are equal if they mean the same, however they are written.
+    """A physical unit; two units are equal if they have the same dimensions, size and zero.
 
     Attributes:
         dims: exponents of m, kg, s, A and K.
@@ -73,7 +73,7 @@ class Unit:
         return _product(((self, 1), (other, -1)))
 
     def __pow__(self, power: int | Fraction) -> Unit:
-        """The unit to a power. Raises ValueError if an exponent would not be whole."""
+        """The unit to a power. Raises ValueError if an exponent of the result is not a whole number."""
         power = Fraction(power)
         if abs(power) > _MAX_POWER:
             raise ValueError(f"[{self}] to the power {power} is out of bounds")
@@ -185,7 +185,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def written_unit(text: str) -> Unit:
-    """Parse a unit; an empty text is the dimensionless unit. Raises ValueError as `parse_unit`."""
+    """Parse a unit as `parse_unit` does; an empty text is the dimensionless unit. Raises ValueError."""
     return parse_unit(text) if text else DIMENSIONLESS
 
 
@@ -199,7 +199,7 @@ def means_celsius(text: str) -> bool:
 
 
 def nearest(value: Fraction | float) -> float:
-    """The double nearest to a number; +-inf beyond the largest."""
+    """Return the double nearest to a number; inf or -inf for a number beyond the largest double."""
     try:
         return float(value)
     except OverflowError:
@@ -207,12 +207,16 @@ def nearest(value: Fraction | float) -> float:
 
 
 def same_dims(a: Unit, b: Unit) -> bool:
-    """True if quantities of these units can be added and compared."""
+    """True if quantities of these units can be added and compared, since their dimensions are equal."""
     return a.dims == b.dims
 
 
 def _factors(text: str) -> list[tuple[str, int]]:
-    """Pairs (symbol, power) of the factors of a unit; each `/` divides by the next factor only."""
+    """Split the text of a unit into pairs (symbol, power); each `/` divides by the next factor only.
+
+    Raises:
+        ValueError: the text is not a unit.
+    """
     factors: list[tuple[str, int]] = []
     position, sign = 0, 1
     while True:
@@ -230,7 +234,7 @@ def _factors(text: str) -> list[tuple[str, int]]:
 
 
 def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
-    """Advice for a product that contains `degC`: the same product with `K`."""
+    """Advice for a unit that is a product with `degC`: the same product with `K`."""
     powers: dict[str, int] = {}
     for symbol, power in factors:
         known = SYMBOLS.get(symbol)
@@ -240,7 +244,7 @@ def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
 
 
 def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
-    """The product of units to whole powers, with the symbols of their texts."""
+    """Product of the powers of units, given as (unit, power); its text uses the symbols of their texts."""
     dims, ratio = _NONE, Fraction(1)
     powers: dict[str, int] = {}
     parts = [(unit.interval, power) for unit, power in parts]
@@ -257,7 +261,7 @@ def _si_text(dims: Dims) -> str:
 
 
 def _text(powers: Mapping[str, int]) -> str:
-    """Text of a unit, such as `kg*m/s^2`, `1/s`, `1`."""
+    """Text of a unit, such as `kg*m/s^2`, `1/s`, `1`, from its mapping symbol -> power."""
 
     def written(symbol: str, power: int) -> str:
         return symbol if power == 1 else f"{symbol}^{power}"
