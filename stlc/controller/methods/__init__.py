@@ -74,9 +74,10 @@ class Method(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Result of a validation: of the verdicts on plans from newly drawn states, and of the search for others.
+    """Result of a validation: verdicts on the policy's plans from newly drawn states.
 
-    A method that searches starts a search for satisfying plans from the states where the policy's plans fail.
+    At every validation, some methods start a search for satisfying plans from the states where the policy's
+    plans fail. It ends by the next validation, whose result includes that of the search.
 
     Attributes:
         accuracy: share of states whose plan satisfies the specification.
@@ -84,8 +85,8 @@ class Validation:
             satisfies it.
         feasible: estimated share of states for which a satisfying plan is known, from the policy or from the
             last search; None if no search has ended.
-        failing: number of states from which the last search started.
-        repaired: number of these states for which it found a satisfying plan.
+        failing: number of states from which the last search started; 0 without a search.
+        repaired: number of states for which the last search found a satisfying plan.
         explored: number of plans that exploration (search over plan prefixes) has found since the validation
             before; remainders of a plan from states that it passes are counted too.
     """
@@ -124,13 +125,13 @@ class Validation:
 class Learner(ABC):
     """State of a training, which the training loop advances, validates and saves step by step.
 
-    A subclass supplies the steps, the policy and the contents of a checkpoint. The attributes and methods for
-    search and exploration describe work that runs concurrently with the steps; by default there is none.
+    A subclass supplies the steps, the policy and the contents of a checkpoint. By default there is neither a
+    search for better plans nor an exploration (search over plan prefixes).
 
     Attributes:
         task: problem of the training.
         config: resolved options of the training.
-        steps: planned total number of steps; the loop changes it.
+        steps: planned total number of steps, which the training loop adapts to a time budget.
         device: torch device.
         ranks: processes that train together.
         step: number of completed steps.
@@ -138,8 +139,8 @@ class Learner(ABC):
         generator: source of all random numbers of this rank (process).
         margin: gamma of the objective, the robustness that training aims at.
         loss: loss of the last step; NaN before the first.
-        searches: whether plans of failing states are repaired by a search concurrently with the steps.
-        searching: whether such a search is running.
+        searches: whether, concurrently with the steps, a search improves plans that fail.
+        searching: whether the concurrent search is running.
         solved: whether a search has found a satisfying plan.
         exhausted: whether exploration with the largest effort has found no plan.
     """
@@ -169,7 +170,7 @@ class Learner(ABC):
     @property
     @abstractmethod
     def policy(self) -> Policy:
-        """Policy after the steps made until now, on the CPU."""
+        """Policy as trained by the steps made until now, on the CPU."""
 
     @property
     def rate(self) -> float:
@@ -177,7 +178,7 @@ class Learner(ABC):
         return self.config.lr
 
     def validate(self) -> Validation:
-        """Judge the policy's plans from newly drawn states."""
+        """Judge the policy's plans from newly drawn states, and set the step of the next validation."""
         x0 = self.task.sample(self.config.pool, generator=self.generator)
         self.next_validation = self.step + self.config.every
         return Validation.of(self.policy.plan_judged(x0)[1]).mean(self.ranks)
@@ -219,7 +220,7 @@ class Learner(ABC):
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Explore plan prefixes for satisfying plans, if the last search found too few.
+        """Explore plan prefixes for satisfying plans, if the last search found too few; by default not.
 
         Returns:
             False if `stop` ended the exploration early, else True.

@@ -168,7 +168,7 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from the result of `tensors`, its names without `episodes.`."""
+        """Restore the episodes from what `tensors` returned, given under names without `episodes.`."""
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
             getattr(self, name)[: self.count] = tensors[name]
@@ -190,7 +190,7 @@ def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[
 
 
 def random_controls(task: Task, count: int, generator: torch.Generator) -> Tensor:
-    """Draw `count` random plans, (count, T, m), with controls that are constant over `PIECE` steps."""
+    """Draw `count` plans, (count, T, m), with random controls that are constant over `PIECE` steps."""
     system = task.system
     pieces = -(-system.horizon // PIECE)
     drawn = torch.rand(count, pieces, len(system.control_names), generator=generator)
@@ -234,9 +234,9 @@ class LearntModel:
 class ModelLearner(Learner):
     """Training with a learnt model: an ensemble that learns the system from observed episodes.
 
-    One step of the training observes one episode in every environment, trains the ensemble if due, and then
-    does what the subclass adds. A checkpoint holds the networks, the stored episodes and the state of the
-    random numbers.
+    One step of the training simulates `config.environments` episodes, trains the ensemble if enough episodes
+    were added, and then does what the subclass adds. A checkpoint holds the networks, the stored episodes and
+    the state of the random numbers.
 
     Attributes:
         episodes: the stored episodes.
@@ -253,8 +253,8 @@ class ModelLearner(Learner):
         """Make an untrained ensemble and an empty memory of episodes.
 
         Raises:
-            UsageError: U101, there are several ranks (processes), the device is not the CPU, or there is no
-                such reward.
+            UsageError: U101, there are several ranks (processes), the device is not the CPU, there is no
+                such reward, or it is `task` and the system declares none.
         """
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         if ranks.size > 1:
@@ -280,9 +280,10 @@ class ModelLearner(Learner):
         return LearntModel(self.task, self.ensemble.predictor())
 
     def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
-        """Simulate one episode per environment, and train the ensemble if enough data were added.
+        """Simulate `config.environments` episodes and store them; train the ensemble if enough were added.
 
-        The first call simulates at least `config.first` episodes, with random controls.
+        Enough are the share `config.growth` of the episodes at its last training. The first call simulates at
+        least `config.first` episodes, with random controls.
 
         Args:
             act: function from states (N, n) and the step to controls (N, m); None for random controls.

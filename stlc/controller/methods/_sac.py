@@ -39,7 +39,7 @@ class SacConfig(ActorConfig):
 class SacActor(nn.Module):
     """Network from observations to the most probable controls of the actor of stable-baselines3.
 
-    Its weights have the same names as there, so that they can be copied; the package is not needed.
+    Its weights have the same names as in that actor, so that they can be copied; the package is not needed.
 
     Attributes:
         centre: mean of the observations of initial states, (k,).

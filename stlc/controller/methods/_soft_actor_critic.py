@@ -26,7 +26,7 @@ LOG_LOW, LOG_HIGH = -5.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Transitions: what happened in B steps of episodes.
+    """Transitions in B steps of episodes.
 
     Attributes:
         seen: observations before the step, (B, k).
@@ -59,7 +59,7 @@ class SacOptions:
 
     Attributes:
         lr: learning rate of Adam for actor, critics and temperature.
-        discount: gamma of the return.
+        discount: discount factor of the return.
         average: share by which the target critics move towards the critics in a gradient step (tau).
         temperature: weight of the entropy; 0: the weight is learnt such that the entropy becomes -1 per
             control.
@@ -138,8 +138,8 @@ class SoftActorCritic(nn.Module):
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Make one gradient step of critics, actor and temperature; return the loss of the critics, ().
 
-        Equations 5, 7 and 18 of Haarnoja et al., with the smaller one of the values of the two target
-        critics.
+        The losses are those of Equations 5, 7 and 18 of Haarnoja et al., in which the value of an action is
+        the smaller one of those of two critics.
         """
         seen, after = self._normalised(batch.seen), self._normalised(batch.after)
         weight = self.temperature.detach().exp()
@@ -170,7 +170,10 @@ class SoftActorCritic(nn.Module):
         return ((seen - self.centre) / self.spread).clamp(-10.0, 10.0)
 
     def _parameters_of(self, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation of the actions before the tanh, (B, m) each."""
+        """Mean and log standard deviation of the actions before the tanh, (B, m) each.
+
+        `seen` are normalised observations, (B, k).
+        """
         mean, log = self.actor(seen[None])[0].chunk(2, -1)
         return mean, LOG_LOW + 0.5 * (LOG_HIGH - LOG_LOW) * (torch.tanh(log) + 1.0)
 
@@ -188,7 +191,7 @@ class SoftActorCritic(nn.Module):
         return torch.tanh(raw), (normal - squashed).sum(-1)
 
     def _values(self, critics: BatchedMlp, seen: Tensor, actions: Tensor) -> Tensor:
-        """Values of observations (B, k) and actions (B, m) by both critics: (2, B)."""
+        """Values of normalised observations (B, k) and actions (B, m) by both critics: (2, B)."""
         values: Tensor = critics(torch.cat((seen, actions), -1).expand(2, -1, -1))[..., 0]
         return values
 

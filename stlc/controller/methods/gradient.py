@@ -23,9 +23,10 @@ class Gradient(NetworkMethod):
     """
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve the options: as in the paper, every step uses new states, unless `samples` is given.
+        """Resolve the options.
 
-        `train: {samples: …}` in the system file asks for a fixed training set of that size.
+        As in Meng and Fan (2023), every step uses newly drawn states, unless `train: {samples: N}` in the
+        system file asks for a fixed training set of N states.
         """
         found = base_config(task, config, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)

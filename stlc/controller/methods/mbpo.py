@@ -2,12 +2,12 @@
 
 An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
 and soft actor-critic learns from their transitions, together with a few observed ones. The reward of imagined
-steps is that of the task. If an imagined episode reaches the last step of a plan, its robustness is computed
-on the observed states before its beginning together with the imagined states.
+steps is not learnt, but computed by the task. If an imagined episode reaches the last step of a plan, its
+robustness is computed on the observed states before its beginning together with the imagined states.
 
 The settings of Meng and Fan (2023) for their comparison: the options `environments=1 growth=0 imagined=400
 longest=15 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
-temperature=0.2`, and `--lr 3e-4`. They learn the reward too; here it is computed by the task.
+temperature=0.2`, and `--lr 3e-4`. Unlike here, they also learn the reward.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class MbpoConfig(ModelConfig):
         observed: share of observed transitions in a batch; the others are imagined.
         updates: number of gradient steps of actor and critics for every observed step.
         critic_width: number of units per hidden layer of actor and critics.
-        discount: gamma of the return.
+        discount: discount factor of the return.
         follow: share by which the target critics move towards the critics in a gradient step.
         temperature: weight of the entropy; 0: learnt.
     """

@@ -61,7 +61,7 @@ class PetsConfig(ModelConfig):
         population: number of control sequences in a round.
         rounds: number of rounds of the cross-entropy method.
         elite_share: share of the population, the best sequences, from which the next round is sampled.
-        inertia: weight of the former mean and variance (the paper's alpha).
+        inertia: weight of the former mean and variance (alpha of Chua et al. 2018).
         particles: number of imagined episodes per control sequence, distributed evenly over the elites (the
             networks with the least validation error).
     """
@@ -149,7 +149,8 @@ class PetsPolicy(Policy):
     def _climbed(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
         """Search as `_optimised` does, for all states in one batch.
 
-        Each round samples from a Gaussian with mean and variance of the best sequences of the round before.
+        Each round samples from a Gaussian, whose mean and variance follow those of the best sequences of the
+        round before.
         """
         config, system = self._config, self.task.system
         low, high = system.control_low, system.control_high
@@ -206,7 +207,7 @@ class PetsPolicy(Policy):
 
 
 class PetsLearner(ModelLearner):
-    """Training by PETS: the ensemble learns from episodes under plans that were searched with it."""
+    """Training by PETS: the ensemble learns from episodes under the plans that a search with it finds."""
 
     config: PetsConfig
 
@@ -216,7 +217,7 @@ class PetsLearner(ModelLearner):
         return PetsPolicy(self.task, self.model, self.config)
 
     def advance(self) -> float:
-        """Plan and simulate one episode per environment, and train the ensemble if enough data were added.
+        """Plan and simulate `config.environments` episodes; train the ensemble if enough were added.
 
         Returns:
             The validation error of the ensemble, see `train_ensemble`; NaN if its training diverged.

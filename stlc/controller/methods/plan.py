@@ -27,8 +27,8 @@ class PlanConfig(ResolvedConfig):
     Attributes:
         planner: name of the planner.
         options: options of the planner, name -> text, as JSON.
-        seconds: processor time per plan.
-        evaluations: maximum number of plans judged in search of one; 0 for no limit.
+        seconds: processor time per plan, in seconds.
+        evaluations: maximum number of plans judged to find one; 0 for no limit.
     """
 
     planner: str = PLANNERS.default

@@ -67,7 +67,7 @@ class PpoConfig(ActorConfig):
         discount: discount factor of the return; 1 since episodes are finite and their elapsed share is
             observed.
         trace: lambda of the generalised advantage estimation.
-        ratio: bound on the change of the probability ratio (the paper's epsilon).
+        ratio: bound on the change of the probability ratio (epsilon of Schulman et al. 2017).
         entropy: weight of the entropy bonus.
         deviation: initial standard deviation of the controls before the tanh.
         correlation: correlation of the exploration noise of successive steps. White noise would hardly move
@@ -222,7 +222,7 @@ class Episodes:
         noise: exploration noise of the step before (of the first step: a random draw), in standard
             deviations, (T, N, w).
         density: logarithm of the probability density of the controls, (T, N).
-        rewards: (T, N).
+        rewards: rewards of the steps, (T, N).
     """
 
     seen: Tensor
@@ -302,7 +302,7 @@ class PpoLearner(ActorLearner):
         return Episodes(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
 
     def _noise(self) -> Tensor:
-        """Normal random numbers for every environment, (N, w)."""
+        """Draw independent standard normal numbers for the raw controls of every environment, (N, w)."""
         shape = self.config.environments, len(self.network.deviation)
         return torch.randn(shape, generator=self.generator).to(self.device)
 

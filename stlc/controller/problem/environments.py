@@ -131,7 +131,10 @@ class Environments:
         return self.task.system.observed_count + 1
 
     def observe(self, states: Tensor, step: int) -> Tensor:
-        """Observations of states (B, n) at the step number `step` of the episode: (B, k), see `observe`."""
+        """Observations of states (B, n) at step number `step` of the episode: (B, k).
+
+        They consist of the policy's inputs and the elapsed share of the episode.
+        """
         return observe(self.task, states, step)
 
     @torch.no_grad()

@@ -162,7 +162,8 @@ class Task:
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """States under plans: (B, n), (B, T, m) -> (B, T+1, n).
 
-        Without gradient, plans of at most T (the horizon) steps are rolled out by the native kernel.
+        `switch` gives the form of jumps and conditions, exact by default. Without gradient, plans of at most
+        one horizon are rolled out by the native kernel.
         """
         differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
         apart = differentiated or not switch.exact or u.shape[1] > self.horizon
@@ -272,9 +273,9 @@ class Task:
     def cost(self, judged: PlanVerdicts) -> Tensor:
         """Cost by which satisfying plans are compared, without gradient: (batch,).
 
-        It consists of the performance terms, and in a mission also of the amount by which robustness is below
-        gamma: otherwise the guidance cost (distance to the next goal), one of the performance terms, would
-        draw plans to the boundary of the constraints.
+        It consists of the performance terms, and in a mission (a specification that adds timers to the state)
+        also of the amount by which robustness is below gamma. Otherwise the guidance cost (distance to the
+        next goal), one of the performance terms, would draw plans to the boundary of the constraints.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)
@@ -286,8 +287,8 @@ class Task:
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
         """Sum of the performance terms, whether or not a plan satisfies the specification: (batch,).
 
-        In a mission the shortfall of the margins of pending goals and the guidance cost (distance to the next
-        goal) are added.
+        In a mission (a specification that adds timers to the state), the amounts by which the margins of
+        pending goals are below gamma and the guidance cost (distance to the next goal) are added.
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -332,8 +333,9 @@ def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
         safe: robustness of phi_safe, the same shape; if None, safety is not considered.
 
     Returns:
-        Larger is better. For satisfying plans above 1, decreasing with cost; for others below 1, increasing
-        with robustness (and for equal robustness, decreasing with cost). For unsafe plans 2 is subtracted.
+        Values of the same shape; larger is better. A plan that satisfies the specification gets more than 1,
+        decreasing with its cost. Any other gets less than 1, increasing with its robustness (at equal
+        robustness, decreasing with its cost), and 2 less if it violates phi_safe.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))

@@ -188,7 +188,7 @@ class StepSchedule:
 
 
 class Pace:
-    """Measured pace of a run, and the number of steps that fit into its budget.
+    """Measured durations in a run, and the number of steps that fit into its budget.
 
     A search round (validation) judges the policy's plans from new states, and starts a search for better ones
     that runs concurrently with the steps; the next round, or a checkpoint, waits for the end of that search.
@@ -219,7 +219,10 @@ class Pace:
         self._left: float | None = None
 
     def stepped(self, step: int, now: float, *, search_runs: bool) -> None:
-        """Record the end of gradient step `step` at time `now`, and whether the search is still running."""
+        """Record the end of gradient step `step` at time `now`.
+
+        `search_runs`: whether the concurrent search is still running.
+        """
         self._marks.append((step, now - self._started - self._apart))
         least = max(WINDOW * self._seconds, 1.0)
         while len(self._marks) > FIRST + 1 and self._marks[-1][1] - self._marks[1][1] >= least:
@@ -228,7 +231,7 @@ class Pace:
             self.searched(step, 0.0)
 
     def searched(self, step: int, waited: float) -> None:
-        """Record the end of the search at `step`, for which the steps had to wait `waited` seconds."""
+        """Record that the concurrent search ended at `step`, after the training waited `waited` seconds."""
         self._apart += waited
         if self._running and self._last_validation is not None and self.per_step > 0.0:
             self._search = step - self._last_validation + waited / self.per_step
@@ -312,7 +315,10 @@ class Pace:
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """True once enough steps were measured since the last planning to plan again."""
+        """True once the number of steps is to be planned again.
+
+        It is planned once enough steps were timed, and then whenever a share of the budget has passed.
+        """
         if self._left is None:
             first = self._marks[0][1]
             return len(self._marks) > FIRST or self._marks[-1][1] - first >= WINDOW * self._seconds

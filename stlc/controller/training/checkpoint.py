@@ -80,7 +80,8 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
         system_hash: SHA-256 of the system file.
 
     Raises:
-        RunError: R101, there is none or it is damaged; R102, it belongs to another specification or system.
+        RunError: R101, there is no checkpoint or it is damaged; R102, it belongs to another specification or
+            system.
     """
     folder = run.path / FOLDER
     facts, data = _read(folder)

@@ -39,8 +39,8 @@ class PlannerChoice:
     Attributes:
         name: name in `stlc.registry.PLANNERS`.
         options: options of the planner, name -> text.
-        seconds: processor time per plan.
-        evaluations: maximum number of plans judged in search of one; None for no limit.
+        seconds: processor time per plan, in seconds.
+        evaluations: maximum number of plans judged to find one; None for no limit.
     """
 
     name: str
@@ -107,13 +107,13 @@ class ResolvedConfig:
         batch: number of fresh states per step.
         hard: number of hard states per step, for which the search has found a plan; 0 until it has.
         lr: peak learning rate.
-        warmup: share of the steps over which the learning rate rises.
+        warmup: share of the steps over which the learning rate rises if `hold` is 0.
         hold: share of the steps at the peak learning rate; if it is positive, the learning rate rises over a
-            fixed number of steps.
+            fixed number of steps before.
         clip: bound on the norm of the gradient.
         average: decay of the moving average of the weights.
         pool: number of fresh states judged per search round.
-        every: steps between search rounds; doubled after a round that repaired few plans.
+        every: steps between search rounds.
         most: maximum number of hard states from which a search round searches.
         slope: slope, per unit, that replaces the derivative of jumps and conditions of the system.
         imitation: weight in the loss of the distance to the plan that the search found.

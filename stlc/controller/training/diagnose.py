@@ -80,7 +80,7 @@ class TrainingStep:
 
 
 def diagnose(step: TrainingStep) -> StlcError:
-    """Error that reports which quantity of a training step first becomes non-finite, and where."""
+    """Find the first quantity of a training step that is not finite, and return the error that reports it."""
     for check in (_plans, _motion, _robustness, _cost):
         found = check(step)
         if found is not None:
@@ -410,7 +410,10 @@ def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float
 
 
 def _upper(atom: ir.Predicate, facts: Mapping[str, Bounds]) -> float:
-    """Upper bound on the robustness of a predicate at one instant, given bounds on the states there."""
+    """Upper bound on the robustness of a predicate at one instant; inf if unknown.
+
+    `facts` are the bounds on the states at that instant, by name.
+    """
     if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
         return math.inf
     reach = bounds(atom.num, facts)

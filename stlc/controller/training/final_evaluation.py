@@ -122,7 +122,7 @@ class FinalEvaluation:
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once the time for the diagnosis of conflicts is over: as long again as the evaluation's."""
+        """True once the diagnosis of conflicts has to end: after twice the time for held-out states."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property

@@ -282,7 +282,11 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the best plan per state, (B,), and whether any plan of the state satisfies phi, (B,)."""
+        """Find the best of the proposed plans (B, plans, T, m) of each state.
+
+        Returns:
+            Index of the best plan, (B,), and whether it or another one satisfies the specification, (B,).
+        """
         batch, count = plans.shape[:2]
         if count == 1 and self.config.hard == 0:
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
@@ -292,7 +296,7 @@ class Trainer(Learner):
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
-        """Weighted mean of the squared distances between plans that a search found and the nearest proposed.
+        """Weighted mean of squared distances from plans that a search found to the nearest proposed plans.
 
         States for which the network already proposes a satisfying plan count as 0.
 
@@ -355,7 +359,7 @@ class Trainer(Learner):
         return found
 
     def _own(self) -> dict[str, Tensor]:
-        """Tensors of this rank alone."""
+        """Tensors of a checkpoint that differ between the ranks (processes), for this rank."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]

@@ -125,7 +125,7 @@ class Search:
         return self._found.result()
 
     def cancel(self) -> None:
-        """Cancel the search."""
+        """Ask the search on its thread to end early."""
         self._cancelled.set()
 
 
@@ -202,7 +202,11 @@ class Searcher:
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
-        """Prepare a native search, with copies of its inputs; the function returned runs it until `stop`."""
+        """Prepare a native search, with copies of its inputs.
+
+        Returns:
+            Function from a stop condition to the result, which runs the search on `threads` threads.
+        """
         native = self.task.native
         assert native is not None
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))

@@ -225,7 +225,7 @@ def _without_steps(
 
 
 def _require_as_many(before: int, now: int) -> None:
-    """Raise UsageError (R104) if the number of ranks differs from that before."""
+    """Raise UsageError (R104) if the number of ranks (processes) `now` is not that of the run `before`."""
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
         raise UsageError(
@@ -406,7 +406,7 @@ class _Session:
         )
 
     def _save(self) -> None:
-        """Write a checkpoint; for a running search, its inputs are saved."""
+        """Write a checkpoint, which of a running search holds the inputs."""
         began = self.now()
         facts = {
             **self.learner.facts(),

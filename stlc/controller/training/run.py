@@ -135,7 +135,7 @@ class RunWriter:
         """Write a checkpoint at a step.
 
         Raises:
-            MissingError: R201, it cannot be written; the last good checkpoint stays.
+            MissingError: R201, the checkpoint cannot be written; the last good one stays.
         """
         if self.writes:
             hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
@@ -185,7 +185,7 @@ def system_hash(folder: RunDir) -> str:
 
 
 def trained_on(folder: RunDir) -> str:
-    """Hash that `load_checkpoint` compares with that of the system file in a run's checkpoint.
+    """Hash of the system file to compare with the one that a run's checkpoint holds.
 
     It is the hash of the system file at the start of the training if the file in the run's folder was edited
     since, but only in fields that do not affect what a policy learns (worlds, scenarios, backup). Otherwise

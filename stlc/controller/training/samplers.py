@@ -1,4 +1,4 @@
-"""Sources of training states: independent draws, a fixed set, states along missions, solved hard states.
+"""Sources of training states: independent draws, a fixed set, states along missions, and a replay buffer.
 
 If a specification has memory (the time of the mission, satisfied goals, timers), only states that a mission
 reaches are useful for training, because the memory must fit the position. Therefore a pool of missions is

@@ -35,8 +35,8 @@ MOST_RHO = 1e6
 class Milp:
     """Mixed-integer linear program for each initial state, solved by HiGHS.
 
-    If it has no solution, a second program is solved, whose solutions include all satisfying plans. If that
-    has none either, it is proved that no plan from the initial state satisfies the specification.
+    If the program has no solution, a second one is solved, whose solutions include all satisfying plans. If
+    the second has none either, no plan from the initial state satisfies the specification.
 
     Attributes:
         gap: relative optimality gap at which the maximisation of robustness ends.
@@ -73,9 +73,9 @@ class Milp:
                 return
 
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
-        """Find a plan from the initial state with index `row`, or prove that no plan satisfies.
+        """Find a satisfying plan from the initial state with index `row`, or prove that there is none.
 
-        The result is stored in `search`.
+        The plan or the proof is stored in `search`.
         """
         task, state, budget = search.task, search.states[row], search.budget
         search.ended[row] = True
