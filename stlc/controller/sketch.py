@@ -1,4 +1,4 @@
-"""Drawing tools of worlds: colours by the source of a decision, past paths, plans, violations.
+"""Functions with which worlds draw pictures: past paths, plans, violations, colours by a plan's source.
 
 They need only NumPy; `axes` are the matplotlib axes that `World.draw` receives.
 """
@@ -31,17 +31,20 @@ FADED = 0.75
 
 
 def deciders(scene: Scene, index: int, agents: int) -> NDArray[np.int64]:
-    """Source of each agent's decision at frame `index`, (agents,); the policy if none was recorded."""
+    """Source of the plan that each agent follows at frame `index`, (agents,): an index into `SOURCES`.
+
+    It is 0, the policy, if `scene` does not contain `decision`.
+    """
     if "decision" not in scene:
         return np.zeros(agents, dtype=np.int64)
     return np.asarray(scene["decision"][index], dtype=np.int64)
 
 
 def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, frames: int) -> None:
-    """Draw the last `frames` frames of every agent's path, coloured by the source of the decision.
+    """Draw the last `frames` frames of every agent's path, coloured by the source of the followed plan.
 
     Args:
-        axes: to draw on.
+        axes: matplotlib axes.
         paths: picture coordinates of agents, (frames, agents, 2); NaN breaks a path.
         scene: recorded snapshots; `decision` is read.
         index: the present frame.
@@ -68,7 +71,7 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
     """Draw the guard's interventions at frame `index`: the rejected plan dashed, its replacement solid.
 
     Args:
-        axes: to draw on.
+        axes: matplotlib axes.
         scene: recorded snapshots; `rejected` and `taken`, (frames, agents, k, 2 or 3), are read if present.
         index: the present frame.
         placed: function from world coordinates (agents, k, 2 or 3) to picture coordinates (agents, k, 2); NaN
@@ -87,7 +90,10 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
 
 
 def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int) -> None:
-    """Draw a ring around each agent that violates a requirement, and its number, at `places` (agents, 2)."""
+    """Draw a ring and the number of each agent that violates a requirement, at `places`, (agents, 2).
+
+    `scene["violated"]`, (frames, agents), says which agents do at frame `index`; without it nothing is drawn.
+    """
     if "violated" not in scene:
         return
     for agent in np.flatnonzero(scene["violated"][index]):
@@ -98,7 +104,7 @@ def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int)
 
 
 def scale_bar(axes: Any, left: float, height: float, length: float, unit: str = "m") -> None:
-    """Draw a scale bar from (left, height) with the given length, in picture units, and its label above."""
+    """Draw a scale bar of the given length from (left, height), in picture units, with its label above."""
     ends = (left, left, left, left + length, left + length, left + length)
     axes.plot(ends, height + 0.09 * length * np.array([-1, 1, 0, 0, 1, -1]), color=NOTE, lw=1.2, zorder=5)
     words = {"ha": "center", "va": "bottom", "size": 7.5, "color": NOTE}
@@ -111,7 +117,7 @@ NUMBERED = 8
 
 
 def numbers(axes: Any, places: NDArray[np.float64]) -> None:
-    """Label agents at `places`, (agents, 2), with their numbers, if there are only few."""
+    """Label agents at `places`, (agents, 2), with their numbers if there are at most `NUMBERED` of them."""
     if len(places) <= NUMBERED:
         for agent, (x, y) in enumerate(places):
             words = {"ha": "center", "va": "center", "size": 6.5, "weight": "bold", "color": "white"}
@@ -121,7 +127,14 @@ def numbers(axes: Any, places: NDArray[np.float64]) -> None:
 def outlines(
     axes: Any, shape: NDArray[np.float64], poses: NDArray[np.float64], who: NDArray[np.int64]
 ) -> None:
-    """Draw agents as polygons: `shape` (points, 2) forward and left, at poses (agents, 3): x, y, heading."""
+    """Draw agents as polygons.
+
+    Args:
+        axes: matplotlib axes.
+        shape: corners of the polygon relative to an agent, (points, 2): forward, left.
+        poses: x, y and heading (rad) of each agent, (agents, 3).
+        who: source of each agent's plan, (agents,), which determines the colour.
+    """
     from matplotlib.collections import PolyCollection
 
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -132,7 +145,7 @@ def outlines(
 
 
 def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) -> None:
-    """Draw short lines (k, 2, 2) as one path with gaps."""
+    """Draw k separate line segments, (k, 2 end points, 2)."""
     gaps = np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
     axes.plot(*gaps.reshape(-1, 2).T, color=color, lw=width, zorder=2)
 
@@ -140,5 +153,8 @@ def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) ->
 def pieces(
     axes: Any, places: NDArray[np.float64], piece: NDArray[np.float64], color: str, width: float
 ) -> None:
-    """Draw the short line `piece` (2, 2) at many places (k, 2); needed by worlds in older run folders."""
+    """Draw a copy of the line segment `piece`, (2 end points, 2), at each of `places`, (k, 2).
+
+    It is for worlds in older run folders.
+    """
     segments(axes, places[:, None] + piece, color, width)

@@ -18,7 +18,7 @@ class Ball:
     """A sphere in space.
 
     Attributes:
-        centre: metres from the base of its robot, (frames, agents, 3).
+        centre: position in metres from the base of the agent's robot, (frames, agents, 3).
         radius: metres.
         color: as `#rrggbb`.
     """

@@ -1,6 +1,6 @@
-"""Random streams of a world: one shared by its agents, and one per agent.
+"""Random number streams of a world: one shared by its agents, and one for each agent.
 
-With them, an agent's random numbers do not depend on the number of other agents.
+An agent's random numbers thus do not depend on the number of other agents.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ class Streams:
 
     @classmethod
     def of(cls, generator: torch.Generator, agents: int) -> Streams:
-        """Streams for `agents` agents; those of the first agents are the same for any larger number."""
+        """Streams for `agents` agents, from a seed that is drawn from `generator`.
+
+        With more agents, those of the first agents remain the same.
+        """
         base = int(torch.randint(2**62, (), generator=generator))
         made = [seeded(base, key) for key in range(agents + 1)]
         return cls(made[0], tuple(made[1:]))

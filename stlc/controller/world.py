@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 class World(Protocol):
     """True environment of the agents, with effects that the model lacks.
 
-    States are float64 and do not contain the timers that a specification adds.
+    States are float64 and contain neither the timers nor the parameters that a specification adds.
     """
 
     def reset(self) -> Tensor:
-        """Initial states, (agents, n)."""
+        """Begin a simulation and return the initial states, (agents, n)."""
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
-        """One true step: (agents, n), (agents, m) -> (agents, n)."""
+        """Advance by one true step: states (agents, n), actions (agents, m) -> next states (agents, n)."""
 
     def progress(self) -> Mapping[str, float]:
         """Progress of the task since `reset`, name -> number."""
@@ -50,11 +50,15 @@ class World(Protocol):
         """
 
     def units(self) -> Mapping[str, str]:
-        """Units of the entries of `progress` that have one."""
+        """Unit of each entry of `progress` that has one, name -> unit."""
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Draw frame `index` of snapshots that are stacked over time; `decision` is (frames, agents)."""
+        """Draw frame `index` on matplotlib axes.
+
+        `scene`: snapshots, stacked over time, and `decision`, the source of each agent's plan, (frames,
+        agents).
+        """
 
 
 @runtime_checkable
@@ -65,10 +69,10 @@ class Choosing(Protocol):
     """
 
     def options(self) -> Tensor:
-        """States under every option, (agents, k, n); option 0 leaves the present state."""
+        """States that the agents would have under each option, (agents, k, n); option 0 changes nothing."""
 
     def choose(self, pick: Tensor) -> Tensor:
-        """Apply every agent's option, (agents,) int64; return the states, (agents, n)."""
+        """Apply the option with the index in `pick`, (agents,), to each agent; return states (agents, n)."""
 
 
 @runtime_checkable
@@ -84,17 +88,20 @@ class Redrawing(Protocol):
 
 @runtime_checkable
 class Charting(Protocol):
-    """World whose picture can show planned trajectories."""
+    """World that maps planned trajectories to picture coordinates, so that pictures can show them."""
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
         """Picture coordinates of planned states: (agents, k, n) -> (agents, k, 2 or 3).
 
-        Each agent's states begin with its present one; NaN states give NaN.
+        The first of an agent's k states is its present one. NaN states have NaN coordinates.
         """
 
 
 class WorldType(Protocol):
-    """Constructor of a world; all its random numbers come from `generator`."""
+    """Interface of world classes: a constructor, and the static method `draw`.
+
+    The world must draw all random numbers from `generator`.
+    """
 
     draw: Callable[[Any, Scene, int], None]
 
@@ -120,7 +127,10 @@ class ModelWorld:
         return self._happen(self._drawn)
 
     def redraw(self, rows: Tensor) -> Tensor:
-        """Redraw the initial states of some agents, (k,) -> (agents, n), and their events at step 0."""
+        """Redraw the initial states of the agents `rows`, (k,), and apply the events of step 0 to all agents.
+
+        Returns all states, (agents, n).
+        """
         self._begin()
         self._drawn = self._drawn.index_copy(0, rows, self._sampled(len(rows)))
         return self._happen(self._drawn)
@@ -144,7 +154,7 @@ class ModelWorld:
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """The first two columns of planned states, (agents, k, 2)."""
+        """Values of the first two states in planned states: (agents, k, n) -> (agents, k, 2)."""
         return states[..., [0, min(1, states.shape[2] - 1)]].numpy(force=True)
 
     @staticmethod

@@ -1,4 +1,7 @@
-"""The search of the paper's guard, on the graphs of an exported controller; as `guard.stages` in torch."""
+"""The search of the paper's guard, on the graphs of an exported controller, without torch.
+
+In torch, `prefix_shooting` and `longest_safe_prefix` of `stlc.controller.guard.stages` do the same.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ POLICY, BACKUP, SAFEST = range(3)
 class Found:
     """Plan found for one state.
 
-    `source` is the rule that chose it; `t0` is the number of its first steps taken from a grid of controls.
+    `judged`: the plan and its verdicts, one row. `source`: rule that chose the plan, `BACKUP` or `SAFEST`.
+    `t0`: number of first steps of the plan that were taken from a grid of controls.
     """
 
     judged: JudgedPlans
@@ -100,7 +104,10 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
 
 
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """Index of the best choice among the allowed ones; `keys` are compared in lexicographic order."""
+    """Index of the best of the allowed choices, by the `keys`, (choices,) each, where larger is better.
+
+    A later key decides between choices that are equal in all earlier ones. NaN is the smallest value.
+    """
     for key in keys:
         value = np.where(allowed & ~np.isnan(key), key, -np.inf)
         allowed = allowed & (value >= value.max() - TOLERANCE)
@@ -108,6 +115,6 @@ def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
 
 
 def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:
-    """Replace every entry of plans (…, m) that is not finite by the value of the control nearest to 0."""
+    """Replace each entry of plans (…, m) that is not finite by the admissible control value nearest to 0."""
     rest = [min(max(0.0, each.low or 0.0), each.high or 0.0) for each in controls]
     return np.where(np.isfinite(plans), plans, rest)

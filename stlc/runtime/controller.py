@@ -1,4 +1,4 @@
-"""Closed-loop decisions of an exported controller, as in `stlc simulate`, but without torch."""
+"""Decisions of an exported controller in closed loop, the same as in `stlc simulate`, but without torch."""
 
 from __future__ import annotations
 
@@ -142,8 +142,8 @@ class Controller:
             elapsed: number of steps since the previous decision.
 
         Returns:
-            The decision. A previous plan that still satisfies the specification is continued unless the new
-            plan is better.
+            The decision; it is stored for the next call. A previous plan that still satisfies the
+            specification is continued unless the new plan is better.
 
         Raises:
             RunError: R107, the state has a wrong shape or is not a number; R402, without a guard, the
@@ -174,7 +174,13 @@ class Controller:
     # ---------------------------------------------------------------------- states
 
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
-        """States as an array (agents, n), and whether a single agent was given."""
+        """Return the state as an array (agents, n), with added states, and whether it is a single agent's.
+
+        `elapsed`: number of steps since the previous decision.
+
+        Raises:
+            RunError: R107, the state has a wrong shape, names or types, is not finite, or lacks a parameter.
+        """
         if elapsed < 0:
             raise _invalid(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
         named = self._named(state) if isinstance(state, Mapping) else None
@@ -210,7 +216,14 @@ class Controller:
         return [state[name] for name in names]
 
     def _added_states(self, agents: int, elapsed: int) -> Numbers:
-        """States that the specification adds: the model's prediction; at first, those of a new mission."""
+        """States that the specification adds, if the caller does not pass them: (agents, added).
+
+        They are the model's prediction at the previous decision; before the first decision, those of a new
+        mission.
+
+        Raises:
+            RunError: R107, `elapsed` is not 1, the number of agents has changed, or a parameter has no value.
+        """
         if self._added is not None:
             if elapsed != 1 or len(self._added) != agents:
                 raise _invalid("timers follow from every step", "give them as the last columns of the state")
@@ -228,7 +241,10 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
-        """The graph's choice between the policy's plans and rests of previous plans, and all its outputs."""
+        """Choose between the policy's plans and the rests of the previous plans.
+
+        Returns all outputs of the graph, too.
+        """
         previous = self._previous
         if previous is None:
             judged, outputs = self._graphs.decided(x)

@@ -81,7 +81,7 @@ class Facts:
         requirements: names of the requirements in order.
         dt: time step in seconds.
         horizon: number of steps of a plan.
-        grid: prefixes of controls that the backup policy tries.
+        grid: prefixes (first controls of a plan) that the backup policy tries.
         graphs: file name -> content in bytes.
         feedback: feedback law around the plans; None if the actuators get the planned controls.
     """

@@ -67,12 +67,17 @@ class Graphs:
         _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Return the best of the policy's plans in states `x`, and all outputs of the graph."""
+        """Return the best of the policy's plans in states `x` with verdicts, and the outputs of the graph."""
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Return the chosen plans, given the rests `begun` of previous ones; `kept` marks continued ones."""
+        """Choose, in states `x`, between the policy's plans and `begun`, the remaining previous plans.
+
+        Returns:
+            The chosen plans with their verdicts, and all outputs of the graph; `kept`, (rows,), marks
+            previous plans.
+        """
         found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
@@ -82,9 +87,12 @@ class Graphs:
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
-        """Return the safety robustness on every prefix (first steps) of the plans, (rows, T + 1), or +inf.
+        """Upper bound on the robustness of the safety requirements, given the samples 0 to k of the states.
 
-        It is +inf if there are no safety requirements.
+        It holds for all continuations of these samples.
+
+        Returns:
+            (rows, T + 1), for k = 0, …, T; +inf if there are no safety requirements.
         """
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)

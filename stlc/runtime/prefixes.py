@@ -1,4 +1,4 @@
-"""Prefixes (first controls of a plan) for the backup policy: all of a grid, or a sample of too many.
+"""Prefixes (first controls of a plan) for the backup policy: all of a grid, or a sample of a large grid.
 
 Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. A
 "lattice" is Richtmyer's sequence of low discrepancy: entry d of point k is k sqrt(p_d) mod 1 with the d-th
@@ -34,7 +34,7 @@ class PrefixGrid:
         lengths: lengths T0 of the prefixes, in the order in which they are tried.
         batch: number of trajectories evaluated at a time.
         samples: greatest number of prefixes of one length that are tried.
-        sampling: sampling sequence, used if the grid has more prefixes.
+        sampling: sequence by which `samples` prefixes are chosen if the grid has more: "lattice" or "random".
     """
 
     values: tuple[tuple[float, ...], ...]
@@ -44,15 +44,15 @@ class PrefixGrid:
     sampling: Sampling = "lattice"
 
     def size(self, length: int) -> int:
-        """Number of prefixes of one length in the grid, M = L^(m T0)."""
+        """Number of all prefixes of one length, M = L^(m T0), for L values of each of m controls."""
         return int(prod(len(values) for values in self.values) ** length)
 
     def count(self, length: int) -> int:
-        """Number of prefixes of one length that are tried."""
+        """Number of prefixes of one length that are tried: all of the grid, but at most `samples`."""
         return min(self.size(length), self.samples)
 
     def prefixes(self, length: int) -> NDArray[np.float64]:
-        """Return the prefixes of one length that are tried, (M, length, m)."""
+        """Return the prefixes of one length that are tried, (count, length, m)."""
         if self.size(length) > self.samples:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
@@ -79,7 +79,7 @@ def generators(dims: int) -> tuple[int, ...]:
 
 
 def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
-    """The first `count` points of a sampling sequence, (count, dims), in units of 2^-64."""
+    """The first `count` points of a sampling sequence in the unit cube, (count, dims), in units of 2^-64."""
     if sampling == "lattice":
         steps = np.array(generators(dims), dtype=np.uint64)
         return np.arange(1, count + 1, dtype=np.uint64)[:, None] * steps
@@ -91,5 +91,8 @@ def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
 
 
 def below(word: NDArray[np.uint64], bounds: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Map 64-bit words to integers from 0 to `bounds` - 1; the bounds must be less than 2^32."""
+    """Map numbers in [0, 1), in units of 2^-64, to integers from 0 to `bounds` - 1, proportionally.
+
+    `word`: (…, dims). `bounds`: (dims,), less than 2^32.
+    """
     return (((word >> np.uint64(32)) * bounds) >> np.uint64(32)).astype(np.int64)

@@ -53,15 +53,19 @@ class Ranks:
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """Seed of this rank's states and searches; the first rank uses the run's seed."""
+        """Seed for the states and searches of this rank; for the first rank, the run's seed `seed` itself."""
         return (seed + self.rank * _SPREAD) % 2**63
 
     def device(self, name: str) -> str:
-        """Device of this rank; each rank takes a GPU of its own."""
+        """Torch device of this rank; of several ranks with device `cuda`, each uses a GPU of its own."""
         return f"cuda:{self.local}" if name == "cuda" and self.size > 1 else name
 
     def learn(self, weights: Iterable[nn.Parameter], value: Tensor) -> Tensor:
-        """All-reduce the gradients of weights to their mean over ranks; return the mean of `value`, ()."""
+        """Replace the gradients of `weights`, in place, by their means over the ranks (all-reduce).
+
+        Returns:
+            The mean of `value` over the ranks, ().
+        """
         if self.size == 1:
             return value
         slopes = [weight.grad for weight in weights if weight.grad is not None]
@@ -73,25 +77,25 @@ class Ranks:
         return mean.view(())
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """Means of numbers over ranks."""
+        """Mean of each number over the ranks; every rank must pass as many numbers."""
         return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
 
     def any(self, flag: bool) -> bool:
-        """True if the flag is set on any rank."""
+        """True on every rank if the flag is set on any rank."""
         return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
 
     def agree(self, value: float) -> float:
-        """Broadcast the first rank's number."""
+        """Broadcast the first rank's number and return it on every rank."""
         return self._reduced([value if self.first else 0.0], dist.ReduceOp.SUM)[0]
 
     def agree_on(self, module: nn.Module) -> None:
-        """Broadcast the first rank's weights of a module."""
+        """Broadcast the weights of the first rank's module; those of the other ranks are overwritten."""
         if self.size > 1:
             for part in module.state_dict().values():
                 self._together(lambda part=part: dist.broadcast(part, 0))  # type: ignore[misc]
 
     def agree_text(self, text: str) -> str:
-        """Broadcast the first rank's text."""
+        """Broadcast the first rank's text and return it on every rank."""
         if self.size == 1:
             return text
         data = torch.tensor(list(text.encode()), dtype=torch.uint8)
@@ -101,7 +105,11 @@ class Ranks:
         return bytes(sent.tolist()).decode()
 
     def gather(self, tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
-        """Gather tensors of the ranks after the first, in order, on the first rank; [] elsewhere."""
+        """Send the tensors of the other ranks to the first one.
+
+        Returns:
+            On the first rank, the tensors of ranks 1, 2, …; on any other rank, an empty list.
+        """
         if self.first:
             return [self._received(rank) for rank in range(1, self.size)]
         data = save_tensors({name: part.detach().cpu().contiguous() for name, part in tensors.items()})
@@ -127,7 +135,11 @@ class Ranks:
         return found
 
     def _together(self, talk: Callable[[], T]) -> T:
-        """Run a collective operation. Raises MissingError (R403) if another rank is gone."""
+        """Run a collective operation and return its result.
+
+        Raises:
+            MissingError: R403, another rank cannot be reached any more.
+        """
         try:
             return talk()
         except RuntimeError as error:
@@ -138,20 +150,20 @@ ALONE = Ranks()
 
 
 def expected() -> Ranks:
-    """Ranks from the environment variables of `torchrun`."""
+    """The rank of this process according to the environment variables of `torchrun`."""
     rank, size, local = (int(os.environ.get(name, 0)) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     return Ranks(rank, size, local) if size > 1 else ALONE
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """Connect the ranks of this training while the context is open.
+    """Context in which the ranks of this training are connected; yields that of this process.
 
     Args:
         device: torch device; on `cuda` every rank of a machine takes a GPU of its own.
 
     Raises:
-        MissingError: R403, the other ranks cannot be reached.
+        MissingError: R403, another rank cannot be reached.
     """
     ranks = expected()
     if ranks.size == 1:

@@ -1,4 +1,4 @@
-"""Training runs in parallel, each in a process of its own; a failed one does not affect the others."""
+"""Training runs in parallel, each in a process of its own; the failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ class Job:
     Attributes:
         name: identifies the job.
         arguments: arguments of `stlc train`, without `--json`.
-        inputs: input files and folders, which are sent to machines that do not share the file system.
-        runs: folder in which the run is stored, also if it comes from such a machine.
+        inputs: input files and folders; they are sent to a worker that does not share the file system.
+        runs: folder on this machine in which the run is stored, also if a worker sends it; None: the default
+            one.
     """
 
     name: str
@@ -45,8 +46,8 @@ class JobResult:
 
     Attributes:
         job: the job.
-        code: exit code; negative where a signal ended the process.
-        document: its JSON output; None without one.
+        code: exit code; negative if a signal ended the process.
+        document: JSON object that `stlc train --json` printed; None if it printed none.
         said: the last lines of its standard error.
         cores: number of cores reserved for it.
     """
@@ -59,29 +60,29 @@ class JobResult:
 
     @property
     def result(self) -> dict[str, Any]:
-        """Entry of the document about the run; empty without one."""
+        """The entry `result` of the printed JSON object, which describes the run; empty if there is none."""
         return (self.document or {}).get("result") or {}
 
     @property
     def why(self) -> str:
-        """Cause of a failure: findings of the document, else the last lines of the process."""
+        """Cause of a failure: findings in the printed JSON object, else the last lines of standard error."""
         findings = (self.document or {}).get("diagnostics") or []
         lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
         return "\n".join(lines) or self.said
 
 
 class Executor(Protocol):
-    """Executor of jobs, on this machine or on others."""
+    """Interface of executors, which run training jobs on this machine or on others."""
 
     def run(self, jobs: Sequence[Job], started: Callable[[Job], None] = ...) -> Iterator[JobResult]:
-        """Run jobs and give the result of each as it ends.
+        """Run jobs and yield the result of each when it ends.
 
-        When the caller is interrupted or closes the iterator, every process is asked to save and stop, and
-        awaited.
+        When the caller is interrupted or closes the iterator, every job that is still running is asked to
+        save and stop, and its end is awaited.
 
         Args:
-            jobs: in order.
-            started: called as each job starts.
+            jobs: jobs in the order in which they start.
+            started: function that is called with each job when it starts.
         """
 
 
@@ -89,7 +90,7 @@ class Executor(Protocol):
 class LocalExecutor:
     """Executor of `workers` local processes at a time; each is pinned to its share of the cores.
 
-    A second interrupt kills all processes. One object runs one list of jobs.
+    A second interrupt kills all processes. The method `run` of an object may be called only once.
     """
 
     workers: int
@@ -101,7 +102,7 @@ class LocalExecutor:
     def run(
         self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
     ) -> Iterator[JobResult]:
-        """Run jobs and yield the result of each as it ends; `started` is called in another thread."""
+        """Run jobs and yield the result of each when it ends; `started` is called in another thread."""
         for share in core_shares(self.workers):
             self.shares.put(share)
         with ThreadPoolExecutor(self.workers) as pool, leaving(self.kill):
@@ -116,7 +117,7 @@ class LocalExecutor:
                 raise
 
     def send(self, job: Job, started: Callable[[Job], None]) -> JobResult:
-        """Run one job to its end."""
+        """Run one job to its end on free cores, and return its result."""
         share = self.shares.get()
         try:
             process = self._start(job, share)
@@ -132,7 +133,7 @@ class LocalExecutor:
         return JobResult(job, process.returncode, document_of(out), tail, len(share))
 
     def _start(self, job: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
-        """Start the process on its share of the cores; None after `stop`."""
+        """Start the job's process on the cores `share`; return None if the executor was stopped."""
         with self.lock:
             if self.stopped:
                 return None
@@ -156,7 +157,7 @@ class LocalExecutor:
             raise
 
     def kill(self, _code: int = 0) -> None:
-        """Kill every process with its children."""
+        """Kill every process and its children."""
         for process in tuple(self.live):
             with suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -165,7 +166,7 @@ class LocalExecutor:
 def start(
     arguments: Sequence[str], share: frozenset[int] | None = None, folder: Path | None = None
 ) -> subprocess.Popen[str]:
-    """Start a training process.
+    """Start a process of `stlc train --json` with pipes for its outputs, and return it.
 
     Args:
         arguments: arguments of `stlc train`.
@@ -189,7 +190,10 @@ def start(
 
 
 def core_shares(jobs: int) -> list[frozenset[int]]:
-    """Equal shares of this process's cores for `jobs` jobs; with more jobs than cores, all cores for each."""
+    """Equal shares of this process's cores for `jobs` simultaneous jobs.
+
+    With more jobs than cores, every share contains all cores.
+    """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     cores = cores or list(range(os.cpu_count() or 1))
     if jobs > len(cores):
@@ -199,7 +203,7 @@ def core_shares(jobs: int) -> list[frozenset[int]]:
 
 
 def document_of(text: str) -> dict[str, Any] | None:
-    """JSON document in a process's output; None without one."""
+    """JSON object that a process printed; None if `text` is not one."""
     with suppress(ValueError):
         found = json.loads(text)
         if isinstance(found, dict):

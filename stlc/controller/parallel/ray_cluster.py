@@ -40,9 +40,10 @@ class RayExecutor:
     def run(
         self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
     ) -> Iterator[JobResult]:
-        """Run jobs, each with its folder of runs, and yield the result of each as it ends.
+        """Run jobs, store their runs in the jobs' folders, and yield the result of each when it ends.
 
-        When the caller is interrupted or closes the iterator, saved results are fetched.
+        When the caller is interrupted or closes the iterator, running jobs are asked to save and stop, and
+        the runs that they save are stored, too.
 
         Raises:
             MissingError: R301, Ray is not installed; R302, there is no such cluster.
@@ -76,7 +77,11 @@ class _Sent:
 
 
 def _connected(address: str) -> Any:
-    """Connect to the cluster at `address` and return the module `ray`."""
+    """Connect to the cluster at `address` and return the module `ray`.
+
+    Raises:
+        MissingError: R301, Ray is not installed; R302, there is no such cluster.
+    """
     os.environ.update({key: value for key, value in _QUIET.items() if key not in os.environ})
     try:
         ray = import_module("ray")
@@ -99,7 +104,10 @@ def _connected(address: str) -> Any:
 
 
 def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
-    """Result of a job, with its run stored among the caller's runs."""
+    """Fetch the result of the finished Ray task `done` and store its run among the caller's runs.
+
+    If the task was lost (a worker failed), the result has the exit code `LOST`.
+    """
     try:
         found = ray.get(done)
     except ray.exceptions.RayError as error:
@@ -111,7 +119,7 @@ def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
 
 
 def _call_back(ray: Any, going: dict[Any, _Sent]) -> None:
-    """Ask all jobs that are still running to save and stop, and store the runs that they saved."""
+    """Ask the running jobs `going` (Ray task -> job) to save and stop, and store the runs that they saved."""
     for each, sent in going.items():
         sent.bundle.close()
         with suppress(Exception):

@@ -1,1 +1,1 @@
-"""Planning: a plan for each of some given initial states, without training."""
+"""Planning without training: search for a plan from each given initial state."""

@@ -1,7 +1,7 @@
-"""Planners: the best plan found for each given initial state of a task.
+"""Planners: methods that search for the best plan from each given initial state, without training.
 
 A planner proposes plans; `PlanSearch` judges them exactly in float64, keeps the best plan of each initial
-state, and measures time and evaluations against the budget. A planner is one file in
+state, and compares time and number of judged plans with the budget. A planner is one file in
 `stlc.controller.methods.planners`.
 """
 
@@ -59,7 +59,8 @@ class PlanResult:
         states: initial states, (B, n).
         plans: the best plan found for each state, in physical units, (B, T, m).
         rho: robustness of that plan, (B,); -inf if no plan was found for which the states stay finite.
-        infeasible: True if the planner proved that no plan satisfies the specification, (B,).
+        infeasible: mask of the states from which the planner proved that no plan satisfies the specification,
+            (B,).
         seconds: processor time spent on each state, (B,).
         evaluations: number of plans judged for each state, (B,) int64.
     """
@@ -88,8 +89,9 @@ class PlanSearch:
         start: initial guesses of plans, (B, T, m); the middle of every control range if none were given.
         plans: the best plans found, (B, T, m).
         rho: robustness of these plans, (B,); -inf before the first plan.
-        infeasible: initial states from which, as was proved, no plan satisfies the specification, (B,).
-        ended: initial states for which the planner has nothing more to try, (B,).
+        infeasible: mask of the initial states from which the planner proved that no plan satisfies the
+            specification, (B,).
+        ended: mask of the initial states for which the planner has nothing more to try, (B,).
         seconds: processor time spent, (B,).
         evaluations: number of plans judged, (B,) int64.
     """
@@ -123,7 +125,11 @@ class PlanSearch:
         return PlanResult(self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
 
     def open(self) -> Tensor:
-        """Indices of the initial states below the target that are within the budget and not ended, (k,)."""
+        """Indices of the initial states for which the search is to continue, (k,).
+
+        The robustness is below the target, the budget is not spent, the state is not proved infeasible, and
+        the planner has not ended its search.
+        """
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
         going = (
@@ -137,7 +143,7 @@ class PlanSearch:
         return going.nonzero()[:, 0]
 
     def affordable(self, rows: Tensor, most: int) -> int:
-        """Number of plans per initial state in `rows` that the budgets still allow, from 1 to `most`."""
+        """Number of plans, from 1 to `most`, that the budget still allows for each state in `rows`."""
         left = float(most)
         if self.budget.evaluations is not None:
             left = min(left, self.budget.evaluations - int(self.evaluations[rows].max()))
@@ -147,7 +153,7 @@ class PlanSearch:
         return max(1, int(left))
 
     def offer(self, rows: Tensor, plans: Tensor, *, evaluations: int | None = None) -> Tensor:
-        """Judge plans and keep those that are better than the best plans before.
+        """Judge plans and store each one that is better than the best plan of its initial state.
 
         Args:
             rows: indices of the initial states, (k,).
@@ -174,7 +180,10 @@ class PlanSearch:
 
     @contextmanager
     def charged(self, rows: Tensor) -> Iterator[None]:
-        """Context that charges its processor time evenly to the states `rows`, (k,), and reports progress."""
+        """Context that adds its processor time to `seconds`, in equal parts for the states `rows`, (k,).
+
+        At its end, the search's function `progress` is called.
+        """
         before = process_time()
         try:
             yield
@@ -189,14 +198,14 @@ Solver: TypeAlias = Callable[[PlanSearch], None]
 
 
 class Planner(Protocol):
-    """A planner: a dataclass whose fields are its options."""
+    """Interface of planners; a planner is a dataclass whose fields are its options."""
 
     def prepare(self, task: Task) -> Solver:
-        """Return a function that searches for plans, prepared once for all initial states of a task.
+        """Return a function that improves the plans of a `PlanSearch` of this task within its budget.
 
         Raises:
             UsageError: U101, the planner cannot plan for this task; the message says why.
-            MissingError: R301, a package is missing.
+            MissingError: R301, the planner needs a package that is not installed.
         """
 
 
@@ -225,7 +234,11 @@ def planner_named(name: str, **options: Any) -> Planner:
 
 
 def _value(name: str, key: str, value: object, kind: type) -> Any:
-    """Value of an option, converted from text to its type `kind`."""
+    """Convert the value of a planner's option from text to the option's type `kind`.
+
+    Raises:
+        UsageError: U101, the text is not of this type.
+    """
     if not isinstance(value, str) or kind is str:
         return value
     try:
@@ -249,7 +262,7 @@ def plan(
     progress: Callable[[PlanSearch], None] | None = None,
     **options: Any,
 ) -> PlanResult:
-    """Plan from given states, without training.
+    """Search for the best plan from each given initial state, without training.
 
     Args:
         task: specification and system.
@@ -265,8 +278,8 @@ def plan(
         The best plans, judged exactly in float64.
 
     Raises:
-        UsageError: U101, there is no such planner or option, it cannot plan for this task, or the states have
-            other columns than its system.
+        UsageError: U101, there is no such planner or option, the planner cannot plan for this task, or `x0`
+            has another number of states than the system.
         MissingError: R301, the planner needs a package that is not installed.
     """
     given = torch.as_tensor(x0, dtype=torch.float64)
@@ -296,7 +309,7 @@ class PlannerPolicy(Policy):
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a short local search, whatever the planner: (B, n) -> (B, T, m)."""
+        """Plans by a short local search instead of the policy's planner: (B, n) -> (B, T, m)."""
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]

@@ -1,4 +1,4 @@
-"""Plans as traces: predicted states and actions, with the specification that they were planned for."""
+"""Storage of plans as traces: predicted states and actions, and the specification."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
-    """Predicted trajectories of plans as a trace file's content, one trace per initial state.
+    """Trace file's content for plans: the predicted trajectory from each initial state is one trace.
 
-    Besides the states the trace holds, of shape (traces, steps), `action.NAME` for every control, in actuator
-    units, and of shape (traces,): `plan_rho`, the plan's robustness, and `infeasible`, 1 if the planner
-    proved that no plan satisfies the specification.
+    Further arrays: `action.NAME`, the actuator commands of every control, (traces, steps); `plan_rho`, the
+    robustness of the plan, (traces,); `infeasible`, 1 if the planner proved that no plan satisfies the
+    specification, (traces,).
     """
     states = task.rollout(result.states, result.plans).numpy()
     commanded = task.system.commanded(

@@ -1,4 +1,4 @@
-"""Initial states for planning: random, written as `x=1, v=2 m/s`, or the first samples of traces."""
+"""Initial states for planning: random ones, values such as `x=1, v=2 m/s`, or first samples of traces."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         seed: seed of random states.
 
     Raises:
-        UsageError: U101, the text is none of these; U102, there is no such file.
-        TraceError: the file cannot be read, or lacks a state.
+        UsageError: U101, an assignment is invalid, or the traces lack a state; U102, there is no such file.
+        TraceError: the trace file is invalid.
     """
     if text == RANDOM:
         return task.sample(count or 1, seed=seed, dtype=torch.float64)
@@ -45,7 +45,11 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
 
 def _assignment(task: Task, part: str) -> tuple[str, float]:
-    """Name of a state and its value in SI units, from a text such as `v = 2 m/s`."""
+    """Name of a state and its value in SI units, from a text such as `v = 2 m/s`.
+
+    Raises:
+        UsageError: U101, the system has no such state, or the value is not a number with a unit.
+    """
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
         near = closest(name, task.system.names)
@@ -66,9 +70,12 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
 
 
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
-    """First samples of the traces in a file as initial states.
+    """First samples of at most `count` traces of the file `text` as initial states, (B, n) float64.
 
-    A trace has no timers (states that the specification adds); they are those of random initial states.
+    A state that the specification adds (timer or parameter) is random if the traces do not contain it.
+
+    Raises:
+        UsageError: U101, the traces lack a state; U102, there is no such file.
     """
     if not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")

@@ -1,8 +1,8 @@
-"""Policies from states to plans: a set of candidate plans per state, of which exact verdicts select one.
+"""Policies: map states to candidate plans, and select one of them by exact verdicts.
 
 A continuous function cannot jump from a path left of an obstacle to one right of it; a set of several plans
-can, and judging a few plans exactly costs well under a millisecond. Planners, and actors that give one action
-per step, propose a single plan.
+can, and judging a few plans exactly costs well under a millisecond. Planners propose a single plan, and so do
+policies that are made from an actor (state -> action).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Policy(ABC):
 
     Attributes:
         task: task whose verdicts select the plan; `for_task` returns the policy for another task.
-        network: network that proposes the plans; None if there is none: such a policy cannot be exported.
+        network: network that proposes the plans. A policy without network (None) cannot be exported.
     """
 
     network: PlanNetwork | None = None
@@ -59,7 +59,10 @@ class Policy(ABC):
         return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans from the predicted ends of many prefixes; like `plan`, but cheaper if planning is slow."""
+        """Plans from the states at the ends of many prefixes (first actions of plans): (B, n) -> (B, T, m).
+
+        They are those of `plan`, or, if this is slow, plans that are cheaper to compute.
+        """
         return self.plan(x0)
 
     def __call__(self, x0: Tensor) -> Tensor:
@@ -112,8 +115,8 @@ class PlanNetwork(nn.Module):
     Attributes:
         plans: number of plans.
         mirror: the system's symmetry; None if it has none or the method does not use it.
-        centre: mean of the observations over initial states, (k,).
-        spread: their standard deviation, (k,).
+        centre: mean of the observations, (k,), by which the network's inputs are centred.
+        spread: standard deviation of the observations, (k,), by which the network's inputs are divided.
     """
 
     centre: Tensor
@@ -135,10 +138,10 @@ class PlanNetwork(nn.Module):
         self.register_buffer("spread", torch.ones(widths[0]))
 
     def normalise(self, x0: Tensor) -> None:
-        """Set the mean and the deviation of the inputs from a sample of states, (n, dim).
+        """Set `centre` and `spread` to mean and standard deviation of the observations of states (n, dim).
 
-        For timers they are computed from the timers' ranges, because early in training missions end soon, so
-        that the sample does not contain late times.
+        For timers, both are computed from the range of the timer, because early in the training missions end
+        soon, and late times do not occur in the states.
         """
         observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)
@@ -160,7 +163,7 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """States mirrored onto one side of the symmetry, and the mask of the mirrored ones, (B,).
+        """Mirror the states on one side of the symmetry; return all states, and a mask of those, (B,).
 
         Without a symmetry the states are unchanged, and the mask is None.
         """
@@ -168,7 +171,7 @@ class PlanNetwork(nn.Module):
 
 
 class BestOfKPolicy(Policy):
-    """Trained policy: the network proposes plans, the monitor selects the best."""
+    """Trained policy: a network proposes several plans, and their exact robustness selects the best."""
 
     network: PlanNetwork
 
