@@ -45,7 +45,11 @@ def plain(value: object) -> Json:
 
 
 def _foreign(value: object) -> Json:
-    """Convert an object to JSON data if it is a dataclass, or an array with `tolist` (NumPy, torch)."""
+    """Convert an object to JSON data: a dataclass, or an array with a method `tolist` (NumPy, torch).
+
+    Raises:
+        TypeError: the object is none of these.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
     to_list = getattr(value, "tolist", None)

@@ -70,12 +70,12 @@ class SearchOptions:
     """Parameters of a local search in native code; all arrays are contiguous float64.
 
     Attributes:
-        bounds: lowest and highest value of each control, and 1 for a periodic angle, (3, m).
+        bounds: lowest value, highest value, and 1 for a periodic angle (else 0) of each control, (3, m).
         factors: weight / scale of each requirement, (R,); the search maximises the least of the robustness
             values multiplied by these.
         bank: plans that satisfied the specification from other states, (k, T, m); a change may replace the
             last part of a plan, or all of it, by that of one of these.
-        generations: largest number of iterations, in each of which `LANES` changes of the best plan are
+        generations: largest number of iterations, in each of which several changes of the best plan are
             tried.
         enough: robustness at which the search for one initial state ends.
         seed: seed of the random changes.
@@ -148,9 +148,9 @@ class Kernel:
             threads: number of threads; the result does not depend on it.
 
         Returns:
-            Improved plans, (B, T, m), and their robustness, (B,), which is -inf if a state is NaN. If the
-                search was stopped early, plans that were not reached are unchanged, and their robustness is
-                NaN.
+            Improved plans, (B, T, m), and for each the least of its robustness values times `search.factors`,
+            (B,), which is -inf if a state is NaN. After an early stop, plans that were not reached are
+            unchanged, and this number is NaN.
 
         Raises:
             MemoryError: there is not enough memory.
@@ -268,8 +268,7 @@ class Advance:
             share: elapsed share of the episode, stored as the last value of every observation.
 
         Returns:
-            The states after the step, (B, n), their observations, (B, k + 1), and the rewards, (B,), or None
-                if the library computes none.
+            The states after the step, (B, n), their observations, (B, k + 1), and the rewards, (B,), or None.
         """
         after = np.empty_like(x)
         seen = np.empty((len(x), self._seen + 1), dtype=np.float32)
@@ -378,7 +377,7 @@ def why_none(text: str) -> str:
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
     """Return the library of a C code for the compiler `using`, from the cache or newly built.
 
-    It is None if it cannot be built or loaded for lack of room.
+    It is None if the disk is full or the operating system refuses to load it.
 
     Raises:
         CompilerError: the compiler cannot be used, or failed for this code a short while ago.
@@ -488,7 +487,7 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Compile C code once, with vectorised sine and similar functions if the C library has them.
+    """Compile C code with the option `level` (such as `-O3`), and with vectorised sine etc. if available.
 
     Returns:
         The reason if the compiler failed, else "".

@@ -25,7 +25,7 @@ def closest(name: str, candidates: Iterable[str]) -> str | None:
     """Return the candidate that is most similar to a misspelt `name`, or None if none is similar.
 
     A candidate that differs only in case comes first; then one whose edit distance (with transpositions) is
-    at most a third of the number of letters, or 1; then the most similar one by Python's difflib.
+    at most 1, or at most a third of the number of letters; then the most similar one by Python's difflib.
     """
     pool = sorted({word for word in candidates if 0 < len(word) <= _LONGEST and word != name})
     if len(name) > _LONGEST:
@@ -50,7 +50,7 @@ def _ratio(left: str, right: str) -> float:
 
 
 def _distance(left: str, right: str) -> int:
-    """Optimal string alignment distance of two words: a transposition counts as one edit."""
+    """Edit distance of two words (optimal string alignment): a transposition counts as one edit."""
     before: list[int] = []
     above = list(range(len(right) + 1))
     for i, a in enumerate(left, start=1):

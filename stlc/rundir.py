@@ -1,4 +1,4 @@
-"""Folder of a training run, `runs/<spec>/<number>-<words>`, with everything needed to repeat the run.
+"""Folder of a run, `runs/<spec>/<number>-<words>`, with everything needed to repeat the run.
 
 A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
 to the newest. Whole files are written atomically; rows are appended so that a kill loses at most the last

@@ -56,7 +56,7 @@ class Span:
 
     @property
     def text(self) -> str:
-        """The characters of the span."""
+        """Text at this location."""
         return self.source.text[self.start : self.end]
 
     def to(self, other: Span) -> Span:

@@ -1,4 +1,4 @@
-"""Lint rules on the syntax tree or the text; sorts, units and times are checked by the compiler."""
+"""Lint rules on the syntax tree or the text; types, units and times are checked by the compiler."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """Return the spelling of another tool's word or sign in this language; None to keep the lexeme."""
+    """Return the word or sign of this language for that of another tool; None to keep the lexeme `item`."""
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":

@@ -30,7 +30,7 @@ _INSTANT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Options that apply to every trace.
+    """Options on how traces are read and judged, the same for all traces of a command.
 
     Attributes:
         spec: path of a specification; None: the one stored in the trace.
@@ -39,11 +39,12 @@ class Question:
         require: names of the judged requirements; all if empty.
         at: instant at which judging starts: a sample, a time, or `all`; None: the instants that the
             requirements imply.
-        end: treatment of traces that are too short.
+        end: treatment of traces that are too short: "open" (bounds), "strict" (an error) or "truncate" (cut
+            windows).
         tolerance: a requirement is satisfied if its robustness is at least minus this.
         resample: time step of the grid for resampling, in seconds.
         overrides: constant -> its value, as text.
-        semantics: semantics of the reported robustness.
+        semantics: name of the semantics of the reported robustness, such as "exact".
         dt: seconds between samples that have no clock.
         max_gap: longest gap between samples, in seconds, in which signals are known.
     """
@@ -126,7 +127,7 @@ def judge(name: str, question: Question, runs: Path) -> Checked:
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
-    """Remark that names the trace judged, if it was found in the newest run's folder."""
+    """Remark that names the judged trace if it was found in the folder of the newest run, else ()."""
     return () if path == Path(name) else (f"taking {path}, of the newest run",)
 
 
@@ -203,7 +204,7 @@ def _monitor(
 
 
 def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
-    """The sample of a trace that the option `--at` names; "all" and None are returned unchanged.
+    """Index of the sample of a trace that the option `--at` names; "all" and None are returned unchanged.
 
     Args:
         text: value of the option: a sample, a time, or "all".
@@ -238,7 +239,11 @@ def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int |
 
 
 def time_step(option: str, text: str | None) -> float | None:
-    """Parse a time step in seconds. Raises UsageError (U101)."""
+    """Parse the value of `option` as a time step and return it in seconds; None is returned unchanged.
+
+    Raises:
+        UsageError: U101, the text is not a time with a unit, or not above 0.
+    """
     if text is None:
         return None
     seconds = _seconds(option, text, "a time with its unit: 0.1s, 20ms")

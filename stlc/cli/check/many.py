@@ -133,7 +133,7 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
-    """The most important requirement: a violated one, else an inconclusive one, else the least robust."""
+    """Row shown for a file: a violated requirement, else an inconclusive one, else the least robust one."""
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
     return min(rows, key=lambda row: (order[row.status], row.least))
 

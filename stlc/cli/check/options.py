@@ -52,7 +52,7 @@ class Traces:
     runs: RunsOption = Path("runs")
 
     def question(self, **more: Any) -> Question:
-        """Return the options as a `Question`; `more` sets the fields of it that are no options here.
+        """Return the options as a `Question`; `more` sets further fields, such as `at`.
 
         Raises:
             UsageError: U101, the value of an option is malformed.

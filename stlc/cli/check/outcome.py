@@ -93,9 +93,9 @@ class Outcome:
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
     """Exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
-    With `fail_under`, 0 means that at least this share of the start instants satisfies all requirements, and
-    1 that fewer can. A file that cannot be judged takes precedence over every verdict. Traces to which the
-    specification does not apply (out of scope) do not count.
+    With `fail_under`, 0 means that at least this share of the start instants satisfies all requirements, 1
+    that it cannot be reached, and 4 that this is undecided. A file that cannot be judged takes precedence
+    over every verdict. Traces to which the specification does not apply (out of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:

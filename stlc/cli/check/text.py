@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> str:
-    """The printed result of one trace."""
+    """Text that `stlc check` prints for one trace."""
     trace, verdict = result.trace, result.verdict
     title = (
         f"{visible(result.source.name)} on {visible(trace.name)}    "

@@ -39,9 +39,9 @@ def compile_(
 ) -> Answer[documents.CompileResult]:
     """Show the compiled form of a specification, or its syntax tree.
 
-    Intervals in seconds and in steps, added states, the safety part, the horizon. --show ast prints the
-    syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc lint` also names, types
-    and units.
+    The compiled form lists intervals in seconds and in steps, added states, the safety part, and the horizon.
+    --show ast prints the syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc
+    lint` also names, types and units.
     """
     from stlc.diagnostics import usage
 

@@ -131,9 +131,9 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """Command to run next, which trains for the first specification in `files` that is for training.
+    """Command to run next: training for the first specification in `files` that is meant for training.
 
-    A specification by which a system judges closed-loop runs is not for training.
+    A specification by which a system judges closed-loop runs is not meant for it.
     """
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}

@@ -50,9 +50,9 @@ def lint(
 ) -> Answer[LintedFiles]:
     """Report errors and warnings in specifications.
 
-    Syntax, types, units, parentheses, unused names, vacuous requirements; with --system also checks against
-    the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors. `stlc explain CODE` says what a
-    code means.
+    Checks syntax, types, units, parentheses, unused names and vacuous requirements; with --system also that
+    the specification fits the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors. `stlc
+    explain CODE` says what a code means.
     """
     from stlc.files import find_spec, read_source, write_atomic
     from stlc.lint.lint import Selection

@@ -122,7 +122,7 @@ def rm(
 
 
 def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Flatten a nested record to texts by dotted names, `key.sub` -> text."""
+    """Flatten a nested record into a mapping from dotted names (`key.sub`) to texts."""
     flat: dict[str, str] = {}
     for key, value in record.items():
         if isinstance(value, Mapping):

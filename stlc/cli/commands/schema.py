@@ -40,7 +40,7 @@ def names() -> list[str]:
 
 
 def load_schema(name: str) -> dict[str, Any]:
-    """Schema of a complete JSON document: the frame that all commands share, and one command's result.
+    """Schema of a complete JSON document: the keys that all commands share, and one command's result.
 
     Raises:
         UsageError: U101, there is no such schema.

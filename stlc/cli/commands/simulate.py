@@ -198,10 +198,9 @@ def _planner(
 def _run_of(
     run: str, choice: PlannerChoice | None, system: str | None, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """Name or folder of the run to simulate.
+    """Return the name of the run to simulate: `run` itself, or with a planner the folder of a new run.
 
-    With a planner, a run folder is created for it, and `run` is the specification; without one, `run` is
-    returned.
+    With a planner, `run` is the specification, and the folder is created.
     """
     if choice is None:
         return run
@@ -314,8 +313,8 @@ def _satisfied(document: Simulation, guard: Mode) -> float:
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
     """Simulate without a scenario and with each of `scenarios`, and return one record of all results.
 
-    It is also written to the run's folder, as is the trace of the simulation without a scenario; the traces
-    under scenarios are replaced.
+    The record is also written to the run's folder, and so is the trace of the simulation without a scenario,
+    which replaces the traces of the scenarios.
     """
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():

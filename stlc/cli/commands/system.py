@@ -112,7 +112,7 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
     """Simulate random initial states under random controls; return the warnings.
 
-    Raises SystemFileError if the initial set or the dynamics fail.
+    Raises SystemFileError if no initial states can be sampled, or if a simulated state is not finite.
     """
     import torch
 
@@ -131,7 +131,7 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
     """Compare the kinematics of robots read from URDF files with those that pytorch-kinematics computes.
 
-    Raises SystemFileError if they differ.
+    Raises SystemFileError (S208) if they differ.
     """
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:

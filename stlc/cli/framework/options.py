@@ -175,14 +175,14 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_count(text: str, option: str) -> int:
-    """A whole number of at least 1. Raises UsageError (U101) for anything else."""
+    """Parse a whole number of at least 1, the value of `option`. Raises UsageError (U101)."""
     if re.fullmatch(r"\s*0*[1-9]\d{0,17}\s*", text, re.ASCII):
         return int(text)
     raise usage(f"`{option} {text}` is no number from 1 on", f"{option} 1200")
 
 
 def parse_limit(text: str) -> float | None:
-    """A duration in seconds, or None for `none`. Raises UsageError (U101) for anything else."""
+    """Parse a duration, returned in seconds, or `none`, returned as None. Raises UsageError (U101)."""
     return None if text.strip() == "none" else parse_seconds(text)
 
 

@@ -34,7 +34,7 @@ _STYLES = {
 
 @dataclass(frozen=True, slots=True)
 class _Paint:
-    """Applies a style to text, or leaves it plain."""
+    """Function that adds the colour codes of a style to a text if `color`; else it returns the text."""
 
     color: bool
 
@@ -181,7 +181,7 @@ def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
 
 
 def _width(char: str) -> int:
-    """Columns that a character takes in a terminal."""
+    """Number of columns that a character takes in a terminal: 0, 1 or 2."""
     if unicodedata.category(char) in ("Mn", "Me"):
         return 0
     return 2 if unicodedata.east_asian_width(char) in ("W", "F") else 1

@@ -137,7 +137,7 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _condition(text: Text, start: int, end: int) -> Group:
-    """Return the group of `if … then … else …`; if it is too long for a line, branches get their own."""
+    """Return the group of `if … then … else …`; if it is too long for a line, each branch gets its own."""
     marks: list[int] = []
     index, depth = start, 0
     while index < end and depth >= 0:
