@@ -23,7 +23,7 @@ from stlc.diagnostics import usage
 from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation, task_of
 
 Reward: TypeAlias = Literal["robustness", "accuracy", "task", "dense"]
-"""`dense` is the increase of the robustness in each step: in sum that of the episode less its start's."""
+"""Name of a reward. `dense` rewards add up to the robustness of the episode less that of its first state."""
 
 AHEAD = 64
 """Initial states that are drawn at a time."""
@@ -173,7 +173,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
 
 class _Motion(Protocol):
-    """Dynamics that move the agent: the model or the world of a system. States are (1, n) float64."""
+    """Motion of the agent, on the model of a system or in its world. States are (1, n) float64."""
 
     def seed(self, seed: int) -> None:
         """Set the seed of all random numbers; it takes effect with the next episode."""
@@ -189,7 +189,7 @@ class _Motion(Protocol):
 
 
 class _OnModel:
-    """Dynamics of the model of the system."""
+    """Motion of the agent on the model of the system, without disturbances."""
 
     def __init__(self, task: Task) -> None:
         self._episodes = Environments(task, 1, generator=torch.Generator(), ahead=AHEAD)
@@ -207,7 +207,7 @@ class _OnModel:
 
 
 class _InWorld:
-    """Dynamics of the world of the system (closed-loop simulation); each episode has a new world."""
+    """Motion of the agent in the world of the system (closed-loop simulation), anew in each episode."""
 
     def __init__(self, task: Task, steps: int) -> None:
         self._task, self._steps, self._type = task, steps, world_type(task.system.decl)

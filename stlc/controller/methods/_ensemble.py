@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 LOWEST, HIGHEST = -10.0, 0.5
 """Initial bounds on the logarithm of a variance, in units of the spread of the targets."""
 BOUNDS = 0.01
-"""Weight of the distance between these bounds in the loss."""
+"""Weight in the loss of the distance between the bounds on the logarithm of a variance."""
 STILL = 1e-7
-"""Spread of a change, as a share of the spread of the column itself, below which the column is constant."""
+"""Standard deviation of a change, as a share of that of the state, below which the state is constant."""
 GAIN = 0.01
-"""Fall of a validation error, as a share of it, that counts as an improvement (Janner et al. 2019)."""
+"""Relative fall of a validation error that counts as an improvement (Janner et al. 2019)."""
 FEWEST = 2
-"""Validation samples below which all samples are trained on."""
+"""Number of validation samples below which all samples are used for training."""
 
 
 class BatchedMlp(nn.Module):
@@ -355,6 +355,6 @@ class _Best:
 
     @torch.no_grad()
     def restore(self) -> None:
-        """Set every network to its stored weights; without validation data none are stored or changed."""
+        """Set every network to its stored weights; do nothing without validation data."""
         for kept, now in zip(self._kept, self._ensemble.body.parameters(), strict=False):
             now.copy_(kept)

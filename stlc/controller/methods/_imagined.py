@@ -282,8 +282,8 @@ class ModelLearner(Learner):
     def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
         """Simulate `config.environments` episodes and store them; train the ensemble if enough were added.
 
-        Enough are the share `config.growth` of the episodes at its last training. The first call simulates at
-        least `config.first` episodes, with random controls.
+        The ensemble is trained once the number of episodes has grown by the share `config.growth` since its
+        last training. The first call simulates at least `config.first` episodes, with random controls.
 
         Args:
             act: function from states (N, n) and the step to controls (N, m); None for random controls.

@@ -40,7 +40,7 @@ SAMPLED = 4096
 NARROW = 1e-4
 """Spread below which observations are not scaled."""
 SEEDS = 2**32
-"""Number of seeds that NumPy takes."""
+"""Number of different seeds that NumPy accepts."""
 CRITICS = [256, 256]
 """Widths of the critics, the library's default."""
 STORED = ("observations", "next_observations", "actions", "rewards", "dones")
@@ -83,7 +83,8 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
 
         Returns:
             Normalised observations (N, k), rewards (N,), whether the episodes ended (N,), and one dictionary
-            per episode: at its end with `terminal_observation` (k,), the observation before the restart.
+            per episode. If the episode ended, its dictionary holds `terminal_observation` (k,), the last
+            observation before the restart.
         """
         result = self.environments.step(self._actor.controls(self._actions))
         done = result.done.numpy()

@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 ROWS = 20_000
-"""Imagined states that are advanced at a time, at most."""
+"""Maximum number of imagined states that are advanced at a time."""
 LEAST = 1e-3
 """Least standard deviation of a population, as a share of the width of a control range."""
 EVERY, POOL = 10, 16
-"""Steps between validations, and the states judged by one: a plan costs far more than a network's."""
+"""Steps between validations, and states judged by one; few, since a plan takes a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class PetsPolicy(Policy):
 
     @torch.no_grad()
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans found by a single round of one search over the whole plan: (B, n) -> (B, T, m)."""
+        """Plans found quickly, by a single round of one search over the whole plan: (B, n) -> (B, T, m)."""
         other = PetsPolicy(self.task, self._model, replace(self._config, ahead=0, rounds=1))
         generator = torch.Generator().manual_seed(self._config.seed)
         return other.sequence(x0.float(), generator).to(x0)

@@ -25,9 +25,9 @@ Reward: TypeAlias = Literal["task", "robustness", "accuracy"]
 REWARDS: tuple[Reward, ...] = get_args(Reward)
 
 SATISFIED = 100.0
-"""Reward `accuracy` of an episode that satisfies the specification (the paper's RL_A)."""
+"""Reward `accuracy` of an episode that satisfies the specification (RL_A of Meng and Fan 2023)."""
 MOST = 10.0
-"""Bound on both sides of the reward `robustness`, which may be infinite."""
+"""Bound on the magnitude of the reward `robustness`, since robustness may be infinite."""
 
 
 def require_reward(task: Task, reward: str) -> None:

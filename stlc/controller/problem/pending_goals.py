@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from stlc.compile.pipeline import Compiled
 
 HELD = 0.5
-"""A status within plus and minus this is pending."""
+"""Magnitude of a status below which the goal is pending."""
 
 
 @dataclass(frozen=True, slots=True)

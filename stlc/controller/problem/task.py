@@ -36,13 +36,13 @@ MOST_VALUES = 32_000_000
 FLOAT32_SLACK = 1e-5
 """Float32 rounding tolerated in a margin that is 0 by construction."""
 TIE = 1e-4
-"""Weight of the cost between plans of equal robustness, which is flat where a deadline cannot be met."""
+"""Weight of the cost among violating plans, whose robustness is the same where a deadline cannot be met."""
 GUIDANCE = 0.1
 """Weight of the guidance cost towards the next goal among the performance terms."""
 GOALS = 3.0
-"""Weight of the margin shortfall of pending goals below gamma among the performance terms."""
+"""Weight among the performance terms of the amounts by which margins of pending goals are below gamma."""
 SHORTFALL = 10.0
-"""Weight of a mission plan's margin shortfall below gamma in the cost that selects plans."""
+"""Weight of the amount by which robustness is below gamma, in the cost that selects plans of a mission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,8 +287,9 @@ class Task:
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
         """Sum of the performance terms, whether or not a plan satisfies the specification: (batch,).
 
-        In a mission (a specification that adds timers to the state), the amounts by which the margins of
-        pending goals are below gamma and the guidance cost (distance to the next goal) are added.
+        In a mission (a specification that adds timers to the state), two further terms are added: the amounts
+        by which the margins of pending goals are below gamma, and the guidance cost (distance to the next
+        goal).
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -310,7 +311,7 @@ class Task:
 
     @cached_property
     def _guidance(self) -> ArrayProgram | None:
-        """Program for the guidance cost `gap` at each sample: distance to the next goal; None without one."""
+        """Program for the guidance cost `gap` (distance to the next goal) at each sample; None: no goals."""
         return (
             None
             if self.compiled.guidance_cost is None

@@ -29,7 +29,7 @@ HELD_OUT_SEED = 981_273
 MISSION_HOLD = 0.7
 """Share of steps at peak learning rate on missions, whose training states change as the policy improves."""
 MISSION_MOST = 128
-"""Maximum number of repaired states on missions, whose failing states are often infeasible and alike."""
+"""Maximum number of hard states per search round on missions, where they are often infeasible and alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     """Resolve the options of a run: those of the user, else of the system file, else of the method.
 
     Raises:
-        UsageError: U101, there is no such method.
+        UsageError: U101, there is no such method or option, or a value is invalid.
     """
     name = config.method or task.system.decl.train.method or METHODS.default
     found: ResolvedConfig = METHODS.get(name).resolve(task, config)

@@ -1,7 +1,7 @@
 """Diagnosis of trainings that fail.
 
-The causes are a declared mirror symmetry that the system lacks, a non-finite quantity in a training step, and
-a requirement that no plan satisfies.
+It finds a declared mirror symmetry that the system lacks, a non-finite quantity in a training step, or a
+requirement that no plan satisfies.
 
 A training step computes network -> plans -> states -> robustness of each requirement and performance terms ->
 gradient; the first of these that is not finite is reported. A search that finds no plan does not prove that
@@ -427,7 +427,7 @@ SAMPLES = 1024
 NEAR = 1e-6
 """Rounding tolerance, relative to 1 or to the value, whichever is larger."""
 ODD = 0.02
-"""Share of samples that may disagree: rounding decides nearly tied switches."""
+"""Share of samples that may disagree, since rounding decides conditions that are nearly tied."""
 
 
 def check_mirror(task: Task) -> None:

@@ -42,13 +42,13 @@ CHILDREN = 512
 KEPT = 512
 """Maximum number of prefixes per layer."""
 FINE, COARSE = 24, 5
-"""Cells per state that the specification reads, and per other moving state."""
+"""Number of cells along each state that the specification reads, and along each other moving state."""
 COUNTED = 6
-"""Cells along a timer."""
+"""Number of cells into which the range of a timer is divided."""
 GROWTH = 0.1
 """Mean share of the horizon by which a prefix is extended at once."""
 NEAR = 8.0
-"""Preference of the nearest prefixes over the farthest, as a power of e."""
+"""Logarithm of the factor by which prefixes of the greatest worth are preferred to those of the least."""
 EFFORTS = (8, 24, 72)
 """Sweeps for a plan of `USUAL` steps: first attempt, and increased effort after failures."""
 USUAL = 30
@@ -56,7 +56,7 @@ USUAL = 30
 BATCH = 8
 """Sweeps from one start before the next start's turn."""
 TAILS = 8
-"""Number of instants of a found plan whose remainder is tried as a plan too."""
+"""Number of instants of a plan at which its remainder is tried as a plan too."""
 RAISED = 250
 """Generations of the local search that increases the margin of a found plan."""
 

@@ -47,15 +47,18 @@ MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
 TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
-"""Limits for searches in torch, which are some hundred times slower: states for the margin, states, tries."""
+"""Limits for searches in torch, which are some hundred times slower than native ones.
+
+They are: states for the margin, states per search round, and plans tried per state.
+"""
 BARREN = 0.05
 """Share of failing states solved by local search below which exploration is used too."""
 LEARNT = 0.5
 """Accuracy on fresh states from which on exploration is not used."""
 EXPLORED = 4
-"""Maximum number of starts explored before a round."""
+"""Number of initial states that are explored before a search round."""
 RISE = 30
-"""Steps of the rise to a held peak learning rate; independent of the total number."""
+"""Steps over which the learning rate rises if its peak is held; independent of the total number of steps."""
 
 
 class Trainer(Learner):
@@ -420,7 +423,7 @@ class Trainer(Learner):
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """Tensors and numbers of a checkpoint for this rank, whose own entries replace those of the first."""
+        """Tensors and numbers of a checkpoint for this rank, with its own entries in place of the first's."""
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")

@@ -1,7 +1,4 @@
-"""Training loss: truncated robustness plus performance terms, as in Meng and Fan (2023, Eq. 8 to 10).
-
-"The paper" in this file is Meng and Fan (2023).
-"""
+"""Training loss: truncated robustness plus performance terms, as in Meng and Fan (2023, Eq. 8 to 10)."""
 
 from __future__ import annotations
 
@@ -23,16 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """Parameters of the loss.
+    """Parameters of the loss; gamma, k and lambda are the symbols of Meng and Fan (2023).
 
     Attributes:
-        margin: the paper's gamma; robustness above it does not reduce the loss.
-        smoothing: the paper's k of smooth min and max; None: exact min and max with subgradients.
+        margin: gamma; robustness above it does not reduce the loss.
+        smoothing: k of smooth min and max; None: exact min and max with subgradients.
         switch: functions whose derivatives replace those of jumps and conditions in the dynamics.
         saturation: s of `s log(1 + hinge / s)`, which keeps infeasible states from dominating; None: plain
             hinge.
-        stl_weight: the paper's lambda.
-        performance_weight: factor of the performance terms.
+        stl_weight: lambda, the weight of the hinge on robustness.
+        performance_weight: weight of the performance terms.
     """
 
     margin: float
@@ -44,7 +41,7 @@ class Objective:
 
 
 def paper_objective(task: Task) -> Objective:
-    """The paper's objective (Eq. 6 to 10): a hinge, at margin gamma, on smooth robustness.
+    """Objective of Meng and Fan (2023, Eq. 6 to 10): a hinge, at margin gamma, on smooth robustness.
 
     Minima and maxima are smoothed by log-sum-exp, and conditions in the dynamics by tanh.
     """
@@ -70,7 +67,7 @@ def guided_objective(margin: float, *, slope: float, performance_weight: float) 
 
 
 def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
-    """Compute the loss of plans (Eq. 10: L_perf + lambda L_STL).
+    """Compute the loss of plans, L_perf + lambda L_STL (Meng and Fan 2023, Eq. 10).
 
     Args:
         task: specification and system.

@@ -114,15 +114,15 @@ class FixedSet:
 
 
 Planner: TypeAlias = Callable[[Tensor], "PlanVerdicts"]
-"""States (B, n) -> verdicts on the followed plans."""
+"""Function from states (B, n) to verdicts on the plans that are followed from them."""
 
 POOL = 2048
 GLIMPSES = 4
-"""Number of states returned per leg of a mission."""
+"""Number of states returned per leg of a mission (the part of a plan that is followed)."""
 STARTS = 0.1
-"""Share of mission starts among the returned states."""
+"""Number of initial states that are added to the returned states, as a share of them."""
 ROUNDS = 5
-"""Number of periods for which a mission without end is simulated."""
+"""Number of periods for which a mission with requirements that recur forever is simulated."""
 GIVE_UP = 0.3
 """Probability that a mission ends after a leg whose plan fails."""
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MOST = 4_000_000
 """Maximum number of plan entries that are judged at a time."""
 SAME = 1e-5
-"""Change of the elites' mean at which a start has converged; the next round restarts it."""
+"""Change of the elites' mean at which the search from an initial state has converged and begins anew."""
 
 
 class _Space(Protocol):

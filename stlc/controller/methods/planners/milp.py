@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FOUND, IMPOSSIBLE, UNKNOWN = "found", "impossible", "unknown"
 FINEST = 1e-9
-"""Feasibility tolerance of the solver, well below the margin of the conditions."""
+"""Feasibility tolerance of the solver, well below `MARGIN`, the distance kept from boundaries."""
 MOST_RHO = 1e6
 
 

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 PIECES = 5
-"""Constant pieces of a drawn guess."""
+"""Number of constant pieces of a random guess."""
 ROUNDS = 2
-"""Programs of a guess: the second has a margin for what the verdict on the first plan lacked."""
+"""Maximum number of programs solved from a guess; the second one has a larger margin."""
 NEARLY = 0.1
-"""Greatest shortfall of a first solution that a greater margin may mend."""
+"""Violation of the first program above which the second one is not tried."""
 
 
 @dataclass(frozen=True, slots=True)
