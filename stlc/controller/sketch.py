@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Scene: TypeAlias = Mapping[str, NDArray[Any]]
 
 DECIDED = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
-"""Colours by `stlc.controller.guard.guard.SOURCES`; distinguishable for colour-blind readers."""
+"""Colours by the source of a plan (`SOURCES`); distinguishable for colour-blind readers."""
 DECIDERS = ("policy", "backup", "safest prefix", "polished plan")
 """Labels of the colours."""
 VIOLATED = "#c4161c"
@@ -92,7 +92,8 @@ def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> 
 def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int) -> None:
     """Draw a ring and the number of each agent that violates a requirement, at `places`, (agents, 2).
 
-    `scene["violated"]`, (frames, agents), says which agents do at frame `index`; without it nothing is drawn.
+    `scene["violated"]`, (frames, agents), marks these agents; without it nothing is drawn. `index`: the
+    present frame.
     """
     if "violated" not in scene:
         return
@@ -155,6 +156,6 @@ def pieces(
 ) -> None:
     """Draw a copy of the line segment `piece`, (2 end points, 2), at each of `places`, (k, 2).
 
-    It is for worlds in older run folders.
+    Only worlds in older run folders use this function.
     """
     segments(axes, places[:, None] + piece, color, width)

@@ -82,7 +82,7 @@ class Redrawing(Protocol):
     def redraw(self, rows: Tensor) -> Tensor:
         """Draw the initial states of the agents `rows`, (k,) int64, again; return all states, (agents, n).
 
-        Other agents keep their states, unless these depend on the redrawn ones.
+        The states of other agents change only if they depend on the redrawn ones.
         """
 
 
@@ -150,7 +150,7 @@ class ModelWorld:
         return {}
 
     def snapshot(self) -> Scene:
-        """The states, (agents, n), and the names of their columns, (n,)."""
+        """The states, (agents, n), as `state`, and the names of the states, (n,), as `names`."""
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
@@ -159,7 +159,7 @@ class ModelWorld:
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Draw agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
+        """Draw agents in the plane of the first two states; `scene["state"]` is (frames, agents, n)."""
         names, state = scene["names"][index], scene["state"]
         decided = deciders(scene, index, state.shape[1])
         second = min(1, state.shape[2] - 1)

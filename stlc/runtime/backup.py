@@ -66,10 +66,10 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 
 
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
-    """All plans for one prefix length T0, with verdicts.
+    """All plans for the prefix length T0 = `length`, with verdicts, one per row.
 
-    The first T0 steps are a prefix from the grid (in the first plan: those of the policy's own plan), the
-    others come from the policy.
+    The first T0 steps of a plan are a prefix from the grid (in the first row, those of the policy's own plan
+    `own`); the other steps come from the policy.
     """
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))

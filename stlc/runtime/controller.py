@@ -241,9 +241,10 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
-        """Choose between the policy's plans and the rests of the previous plans.
+        """Choose between the policy's plans and the rests of the previous plans, in states (agents, n).
 
-        Returns all outputs of the graph, too.
+        Returns:
+            The chosen plans, and all outputs of the ONNX graph that chose them.
         """
         previous = self._previous
         if previous is None:

@@ -44,7 +44,9 @@ class ControllerQuantity:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackGains:
-    """Feedback law around the plans: the actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+    """Feedback law around the plans: actuator commands from planned controls v.
+
+    The commands in the state x are clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
 
     Attributes:
         gain: K, (m, n), without states that the specification adds.

@@ -24,7 +24,7 @@ class JudgedPlans:
         plan: controls, (rows, T, m), in physical units.
         rho: robustness of the specification, (rows,); -inf if the plan is not a number.
         safe: robustness of the safety requirements alone, (rows,); +inf if there are none.
-        cost: cost of the plan, (rows,).
+        cost: performance cost of the plan, (rows,).
         each: robustness of each requirement, (rows, R).
     """
 

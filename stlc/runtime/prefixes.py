@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Sampling: TypeAlias = Literal["lattice", "random"]
 SAMPLINGS: tuple[Sampling, ...] = get_args(Sampling)
 SAMPLES = 16_384
-"""Greatest number of prefixes of one length, where a system file gives none."""
+"""Default maximum number of prefixes of one length that are tried."""
 GOLDEN, FIRST, SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 _WORD = 1 << 64
 

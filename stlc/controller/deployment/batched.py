@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 REDRAWN = 50
-"""Maximum number of draws of one agent's start."""
+"""Maximum number of draws of one agent's initial state."""
 
 SURPRISE = 1e-6
 """Largest state difference that counts as rounding."""
@@ -226,7 +226,7 @@ class Worlds:
         return tuple(found)
 
     def units(self) -> dict[str, str]:
-        """Units of the entries of `progress`."""
+        """Unit of each entry of `progress` that has one, name -> unit."""
         with blamed(self.worlds[0], "units", "say its units"):
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 

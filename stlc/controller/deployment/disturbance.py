@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 SECOND = parse_unit("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
-"""Random streams of a seed by their use: worlds draw the same numbers whatever is disturbed."""
+"""Random streams of a seed, one per use, so that a world draws the same numbers whatever is disturbed."""
 
 
 class Disturbance:
-    """Disturbance, noise and errors of a system's scenario; without scenario there are none.
+    """Disturbance, measurement noise and model errors of a system's scenario; none without a scenario.
 
     The scenario's expressions `disturb` and `noise` read the present state and the time `t` since the start
     of the deployment, and may draw random numbers.
@@ -144,7 +144,7 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Nonzero errors of the system's scenario: name -> share.
+    """Nonzero model, actuator and sensor errors of the system's scenario: name -> relative size.
 
     If `parameters` is among them, the entry `numbers` lists the constants of the dynamics that it changes.
     """

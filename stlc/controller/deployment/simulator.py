@@ -35,7 +35,8 @@ class DeploymentRecording:
         actions: executed actions of the followed plans, (rows, steps, m).
         source: (rows, steps), source of the followed plan, an index into
             `stlc.controller.guard.candidates.SOURCES`.
-        t0: (rows, steps), prefix length of the backup policy, 0 for the policy's own plan.
+        t0: (rows, steps), prefix length of the followed plan: number of its first actions that the backup
+            policy took from a grid; 0 for the policy's own plan.
         rho: (rows, steps), robustness of the followed plan.
         policy_rho: (rows, steps), robustness of the policy's own plan.
         safe: (rows, steps), whether the followed plan satisfies the requirements tagged `@safety`.

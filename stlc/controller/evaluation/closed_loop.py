@@ -44,15 +44,15 @@ SEED = 1 << 40
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 """Guards by increasing cost."""
 NARROW = 0.005
-"""Half-width of the confidence interval at which sampling of a guard stops."""
+"""Half-width of the confidence interval of a guard's share below which it is simulated no more."""
 NEAR = 0.02
-"""Largest loss in share at which a cheaper guard is still recommended."""
+"""Largest difference in share at which the cheaper of two guards is recommended."""
 LEAST = 20
-"""Number of runs from which on a share is trusted as it is."""
+"""Number of runs of a guard from which on its share is compared without a probability test."""
 SURE = 0.9
-"""Probability of being better at which a guard with fewer runs is recommended."""
+"""Probability of being better at which a guard with fewer than `LEAST` runs is recommended."""
 FEWER = 4
-"""Factor by which the number of agents is reduced where a seed takes too long."""
+"""Factor by which the number of agents is reduced if a seed takes too long."""
 
 
 @dataclass(frozen=True, slots=True)

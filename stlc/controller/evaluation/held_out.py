@@ -35,7 +35,7 @@ CEILING_TRIES = 8000
 MOST_SEARCHED = 1024
 """Maximum number of failing states to search; extrapolation has a standard error of 1.6 %."""
 EXPLORED = 4
-"""Failing states to explore where no plan is known for any."""
+"""Number of failing states to explore if no satisfying plan is known for any state."""
 CHUNK = 256
 """Batch size of the search."""
 TORCH_CHUNK = 32
@@ -163,7 +163,8 @@ def _judged(
     """Judge the policy's plans in batches of states until `enough` returns True, at least one batch.
 
     Returns:
-        The judged states (k, dim), the plans, their robustness, and their robustness per requirement.
+        The judged states, (k, dim), their plans, (k, T, m), the robustness of the plans, (k,), and their
+        robustness per requirement, (k, requirements).
     """
     plans: list[Tensor] = []
     rho: list[Tensor] = []
@@ -204,7 +205,10 @@ def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
 
 
 def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's score interval of a share of `n` trials (E. B. Wilson, 1927)."""
+    """Wilson's score interval (low, high) of a share of successes in `n` trials (E. B. Wilson, 1927).
+
+    `z`: quantile of the standard normal distribution; 1.96 for a confidence of 95 %.
+    """
     middle = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return 0.0 if share == 0.0 else max(0.0, middle - half), 1.0 if share == 1.0 else min(1.0, middle + half)

@@ -146,7 +146,7 @@ def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool
 
 
 def read_rules(judge: JudgeRef) -> ast.Spec:
-    """Read the rules that a system file names, with their imports.
+    """Read the rules (specification of closed-loop runs) that a system file names, with their imports.
 
     Raises:
         SystemFileError: S210, the file does not exist.

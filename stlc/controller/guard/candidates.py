@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 Mode: TypeAlias = Literal["none", "paper", "full"]
 RobustnessMargins: TypeAlias = Mapping[str, float]
-"""Safety requirement -> required robustness margin, in its own unit; none if left out."""
+"""Safety requirement -> required robustness margin, in its unit; 0 for requirements left out."""
 
 SOURCES = ("policy", "backup", "safest", "polished")
 TO_SPARE = 0.05
-"""Share of the paper's gamma that plan repair aims for beyond satisfaction."""
+"""Target robustness of plan repair, as a share of gamma (the robustness that training aims for)."""
 POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 """Sources of a plan: the policy; a prefix continued by the policy; the longest safe prefix; plan repair."""
 
@@ -41,7 +41,8 @@ class Candidates:
             tagged `@safety`.
         cost: performance cost of the objective, (…); 0 where not computed.
         source: index into `SOURCES`, (…) int64.
-        prefix_length: T0, (…) int64; 0 without a sampled prefix.
+        prefix_length: T0, the number of first actions taken from a grid, (…) int64; 0 for plans without such
+            a prefix.
     """
 
     plans: Tensor
@@ -110,11 +111,11 @@ class Candidates:
 
     @classmethod
     def concatenated(cls, parts: Sequence[Candidates]) -> Candidates:
-        """Concatenate along the agents."""
+        """Concatenate sets of plans along the dimension of the agents."""
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
 
     def view(self, agents: int) -> Candidates:
-        """Reshape (agents * choices,) to (agents, choices)."""
+        """Reshape the leading dimension of all fields from (agents * choices,) to (agents, choices)."""
         parts = (getattr(self, name) for name in _FIELDS)
         return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
 

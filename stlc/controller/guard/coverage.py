@@ -1,4 +1,4 @@
-"""Probability that the backup policy finds a satisfying plan: Theorem 1 of the paper, and exact value.
+"""Probability that the backup policy finds a satisfying plan: Theorem 1 of Meng and Fan (2023), and exactly.
 
 Assumption: a prefix u* of T0 actions is uniformly distributed over the control ranges, and every prefix
 within `radius` of u*, in every control at every step, leads to satisfaction. The backup policy finds such a
@@ -59,7 +59,8 @@ class Chance:
     """Probabilities that a tried prefix of one length works (leads to a satisfying plan).
 
     Attributes:
-        radius: largest distance from u* at which a prefix works, as a share of each control's range.
+        radius: largest distance from the satisfying prefix u* at which a prefix works, as a share of each
+            control's range.
         length: number of actions of a prefix, T0.
         candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
         theorem: the paper's bound, min{1, product over controls and steps}.

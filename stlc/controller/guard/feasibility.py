@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 PASSES = 4
 TRIES = 20_000
-"""Evaluations per start and pass, where native code judges plans."""
+"""Number of plans judged per state and pass if native code judges them."""
 ENOUGH = 1e-4
-"""Target robustness at which the search of a start ends."""
+"""Target robustness at which the search from a state ends."""
 PIECES = 3
 MOST = 2048
 """Maximum size of the plan library."""

@@ -32,7 +32,8 @@ class GuardDecision:
         action: (agents, m) float64, physical units.
         plan: (agents, T, m), the followed plan.
         source: (agents,) int64, an index into `SOURCES`.
-        t0: (agents,) int64, prefix length of the backup policy; 0 for the policy's own plan.
+        t0: (agents,) int64, prefix length of `plan`: number of its first actions that the backup policy took
+            from a grid; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
         safe: (agents,) bool, whether `plan` satisfies phi_safe (the requirements tagged `@safety`).
         policy_rho: (agents,) float64, robustness of the policy's plan; -inf where that is not finite.

@@ -270,7 +270,7 @@ def input_files(
 ) -> tuple[Path, ...]:
     """Paths of the input files of a training.
 
-    The files that a file with errors names may be missing; the training itself reports the errors.
+    If a file has errors, the files that it names may be missing; the training itself reports the errors.
 
     Args:
         path: path of the specification.

@@ -1,9 +1,9 @@
 """Data-parallel training by several processes (`torchrun`): ranks, collectives, agreement.
 
 Every rank draws its own states, searches on its own, and learns from the mean of all gradients, so that all
-ranks have the same weights. Collective operations make decisions equal that must be (steps, margin, when to
-save, when to stop), and only the first rank writes the run. gloo communicates tensors on CPUs, nccl those on
-GPUs.
+ranks have the same weights. Decisions that must be equal on all ranks (steps, margin, when to save, when to
+stop) are made by collective operations. Only the first rank writes the run. gloo communicates tensors on
+CPUs, nccl those on GPUs.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Ranks:
         return (seed + self.rank * _SPREAD) % 2**63
 
     def device(self, name: str) -> str:
-        """Torch device of this rank; of several ranks with device `cuda`, each uses a GPU of its own."""
+        """Torch device of this rank; if several ranks use `cuda`, each has a GPU of its own."""
         return f"cuda:{self.local}" if name == "cuda" and self.size > 1 else name
 
     def learn(self, weights: Iterable[nn.Parameter], value: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ class Ranks:
         return mean.view(())
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """Mean of each number over the ranks; every rank must pass as many numbers."""
+        """Mean of each number over the ranks; all ranks must pass equally many numbers."""
         return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
 
     def any(self, flag: bool) -> bool:

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 PLANNING_VERSION = 1
-"""To be raised with every change of the plans that a planner finds within a budget."""
+"""Version of the planners, raised with every change of the plans that they find within a budget."""
 SHORT = 64
-"""Evaluations of a plan that continues a prefix."""
+"""Number of plans judged in the search for a plan that continues a prefix."""
 SECONDS = 1.0
-"""Default budget of a start, processor seconds."""
+"""Default budget per initial state, in seconds of processor time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +194,7 @@ class PlanSearch:
 
 
 Solver: TypeAlias = Callable[[PlanSearch], None]
-"""Improves the plans of a search until no start is open."""
+"""Function that improves the plans of a search until `PlanSearch.open` returns no state."""
 
 
 class Planner(Protocol):

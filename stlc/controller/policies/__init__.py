@@ -1,1 +1,1 @@
-"""Policies: plan networks and policies made from actors."""
+"""Policies: networks that map a state to plans, and policies that apply an actor (state -> action)."""

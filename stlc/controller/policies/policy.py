@@ -163,9 +163,9 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Mirror the states on one side of the symmetry; return all states, and a mask of those, (B,).
+        """Mirror states (B, n) on one side of the symmetry; return all, and the mask of the mirrored ones.
 
-        Without a symmetry the states are unchanged, and the mask is None.
+        The mask is (B,). Without a symmetry the states are unchanged, and the mask is None.
         """
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 

@@ -38,21 +38,21 @@ NEAR = 8
 FAR = 24
 """Plans with controls at ends of their ranges, added to every later round."""
 KEPT = 2
-"""Number of best plans of a round that start the next one or are returned."""
+"""Number of best plans of a round, from which the next round starts or which are returned."""
 STEPS = 30
 RATES = 0.1, 0.2, 0.2
 """Initial step size of each round, as a share of the control range; it falls to 0 at the last step."""
 SHARES = 8
 """Number of interpolation steps between the policy's plan and the repaired one."""
 SLOPE = 5.0
-"""Backward slope of conditions, per unit."""
+"""Slope that replaces the derivative of a switching condition (straight-through estimator), per unit."""
 STEEP = 1e100
 """Gradients of at least this magnitude are set to 0."""
 AGENTS = 256
 """Maximum number of agents per batch."""
 SEED = 20_231
 APART = 1e6
-"""Offset between plans that satisfy phi, those that satisfy phi_safe alone, and the rest."""
+"""Offset between the values of satisfying plans, of plans that are only safe, and of others."""
 
 Numbers: TypeAlias = NDArray[np.float64]
 Pull: TypeAlias = Callable[[Numbers], Numbers]

@@ -2,9 +2,9 @@
 
 For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a random
 sample of them if these are too many, is applied from the present state, and the policy plans from its end.
-The first T0 with a plan that satisfies phi, or else phi_safe, is chosen. One addition to the paper (decision
-record 37 in `docs/decisions`): the remainder of the previous plan is a candidate too, so that a safe plan is
-not lost after its first action.
+The first T0 with a plan that satisfies the specification, or else the requirements tagged `@safety`, is
+chosen. One addition to the paper (decision record 37 in `docs/decisions`): the remainder of the previous plan
+is a candidate too, so that a safe plan is not lost after its first action.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 HANDED_ON = 65_536
-"""Maximum number of trajectories stored for the next stage; it recomputes the others."""
+"""Maximum number of trajectories stored for the next stage, which recomputes the others."""
 
 
 class PrefixShooting(GuardStage):

@@ -52,7 +52,7 @@ class SampledPrefixes:
 
         `x`: states in which the prefixes begin, (agents, n) float64.
 
-        They are computed in batches of at most `grid.batch` trajectories.
+        The plans are computed in batches of at most `grid.batch` trajectories.
         """
         return Candidates.concatenated([self._finished(part) for part in torch.split(x, self._most)])
 
