@@ -195,13 +195,15 @@ class Guard:
     def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
         """Remainders of plans in states (agents, n), extended at their ends by the policy.
 
-        `previous` continues each plan after its end by holding its last action. Instead, the policy plans
-        from the state at the end of the plan; the first actions of this plan are appended.
+        `previous` fills each remainder up to the length of a plan by holding its last action. These actions
+        are replaced: the policy plans from the predicted state at the end of the remainder, and the first
+        actions of that plan are appended.
 
         Args:
             x: (agents, n) states.
             previous: remainder of the previous decision.
-            taken: number of steps of each plan that were executed, and so of actions to append, (agents,).
+            taken: number of steps of each plan that were executed, which is the number of actions to append,
+                (agents,).
         """
         x, plan = x.to(torch.float64), previous.plan.clone()
         length = plan.shape[1]
@@ -220,8 +222,8 @@ class Guard:
     ) -> Candidates:
         """The policy's plans `fresh` with their verdicts `judged`, or previous plans that are better.
 
-        A previous plan is taken if it satisfies the specification and ranks no lower, or increases the margin
-        of a pending goal; see `decide`.
+        A previous plan that satisfies the specification is taken if it ranks no lower than the policy's plan,
+        or if it increases the margin of a pending goal; see `decide`.
         """
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())

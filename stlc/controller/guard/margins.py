@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
-    """The task whose safety requirements are tightened: their robustness is reduced by their margins.
+    """The task with tightened safety requirements: the robustness of each is reduced by its margin.
 
     Predicates on time and constants, which decide truth but do not bound the robustness, are unchanged.
     """
@@ -65,13 +65,13 @@ SEED = 20_251
 
 @torch.no_grad()
 def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
-    """Margin of each safety requirement: a quantile of the robustness that safe plans lose.
+    """Margin of each safety requirement: a quantile of the robustness that safe plans lose when executed.
 
     Args:
         task: specification and system, with the scenario whose errors, disturbances and noise cause the loss.
         policy: policy that makes the plans.
         steps: number of steps between two judgements of the guard; the full guard judges at every step.
-        share: share of the plans whose loss the margin exceeds or equals.
+        share: share of the plans whose loss is at most the margin.
 
     Returns:
         Requirement -> margin, without margins of 0; empty if the scenario has no errors or the policy makes
@@ -115,9 +115,9 @@ class MarginRequest:
     """Margins requested on the command line; see `parse_margins`.
 
     Attributes:
-        every: margin of each safety requirement that is not named.
+        every: margin of each safety requirement that `named` does not contain.
         named: requirement -> margin.
-        share: share of plans that a calibrated margin covers; None without calibration.
+        share: share of plans whose loss of robustness a calibrated margin covers; None without calibration.
     """
 
     every: float = 0.0
@@ -127,7 +127,8 @@ class MarginRequest:
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
         """Return the requested margin of each safety requirement, without margins of 0.
 
-        If requested, margins are calibrated.
+        A calibrated margin replaces `every`, and an entry of `named` replaces both. With the guard "none"
+        nothing is calibrated.
 
         Raises:
             UsageError: U101, `named` contains a name that is not that of a safety requirement.
@@ -150,7 +151,10 @@ class MarginRequest:
 
 
 def parse_margins(texts: Sequence[str]) -> MarginRequest:
-    """Parse margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; a later one replaces an earlier one.
+    """Parse texts such as `0.2` (all requirements), `avoid=0.2` (one requirement), `auto` and `auto:99`.
+
+    `auto` calibrates the margins so that they cover 99 % of the plans, or the given percentage. Of several
+    texts for the same entry of the result, the last counts.
 
     Raises:
         UsageError: U101, a text is not a margin.

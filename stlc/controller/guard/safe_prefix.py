@@ -19,10 +19,10 @@ BEYOND = "#beyond"
 def open_ended(formula: ir.Formula) -> ir.Formula:
     """The formula as an upper bound: predicates are true at samples where the column `BEYOND` is positive.
 
-    The column is to be positive at all samples after the known ones. As the formula is in negation normal
-    form, a predicate that becomes true never decreases the robustness; so the result is the upper bound on
-    the robustness over all continuations of the known samples. It is negative exactly if these already
-    violate the formula.
+    `BEYOND` must be positive at all samples after the known ones. As the formula is in negation normal form,
+    a predicate that becomes true never decreases the robustness; so the result is the upper bound on the
+    robustness over all continuations of the known samples. It is negative exactly if the known samples
+    already violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -30,11 +30,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """The formula in which predicates on the initial state count only as true or false.
+    """The formula in which predicates on the initial state decide truth but do not bound the robustness.
 
-    Their robustness is +inf or -inf, so it never determines that of a satisfiable plan. All plans have the
-    same initial state: for `a -> always b`, plans that violate the formula are thus compared by the violation
-    of b, not by the robustness of a.
+    All plans have the same initial state. In `a -> always b`, where a depends on it alone, plans that violate
+    the formula are therefore compared by their violation of b, not by the robustness of a.
     """
     match formula:
         case ir.Predicate():
