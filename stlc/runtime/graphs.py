@@ -89,7 +89,7 @@ class Graphs:
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
         """Upper bound on the robustness of the safety requirements, given the samples 0 to k of the states.
 
-        It holds for all continuations of these samples.
+        The bound holds for all continuations of these samples.
 
         Returns:
             (rows, T + 1), for k = 0, …, T; +inf if there are no safety requirements.

@@ -184,7 +184,7 @@ class _Known:
             (None if there are none).
         seeds: number of simulated seeds.
         cost: measured seconds per seed; 0 before the first seed.
-        given_up: whether the guard is simulated no more, because a seed takes too long.
+        given_up: True if the guard is not simulated any more, because a seed takes too long.
     """
 
     agents: int
@@ -259,8 +259,9 @@ class _Trial:
     def _next(self) -> Mode | None:
         """Guard to simulate next; None to stop.
 
-        First, each guard by increasing cost, up to one that satisfies all runs; then, of those whose share
-        may still be the best, the one with the widest confidence interval.
+        Each guard is simulated once, by increasing cost, up to the first guard under which all runs satisfy
+        the mission. After that, of the guards whose share may still be the best, the one with the widest
+        confidence interval is returned.
         """
         if self.left() <= 0.0:
             return None

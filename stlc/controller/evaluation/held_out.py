@@ -51,12 +51,13 @@ class Score:
         interval: 95 % Wilson interval of the accuracy.
         requirements: share of states whose plan satisfies a requirement, for each requirement.
         feasible: share of states with a known satisfying plan, the policy's or one found by search; if only a
-            random sample of the failing states was searched, it is extrapolated to the others.
-        states: (n, dim), float64.
+            random sample of the failing states was searched, its share of solved states is assumed for the
+            others.
+        states: the held-out states, (n, dim), float64.
         rho: robustness of each plan, (n,).
         each: robustness per requirement, (n, requirements).
-        known: states with a known satisfying plan, (n,) bool.
-        searched: states that the policy solved or that were searched, (n,) bool.
+        known: mask of the states with a known satisfying plan, (n,).
+        searched: mask of the states that the policy solved or that were searched, (n,).
         endless: for a mission without end, the simulated duration in seconds; else None.
     """
 
@@ -110,9 +111,9 @@ def score(
         policy: policy to judge.
         n: number of held-out states.
         seed: seed of their random numbers.
-        enough: function that returns True to end the evaluation early. While plans are being judged, this
-            reduces the number of states; during the searches, the states of the interrupted batch do not
-            count as searched, except those of the first batch.
+        enough: function that returns True to end the evaluation early. If that happens while plans are
+            judged, fewer than `n` states are judged. If it happens during the searches, the results of the
+            interrupted batch of states are discarded, unless it is the first batch.
         report: function that receives the progress as a short text.
     """
     if task.compiled.timers:

@@ -69,9 +69,10 @@ class Metric:
         key: name in JSON files.
         label: name in tables.
         meaning: explanation, a sentence without its full stop.
-        mask: function of a seed that gives the mask of the property; None if it was not recorded.
-        among: function of a seed that gives the mask of the population; None for everything. A share of an
-            empty population is omitted.
+        mask: function that returns, for a seed, the mask of the plans or runs with the property, or None if
+            it was not recorded.
+        among: function that returns, for a seed, the mask of the population; None: all plans or runs. The
+            share of an empty population is omitted.
         unit: unit of the value; shares have none.
         safety: whether the metric is omitted if no requirement is tagged `@safety`.
     """

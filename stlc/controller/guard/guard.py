@@ -158,7 +158,7 @@ class Guard:
             steps: number of steps to check, one number or (agents,).
 
         Returns:
-            (agents,) booleans. Only the full guard checks previous plans; for the others all are False.
+            (agents,) booleans. Only the guard "full" checks previous plans; with another guard all are False.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
         if self.mode != "full" or not formulas:

@@ -49,7 +49,7 @@ def robustness_until(
 ) -> Tensor:
     """Upper bound on the robustness of formulas given the samples 0 to `last`, (batch,).
 
-    It holds for all continuations of these samples. The minimum over the formulas is returned.
+    The bound holds for all continuations of these samples. The minimum over the formulas is returned.
 
     Args:
         formulas: formulas in negation normal form.
