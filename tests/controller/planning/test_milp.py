@@ -9,7 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.methods.planners import milp
+from stlc.controller.planning.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
@@ -34,6 +35,7 @@ flow:
   n: ind(p > 1)
 jump:
   - {name: bounce, guard: p > 3, reset: {v: -v}}
+  - {name: rest, guard: p < -3, reset: {n: 0}}
 init:
   mixture:
     - {name: any, draw: {p: "uniform(-3, 3)", v: "uniform(-2, 2)", n: 0}}
@@ -121,3 +123,57 @@ def test_a_margin_of_exactly_zero_is_a_plan(cart: System) -> None:
 def test_an_expression_that_is_not_linear_is_named(cart: System) -> None:
     with pytest.raises(UsageError, match=r"cannot encode p \* v"):
         plan(task_of(cart, "always[0 s, 5 s] p * v < 1"), torch.zeros(1, 3), "milp")
+
+
+def test_a_choice_stays_within_the_bounds_of_its_values(cart: System) -> None:
+    """Each big-M follows from these bounds. After a jump they must not be wider than before and after it."""
+    task = task_of(cart, "eventually[0 s, 5 s] n > 1")
+    encoding, _ = milp._encoded(task, torch.zeros(3), 0.0, tight=True)
+    assert encoding.model.bounds(encoding.rows[-1]["n"].form) == (0.0, 2.0)
+
+
+def test_what_a_constant_decides_is_not_encoded(cart: System) -> None:
+    start = torch.tensor([1.0, 0.0, 0.0])
+    plain = milp._encoded(task_of(cart, "always[0 s, 5 s] p < 9"), start, 0.0, tight=True)[0]
+    task = task_of(cart, "p > 0 or eventually[0 s, 5 s] p % 2 > 1")
+    assert len(milp._encoded(task, start, 0.0, tight=True)[0].model.arrays().lower) == len(
+        plain.model.arrays().lower
+    )
+
+
+def test_a_search_first_leaves_its_misses_to_the_program(
+    cart: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x0 = torch.tensor([[0.0, 0.0, 0.0], [-4.0, -2.0, 0.0]])
+    task, solved = task_of(cart, "eventually[0 s, 3 s] p > 1"), []
+    usual = milp.Milp._solve
+
+    def spy(self: milp.Milp, search: PlanSearch, row: int, highs: object) -> None:
+        solved.append(row)
+        usual(self, search, row, highs)
+
+    monkeypatch.setattr(milp.Milp, "_solve", spy)
+    found = plan(task, x0, "milp", tries=200)
+    assert found.satisfied.tolist() == [True, False]
+    assert found.infeasible.tolist() == [False, True]
+    assert solved == [1]
+
+
+def test_a_stop_interrupts_the_solver(cart: System) -> None:
+    """The limit counts processor time, and is asked for while HiGHS is at work."""
+    asked = []
+
+    def stop() -> bool:
+        asked.append(True)
+        return len(asked) > 3  # beginning, and before the solve; then while it runs
+
+    task = task_of(cart, "eventually[0 s, 3 s] (abs(p) > 1.2 and eventually[0 s, 2 s] abs(v) > 1.9)")
+    found = plan(task, torch.zeros(1, 3), "milp", budget=PlanBudget(5.0, target=torch.inf, stop=stop))
+    assert len(asked) > 3
+    assert not bool(found.infeasible.any())
+
+
+def test_without_budget_nothing_is_claimed(cart: System) -> None:
+    task = task_of(cart, "eventually[0 s, 3 s] abs(p) > 1")
+    found = plan(task, torch.zeros(1, 3), "milp", budget=PlanBudget(1e-6))
+    assert not bool(found.infeasible.any() | found.satisfied.any())

@@ -153,6 +153,7 @@ class Encoding:
         self._numbers: dict[tuple[int, int], Expression] = {}
         self._trees: dict[tuple[int, int, int], Tree] = {}
         self._free: set[int] = set()
+        self._plain: dict[int, bool] = {}
 
     # ------------------------------------------------------------------ dynamics
 
@@ -234,13 +235,22 @@ class Encoding:
                     yield from self._demanded(item, k, what)
             case ir.BoolOp("or", items):
                 left = [
-                    item for item in items if not _of_state(item) or self._tree(item, 0, what) is not False
+                    item
+                    for item in items
+                    if not self._of_state(item) or self._tree(item, 0, what) is not False
                 ]
                 if len(left) == 1:
                     yield from self._demanded(left[0], k, what)
-            case ir.Temporal("always", window, body) if _of_state(body):
+            case ir.Temporal("always", window, body) if self._of_state(body):
                 if window.lo <= k and (window.hi is None or k <= window.hi):
                     yield body
+
+    def _of_state(self, formula: ir.Formula) -> bool:
+        """True if the formula is about the signals at a single sample, without temporal operators."""
+        key = id(formula)
+        if key not in self._plain:
+            self._plain[key] = _of_state(formula)
+        return self._plain[key]
 
     # ------------------------------------------------------------------- formulas
 
@@ -258,7 +268,7 @@ class Encoding:
             case ir.Predicate():
                 return self._predicate(node, k, margin.margin.plus(self._required))
             case ir.BoolOp(op, items):
-                return junction(op, [self._tree(item, k, margin) for item in items])
+                return junction(op, (self._tree(item, k, margin) for item in items))
             case ir.AtStart(body):
                 return self._tree(body, 0, margin)
             case ir.Temporal(op, window, body):
@@ -326,7 +336,7 @@ class Encoding:
                 return self._condition(value if holds else value.times(-1.0), self._slack, num)
             case ir.BoolOp(op, items):
                 turned = op if holds else ("or" if op == "and" else "and")
-                return junction(turned, [self._decided(item, k, holds=holds) for item in items])
+                return junction(turned, (self._decided(item, k, holds=holds) for item in items))
         raise UnencodableError("a condition over time")
 
     def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
@@ -602,7 +612,7 @@ class Encoding:
         gap = yes.plus(no, -1.0)
         if not gap.terms:
             return no.plus(binary, gap.const)
-        return no.plus(model.product(binary, gap))
+        return model.selected(binary, yes, no)
 
 
 _FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {

@@ -215,14 +215,15 @@ class Model:
         self.require(form.plus(found, -1.0), 0.0, 0.0)
         return found
 
-    def product(self, binary: Affine, form: Affine) -> Affine:
-        """Variable that equals a binary variable times an affine form (McCormick envelope, exact here)."""
-        low, high = self.bounds(form)
-        found = self.variable(min(low, 0.0), max(high, 0.0))
-        self.require(found.plus(binary, -low))
-        self.require(binary.times(high).plus(found, -1.0))
-        self.require(form.plus(found, -1.0).plus(binary, low).plus(constant(-low)))
-        self.require(found.plus(form, -1.0).plus(binary, -high).plus(constant(high)))
+    def selected(self, binary: Affine, yes: Affine, no: Affine) -> Affine:
+        """Variable, within the bounds of both, that equals `yes` if a binary variable is 1, else `no`."""
+        (low, high), (least, most) = self.bounds(yes), self.bounds(no)
+        found = self.variable(min(low, least), max(high, most))
+        below, above = self.bounds(yes.plus(no, -1.0))
+        over, under = found.plus(no, -1.0), yes.plus(found, -1.0)  # 0 and the gap, or the gap and 0
+        for rest, rise in ((over, binary), (under, constant(1.0).plus(binary, -1.0))):
+            self.require(rest.plus(rise, -below))
+            self.require(rise.times(above).plus(rest, -1.0))
         return found
 
     def imply(self, off: Affine, tree: Tree) -> None:

@@ -6,9 +6,13 @@ It applies to piecewise linear systems and uses the big-M encodings of Karaman e
 
 from __future__ import annotations
 
+import gc
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from time import process_time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +21,10 @@ import torch
 from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.feasibility import extremes
+from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import Diagnostic, MissingError, UsageError
+from stlc.native import Stop
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,10 +48,13 @@ class Milp:
     Attributes:
         gap: relative optimality gap at which the maximisation of robustness ends.
         prove: whether to solve the second program.
+        tries: number of plans that a local search tries for each initial state before; a program is solved
+            where these miss the target. 0: no search.
     """
 
     gap: float = 1e-3
     prove: bool = True
+    tries: int = 0
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by mixed-integer linear programs.
@@ -65,12 +75,25 @@ class Milp:
         return partial(self._run, highs=highspy)
 
     def _run(self, search: PlanSearch, highs: Any) -> None:
+        if self.tries:
+            self._search(search)
         for row in search.open().tolist():
-            rows = torch.tensor([row])
-            with search.charged(rows):
+            with search.charged(torch.tensor([row])), _without_collection():
                 self._solve(search, row, highs)
             if not len(search.open()):
                 return
+
+    def _search(self, search: PlanSearch) -> None:
+        """Offer the plans that a short local search finds, for all initial states at once."""
+        rows, task = search.open(), search.task
+        with search.charged(rows):
+            searcher = Searcher(task, search.generator, enough=search.budget.target or TOLERANCE)
+            bank = extremes(task, search.generator).double()
+            count = search.affordable(rows, self.tries)
+            found = searcher.repair(
+                search.states[rows], search.start[rows], bank, tries=count, stop=search.budget.stop
+            )
+            search.offer(rows, found.plans, evaluations=count)
 
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
         """Find a satisfying plan from the initial state with index `row`, or prove that there is none.
@@ -78,43 +101,46 @@ class Milp:
         The plan or the proof is stored in `search`.
         """
         task, state, budget = search.task, search.states[row], search.budget
+        limit = _Limit(process_time() + budget.seconds - float(search.seconds[row]), budget.stop)
+        known = max(0.0, float(search.rho[row]))
         search.ended[row] = True
-        for beyond in (MARGIN, 0.0):  # away from the boundary; then on it, where timers end exactly
-            found, plan = self._solved(task, state, budget.target + beyond, budget.seconds, highs, tight=True)
+        for beyond in (MARGIN, -TOLERANCE / 2.0):  # off the boundary; then on it, where timers end exactly
+            goal = _Goal(budget.target + beyond, known)
+            found, plan = self._solved(task, state, goal, limit, highs, tight=True)
             search.evaluations[row] += 1
             if plan is not None:
                 rho = search.offer(torch.tensor([row]), plan[None], evaluations=0)
                 if float(rho) >= min(budget.target, 0.0) - TOLERANCE:
                     return
-            elif found == IMPOSSIBLE and beyond and self.prove:
-                proof, _ = self._solved(task, state, 0.0, budget.seconds, highs, tight=False)
+            elif found == IMPOSSIBLE and beyond > 0.0 and self.prove and search.rho[row] < -TOLERANCE:
+                proof, _ = self._solved(task, state, _Goal(0.0), limit, highs, tight=False)
                 search.infeasible[row] = proof == IMPOSSIBLE
                 if proof == IMPOSSIBLE:
                     return
+            if limit.reached():
+                return
 
     def _solved(
-        self, task: Task, state: Tensor, target: float, seconds: float, highs: Any, *, tight: bool
+        self, task: Task, state: Tensor, goal: _Goal, limit: _Limit, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Solve the program for a plan from one state, (n,), with a robustness of at least `target`.
+        """Solve the program for a plan from one state, (n,), with the robustness of `goal`.
 
         Returns:
             `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), None unless
             found.
         """
-        encoding, cost = _encoded(task, state, target, tight=tight)
+        encoding, cost = _encoded(task, state, goal.target, known=goal.known, tight=tight)
         if not encoding.model.feasible:
             return IMPOSSIBLE, None
+        if limit.reached():
+            return UNKNOWN, None
         solver = highs.Highs()
-        options: dict[str, Any] = {
-            "output_flag": False,
-            "threads": 1,
-            "time_limit": seconds,
-            "mip_rel_gap": self.gap,
-        }
+        options: dict[str, Any] = {"output_flag": False, "threads": 1, "mip_rel_gap": self.gap}
         options |= {"mip_feasibility_tolerance": FINEST, "primal_feasibility_tolerance": FINEST}
         options |= {"presolve": "off", "mip_heuristic_effort": 0.0}  # both cost more than they save here
         for name, value in options.items():
             solver.setOptionValue(name, value)
+        solver.cbMipInterrupt.subscribe(limit.interrupt)
         solver.passModel(_program(encoding.model.arrays(cost), highs))
         solver.run()
         if solver.getModelStatus() == highs.HighsModelStatus.kInfeasible:
@@ -125,14 +151,70 @@ class Milp:
         return FOUND, torch.tensor([[_at(each, values) for each in inputs] for inputs in encoding.controls])
 
 
+@dataclass(frozen=True, slots=True)
+class _Goal:
+    """Robustness that a plan must reach.
+
+    Attributes:
+        target: this robustness; inf to maximise it.
+        known: robustness of a known plan, below which no plan is of interest when it is maximised.
+    """
+
+    target: float
+    known: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Limit:
+    """Condition that ends a solve. HiGHS' own time limit is elapsed time, which depends on other programs.
+
+    HiGHS does not ask within its sub-programs, so that a solve may end some tenths of a second late.
+
+    Attributes:
+        until: end of the budget on the clock of processor time.
+        stop: condition that ends the whole search.
+    """
+
+    until: float
+    stop: Stop
+
+    def reached(self) -> bool:
+        """True if the solve has to end."""
+        return process_time() >= self.until or bool(self.stop())
+
+    def interrupt(self, event: Any) -> None:
+        """Interrupt HiGHS if the solve has to end; HiGHS calls this between linear programs."""
+        if self.reached():
+            event.interrupt()
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Context without cyclic garbage collection.
+
+    A program consists of tens of thousands of small objects without cycles. They would set off collections
+    that visit all objects of the process.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def _at(form: Affine, values: Any) -> float:
     return form.const + sum(factor * float(values[index]) for index, factor in form.terms.items())
 
 
-def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[Encoding, Affine]:
+def _encoded(
+    task: Task, state: Tensor, target: float, *, known: float = 0.0, tight: bool
+) -> tuple[Encoding, Affine]:
     """Program whose solutions are plans from a state with a robustness of at least `target`, and its cost.
 
-    If `target` is inf, the cost makes the solver maximise robustness. For `tight`, see `Encoding`.
+    If `target` is inf, the robustness is at least `known`, and the cost makes the solver maximise it. For
+    `tight`, see `Encoding`.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.
@@ -144,7 +226,7 @@ def _encoded(task: Task, state: Tensor, target: float, *, tight: bool) -> tuple[
     maximise = math.isinf(target)
     try:
         x0 = dict(zip(task.system.names, state.tolist(), strict=True))
-        rho = encoding.model.variable(0.0, MOST_RHO) if maximise else constant(target)
+        rho = encoding.model.variable(known, MOST_RHO) if maximise else constant(target)
         factors = [rule.weight / rule.scale for rule in task.rules]
         wanted = [
             Demand(rule.formula, rho.times(1.0 / factor))
