@@ -24,9 +24,9 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Time step and horizon, exact, in seconds; None if unknown.
+    """Time step and horizon in seconds, as exact fractions; None if unknown.
 
-    `trace` is the name of the file whose time step is taken; "" if the time step was given as an argument.
+    `trace` is the name of the trace file that supplied the time step; "" if another source did.
     """
 
     dt: Fraction | None = None
@@ -34,7 +34,7 @@ class Times:
     trace: str = ""
 
     def or_else(self, other: Times) -> Times:
-        """Return these times; where one is unknown, take it from `other`."""
+        """Return a copy in which an unknown time step or horizon is taken from `other`."""
         step = self if self.dt is not None else other
         return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
@@ -73,7 +73,7 @@ def _dividing(horizon: float, dt: float) -> str:
 
 
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
-    """Return the arguments `dt` and `horizon` as exact times. Raises UsageError (U101) if not positive."""
+    """Convert `dt` and `horizon`, in seconds, to exact times. Raises UsageError (U101) if not positive."""
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
@@ -101,7 +101,7 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
-    """Return the times of the system that the specification names; None without a name or a file."""
+    """Return time step and horizon of the system that `spec` names; None if no system or file is found."""
     if spec.system is None:
         return None
     try:
@@ -112,7 +112,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 
 
 def recorded_times(trace: Trace, given: Times) -> Times:
-    """Return the times of a trace. Raises TraceError (E602) if its time step differs from the given one."""
+    """Return time step and horizon of a trace. Raises TraceError (E602) if its step differs from `given`."""
     dt = as_fraction(trace.dt)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"

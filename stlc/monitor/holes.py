@@ -46,7 +46,7 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """Return the formula whose value is the least, or the greatest, value that `formula` may have.
+    """Return the formula whose value is the least, or the greatest, value over all unknown samples.
 
     Args:
         formula: in negation normal form.

@@ -51,7 +51,7 @@ def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: 
 
 
 def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
-    """Samples from an instant to its `end`; None if `end` is not at a fixed distance from the instant."""
+    """Samples from an instant to `end`, the end of its planning window; None if that number is not fixed."""
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
@@ -71,7 +71,7 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """True per start if the value there depends on the first `samples` samples only, (count,)."""
+    """True for instants in `starts` whose value depends on the first `samples` samples only, (count,)."""
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
@@ -82,9 +82,10 @@ def rule_known(
 def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: Boundary) -> Array:
     """Return the robustness at every sample, `(samples, batch)`.
 
-    Values are NaN where the window extends beyond the trace and `end` is "strict", and where they depend on
-    unknown samples unless `end` is "lower" or "upper". A requirement with absolute operators
-    (`always@[a, b]`) has one value at all samples.
+    `end` is the treatment of windows that extend beyond the trace: "strict" gives NaN, "truncate" clips them,
+    "lower" and "upper" give a bound. A value that depends on unknown samples is NaN, or the bound if `end` is
+    "lower" or "upper". A requirement with absolute operators (`always@[a, b]`) has the same value at all
+    samples.
     """
     if record.holes:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
@@ -99,9 +100,10 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
 
 
 def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
-    """`rule_signal` for a requirement whose `end` is `window` samples after each instant.
+    """Compute `rule_signal` for a requirement that mentions `end`, the last sample of a planning window.
 
-    With `end` "strict", values are NaN where that window extends beyond the trace.
+    The planning window ends `window` samples after each instant. With argument `end` "strict", values are NaN
+    where the planning window extends beyond the trace.
     """
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
@@ -119,7 +121,7 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
 def rules_at(
     rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
 ) -> list[Array]:
-    """Robustness of several requirements at sample `at`, `(1, batch)` each; NaN as in `rule_signal`."""
+    """Robustness of several requirements at sample `at`, `(1, batch)` each; for `end` see `rule_signal`."""
     if record.holes:
         sides = [_sides(rule, record) for rule in rules]
         least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
@@ -141,7 +143,7 @@ def rules_at(
 
 
 def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
-    """The requirement with its formula replaced by its lower and its upper bound over unknown samples."""
+    """Two copies of a requirement: its formula bounded from below, and from above, over unknown samples."""
     formula = rule.under(record.semantics)
     least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)

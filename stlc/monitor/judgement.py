@@ -30,7 +30,7 @@ class Prepared:
         compiled: the specification, compiled for the time step of the signals.
         rules: the requirements to evaluate.
         signals: the signals with their shape and times.
-        record: signals as arrays (time, batch), with the array library that evaluates them.
+        record: the same signals as arrays (time, batch), and the array library (NumPy or torch).
     """
 
     compiled: Compiled
@@ -62,7 +62,7 @@ class Prepared:
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
 
     def moment(self, sample: int) -> str:
-        """Time of a sample in words: `t = 4.6 s`."""
+        """Time of a sample as text: `t = 4.6 s`, or `sample 46` if the time step is unknown."""
         return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
 
 
@@ -78,9 +78,9 @@ class Judgement:
         holds: whether the requirement is certainly satisfied, (instants, traces).
         fails: whether the requirement is certainly violated, (instants, traces).
         shape: axes of the signals before their time axis; () for a single trace.
-        scope: True for traces that satisfy the assumptions, (traces,); None: all do. Other traces are not
-            counted.
-        reported: `low` and `high` in the requested semantics; None if that is the exact one.
+        scope: True for traces that satisfy the assumptions, (traces,); None: all do. Traces that violate the
+            assumptions do not affect verdicts over all traces.
+        reported: `low` and `high` in the requested semantics; None if the exact semantics is requested.
     """
 
     rule: CompiledRequirement
@@ -105,12 +105,12 @@ class Judgement:
 
     @property
     def unit(self) -> str:
-        """Unit of the robustness, that of the compared quantities; "" if the predicates' units differ."""
+        """Unit of the robustness: that of the predicates; "" if predicates have different units."""
         return self.rule.unit
 
     @property
     def statuses(self) -> list[Status]:
-        """Status of each trace."""
+        """Status of each trace; `out of scope` if the trace violates the assumptions."""
         inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
         return [
             _status(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
@@ -123,12 +123,12 @@ class Judgement:
 
     @property
     def status(self) -> Any:
-        """`satisfied`, `violated` or `inconclusive`; for a batch of traces an array of these."""
+        """Status (see `Status`) of the single trace; for a batch of traces an array of statuses."""
         return _shaped(np.array(self.statuses), self.shape)
 
     @property
     def overall(self) -> Status:
-        """Status over all traces: violated if one is, satisfied if all are."""
+        """Status over the traces in scope: violated if one is, satisfied if all are, else inconclusive."""
         holds = self.counted(self.holds)
         return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
@@ -147,14 +147,14 @@ class Judgement:
     def robustness(self) -> Any:
         """The least robustness over the evaluated instants: a float, or an array for a batch of traces.
 
-        If a trace is too short, the value is the bound from which the verdict follows, or NaN without a
-        verdict.
+        If a trace is too short for an exact value, the lower bound is returned for a satisfied requirement,
+        the upper bound for a violated one, and NaN if the verdict is inconclusive.
         """
         return _shaped(self.least, self.shape)
 
     @property
     def least(self) -> Floats:
-        """Least robustness of each trace over the evaluated instants, (traces,); NaN if unknown."""
+        """Array (traces,) of the values that `robustness` returns."""
         low, high = (end.min(axis=0) for end in self.margins)
         known = np.where(self.holds.all(axis=0), low, np.nan)
         known = np.where(self.fails.any(axis=0), high, known)
@@ -173,7 +173,7 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Indices (trace, sample) of the least robustness; if violated, of the worst violation."""
+        """Indices (trace, sample) of the least `high` if a trace is violated, else of the least `low`."""
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
@@ -226,11 +226,11 @@ class Verdict:
 
     @property
     def status(self) -> Any:
-        """`satisfied`, `violated` or `inconclusive`; for a batch of traces an array of these."""
+        """Status (see `Status`) of the single trace; for a batch of traces an array of statuses."""
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return the verdict on the traces that satisfy the assumptions alone, True in `scope` (traces,)."""
+        """Return a copy that counts only the traces with True in `scope` (traces,): assumptions satisfied."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
@@ -243,7 +243,7 @@ class Verdict:
 
     @property
     def overall(self) -> Status:
-        """Status over all traces and requirements."""
+        """Status over all requirements and all traces in scope: the worst of the requirements' statuses."""
         found = {judgement.overall for judgement in self.requirements}
         return _status("violated" in found, found <= {"satisfied"})
 
@@ -283,7 +283,7 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Truth values at `most` instants, those of a single instant repeated: (instants, traces)."""
+        """Truth values expanded to `most` instants by repetition of the overall value: (most, traces)."""
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)

@@ -62,10 +62,10 @@ class CauseNode:
         reads: for a predicate, the signals that it reads, each with the offset in samples at which it reads
             it.
         parts: causes among the operands; empty for a predicate.
-        main: index in `parts` of the operand that decides.
+        main: index in `parts` of the operand whose value is the robustness of the sub-formula.
         premise: whether the sub-formula is the left side of an implication.
-        moves: whether the value of the sub-formula changes when the deciding value changes; False if a value
-            that `freeze` bound changes with it.
+        moves: whether the robustness of the sub-formula changes if the deciding predicate value changes
+            alone; False, for example, for a `freeze` that binds a signal sample which the predicate reads.
     """
 
     formula: typed.Formula
@@ -101,7 +101,7 @@ class CauseNode:
 
     @property
     def path_moves(self) -> bool:
-        """True if `moves` holds for all nodes on the path to the deciding predicate."""
+        """True if `moves` is True for this node and all nodes on the path to the deciding predicate."""
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
@@ -116,16 +116,15 @@ Spot: TypeAlias = tuple[ir.Formula, int]
 
 @dataclass(frozen=True, slots=True)
 class _Tied:
-    """Predicate values of a trace, one of which may be raised to the next larger float.
+    """Table of all predicate values on a trace, one of which may be replaced by the next larger float.
 
-    Used to test whether one predicate value alone determines the robustness of a formula.
+    It is used to test whether one predicate value alone determines the robustness of a formula.
 
     Attributes:
         record: the trace.
         names: predicate -> name of the column (time series) with its values.
-        env: name of a column -> values (samples, 1); `coded` adds columns for predicates that are not yet in
-            it.
-        raised: the value to raise, as (predicate, sample); None raises no value.
+        env: name of a column -> predicate values (samples, 1); `coded` adds the columns that are missing.
+        raised: (predicate, sample) of the value to replace; None replaces no value.
         stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
     """
 
@@ -146,7 +145,7 @@ class _Tied:
         return {**self.env, name: column}
 
     def coded(self, formula: ir.Formula) -> ir.Formula:
-        """Replace the predicates of a formula by columns that hold their values."""
+        """Replace the predicates of a formula by columns of their values; missing columns are added."""
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
@@ -155,7 +154,7 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """Robustness of a formula at a sample, with the first of the values in `raised`, if any, raised."""
+        """Robustness of a formula at a sample; the first value in `raised` is raised to the next float."""
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
@@ -182,9 +181,11 @@ class CauseFinder:
     Attributes:
         record: signals of the trace, (samples, 1), up to the end of the evaluated window.
         grid: time grid.
-        cache: (formula, wanted) -> the lowered formula, negated if `wanted` is False.
-        known: lowered formula -> evaluated instants with upper bounds of its robustness there.
-        tied: predicate values that replace those of the trace, one of them slightly raised.
+        cache: (formula, wanted) -> the lowered formula (intervals in samples, only basic operators), negated
+            if `wanted` is False.
+        known: lowered formula -> ranges of evaluated instants, each with upper bounds on its robustness.
+        tied: table of predicate values, one of them slightly raised, to evaluate instead of the trace; None
+            evaluates the trace.
         stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
     """
 
@@ -198,7 +199,7 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Return why `formula` does not have truth value `wanted`, and if one predicate value alone decides.
+        """Return the cause tree of `formula` not being `wanted`; True if one predicate value alone decides.
 
         If several predicate values equal the robustness, the main path leads to one whose change alone
         changes the robustness, if there is one among the first `MOST_TIED`.
@@ -236,9 +237,10 @@ class CauseFinder:
         return sorted(found, key=lambda spot: spot[1])
 
     def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
-        """Values of all predicates on the trace.
+        """Table of the values of all predicates on the trace.
 
-        None if one of the instants in `equal` lies beyond the last sample, or if there are too many values.
+        It is None if one of the instants in `equal` lies after the last sample, or if there are too many
+        values.
         """
         leaves = list(_leaves_of(lowered))
         samples = self.record.samples
@@ -294,8 +296,8 @@ class CauseFinder:
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
         """Values that a `freeze` formula binds at a sample.
 
-        A value that is unknown there is replaced by one read beyond the trace, which makes its readers
-        unknown.
+        An unknown value is replaced by a signal that is read after the end of the trace, so that the
+        predicates that use it are unknown.
         """
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
@@ -309,9 +311,10 @@ class CauseFinder:
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
-        """The lowered formula, negated if `wanted` is False: the formula whose violation is explained.
+        """The formula in terms of basic operators with intervals in samples, negated if `wanted` is False.
 
-        Signals on which a requirement does not depend may be missing.
+        Predicates on signals that the trace does not contain are assumed true. If samples are unknown, the
+        upper bound of the formula is returned.
         """
         key = (formula, wanted)
         if key not in self.cache:
@@ -342,7 +345,7 @@ class CauseFinder:
         return self._margin(formula, sample, wanted) == math.inf
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
-        """Values at `instants` that an earlier evaluation stored; None if there are none."""
+        """Values (instants,) that an earlier evaluation stored in `known`; None if there are none."""
         for known, values in self.known.get(lowered, ()):
             if known.start <= instants.start and instants.stop <= known.stop:
                 rows = values[instants.start - known.start : instants.stop - known.start]
@@ -451,7 +454,10 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """The first instant after the last sample from which on the operands of a formula are unknown."""
+        """The first instant from which on all operands of a formula are unknown.
+
+        It lies after the last sample by the lookback of past operators (at most `_MOST_LATER` samples).
+        """
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
     def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> CauseNode:
@@ -510,7 +516,7 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """True if the window extends beyond the instants at which an operand has known values."""
+        """True if the window extends beyond the last instant at which an operand has a known value."""
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
             return False
@@ -526,7 +532,7 @@ class CauseFinder:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """The closest attempt of a failed `until`: its offset from now, and whether the left side decides there.
+    """Offset in samples of the value that decides a failed `until`; True if it is a value of the left side.
 
     The robustness of `until` is the maximum, over the instants k of its window, of the minimum of the right
     side at k and of the left side at all instants up to k.
@@ -540,11 +546,11 @@ def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
 
 
 def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
-    """Decomposition of a failed `release`.
+    """Offsets in samples of the left and right values that decide a failed `release`.
 
     Returns:
-        The offset at which the right side fails, the offset of the greatest left value up to there, and which
-        of the two decides: 0 left, 1 right.
+        The offset at which the right side fails, the offset of the greatest left value up to there, and the
+        side whose value is the robustness: 0 left, 1 right.
     """
     skipped = len(left) - len(right)
     freed = np.maximum.accumulate(left)[skipped:]

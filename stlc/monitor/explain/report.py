@@ -151,13 +151,13 @@ def _cause(
 
 @dataclass(frozen=True, slots=True)
 class _Words:
-    """Wording of causes of one requirement.
+    """Generator of the texts that describe causes of the violation of one requirement.
 
     Attributes:
         subject: the evaluated signals and requirements.
-        record: the trace, up to the end of the window.
+        record: the trace, up to the end of the evaluated window.
         written: source expression of the requirement.
-        definitions: name defined in the specification -> its expression.
+        definitions: name of a definition in the specification -> its expression.
     """
 
     subject: Prepared
@@ -181,7 +181,7 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """Labels of the parts of the source text to underline, that of the deciding predicate first."""
+        """Labels of the source parts to underline, beginning with the one of the deciding predicate."""
         found: dict[Span, str] = {}
         for node in _labelled(tree):
             found.setdefault(self.site(node.span), self.label(node))
@@ -190,7 +190,7 @@ class _Words:
         return [Label(span, found[span]) for span in spans]
 
     def label(self, node: CauseNode) -> str:
-        """Label of an underlined part: truth value and instant; for a premise also signal values."""
+        """Label of a node: truth value and instant; signal values for the left side of an implication."""
         moment = self.subject.moment(node.sample)
         if node.until is not None:
             window = f"from {moment} to {self.subject.moment(node.until)}"
@@ -199,7 +199,7 @@ class _Words:
         return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
 
     def because(self, tree: CauseNode) -> str:
-        """The cause in words; if the premise of an implication decides, the conclusion is described, too."""
+        """The cause in words; if the left side of an implication decides, its right side is described too."""
         text = self.reason(tree)
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
@@ -223,7 +223,7 @@ class _Words:
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
-        """Part of the requirement that contains `span`, or that refers to the definition containing it."""
+        """`span` itself, or, if it is inside a definition, the name in the requirement that leads to it."""
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 
@@ -249,7 +249,7 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 
 
 def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
-    """Nodes that get a label: whole premises, bodies of temporal operators that never hold, predicates."""
+    """Nodes that get a label: left sides of implications, bodies that never hold in a window, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
         yield _body(tree)
         return
@@ -263,7 +263,7 @@ def _deciding(tree: CauseNode) -> CauseNode:
 
 
 def _closest(tree: CauseNode) -> bool:
-    """True if the deciding predicate is the closest attempt in a window in which the body never holds."""
+    """True if the deciding predicate is the body of a window, fails throughout, and is nearest to true."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]
@@ -271,7 +271,7 @@ def _closest(tree: CauseNode) -> bool:
 
 
 def _body(node: CauseNode) -> CauseNode:
-    """For a temporal operator whose body holds nowhere in its window, the node with the body as formula."""
+    """A copy with the body as formula if it holds nowhere in a temporal operator's window, else `node`."""
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
         return replace(node, formula=operands(node.formula)[-1])
     return node
