@@ -1,8 +1,8 @@
-"""Bounds for a stream that may end with any sample: the effect of an early end is written into the formula.
+"""Formulas whose values bound the robustness on a stream that may end with any sample.
 
-A window to the end of the trace has no end yet while the trace grows. The least value of `eventually` is that
-of a trace that ends now, the least value of `always` that of a trace that continues; for the greatest values
-it is the other way round. `prefix_bound` adds to the formula a predicate that is true at every existing
+The length of a window to the end of the trace is unknown while the trace grows. `eventually` has its least
+value if the trace ends now, `always` if the trace continues; for the greatest values it is the other way
+round. `prefix_bound` adds to the formula a predicate that is true at every existing
 sample and unknown afterwards, so that values beyond the last sample do not count. The least and the greatest
 value therefore need two formulas.
 """
@@ -33,12 +33,12 @@ _UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
-    """The formula whose value is the lower or upper bound of `formula` wherever the trace ends.
+    """The formula whose value bounds that of `formula`, at whichever later sample the trace ends.
 
     Args:
         formula: the formula to bound.
-        end: which bound.
-        cut: whether the end of the trace clips bounded windows, too.
+        end: "lower" or "upper" bound.
+        cut: whether the end of the trace clips bounded windows, too, and not only unbounded ones.
     """
     return _PrefixBound(end == "lower", cut).of(formula)
 
@@ -49,9 +49,10 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return a bound of the formula over the traces that end with the last sample or later.
+        """Return a formula that bounds `formula` on all traces that end with the last sample or later.
 
-        Instants that do not exist if the trace ends early are left out of the windows.
+        Instants that would not exist if the trace ended early are excluded from windows where that is the
+        worst case.
         """
         match formula:
             case ir.Temporal(op, window, body):
@@ -71,25 +72,33 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """The body of a window, restricted to existing samples if that is the worst case for the bound."""
+        """Bound the body of a window; only existing samples count if that is the worst case for the bound.
+
+        `some` is True if the body must hold at one instant of the window, False if at all; `cut` is True if
+        the end of the trace clips the window.
+        """
         inner = self.of(body)
         return self._seen(inner, 0) if cut and some is self.least else inner
 
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """The formula, with the worst case for the bound if its window starts after the last sample."""
+        """Make the bound of an unbounded operator infinite if its window starts after the last sample.
+
+        `some` is as in `_found`. The formula is unchanged if an empty window makes the bound infinite
+        already, or if the end of the trace clips all windows (`cut`).
+        """
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """The formula, and that the sample `later` steps later exists; for the upper bound the dual."""
+        """Make a bound infinite (no information) where the sample `later` steps ahead may not exist."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
-    """Return the signals (samples, traces), with a column that is 1 at every existing sample."""
+    """Return the signals (samples, traces) and, added, the signal `SEEN`, which is 1 at every sample."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 
@@ -111,7 +120,7 @@ def own_span(node: ir.Formula) -> Reach:
 
 
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return the formula with unbounded future windows replaced by windows longer than all known values."""
+    """Return the formula with unbounded future windows bounded, beyond all instants with known values."""
     length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
 
     def longer(node: ir.Formula) -> ir.Formula:

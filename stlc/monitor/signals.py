@@ -96,7 +96,7 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
 
 
 def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
-    """Return the options for reading a trace file of the signals that `spec` declares.
+    """Return `requested` completed by the kinds and words of the signals that a specification declares.
 
     Args:
         spec: the specification, which gives the kinds of the signals and the values of enum members.
@@ -107,7 +107,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
     columns = {item.name: item.column for item in signals if item.column}
 
     def column(name: str) -> str:
-        """The column name of a signal or of one of its components: with `p from "q"`, `p[0]` is `q[0]`."""
+        """Name in the file of a signal or of a vector's component: with `p from "q"`, `p[0]` is `q[0]`."""
         base, bracket, index = name.partition("[")
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
@@ -156,7 +156,7 @@ class Signals:
 
     @property
     def gaps(self) -> dict[str, Gap]:
-        """Unknown samples (NaN) of each signal that has some, by name; empty for arrays not of NumPy."""
+        """Unknown samples (NaN) of every signal that contains NaN, by name; {} if arrays are not NumPy."""
         if self.ops is not NUMPY:
             return {}
         found = {name: Gap().with_more(np.isnan(values)) for name, values in self.env.items()}
@@ -214,7 +214,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
 
 
 def _find(data: Given, name: str) -> Any:
-    """The array of a signal, or of a component `q[0]` of a vector `q`; None if there is none."""
+    """The array called `name`, or for `q[0]` component 0 of the vector `q`; None if there is none."""
     index = None
     if name not in data:
         match = _COMPONENT.fullmatch(name)
@@ -291,7 +291,7 @@ def _torch_columns(
 
 
 def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Convert signals to the units that the specification declares; unchanged if either unit is unknown."""
+    """Convert signals to their declared units, if both units are known. Raises TraceError (E605)."""
     converted = dict(columns)
     findings: list[Diagnostic] = []
     for need in needs:
@@ -324,7 +324,7 @@ class Conversion:
 
 
 def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
-    """Conversion of recorded numbers to a signal's unit; None if the units are equal or one is unknown.
+    """Return the conversion from the recorded to the declared unit; None if they are equal or one is unknown.
 
     Raises:
         TraceError: E605, the units measure different quantities.
@@ -360,7 +360,7 @@ def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:
 
 
 def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
-    """Finding E604: an infinite value."""
+    """Finding E604: a signal has the infinite value `value`; `where` is its instant as text."""
     return Diagnostic(
         "E604",
         f"{signal} is {value} at {where}",
@@ -371,7 +371,7 @@ def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Unknown samples of a signal.
+    """Count and range of the unknown samples (NaN) of a signal.
 
     Attributes:
         samples: number of unknown samples, over all traces.

@@ -50,7 +50,7 @@ class Record:
 
     @property
     def sure(self) -> Record:
-        """The record without `holes`, for formulas that already account for unknown values."""
+        """The record with `holes` empty, for formulas that account for unknown values themselves."""
         return replace(self, holes=frozenset()) if self.holes else self
 
     @property
@@ -65,7 +65,11 @@ class Record:
     def values(
         self, formulas: Sequence[ir.Formula], instants: range, end: Boundary, stop: int | None = None
     ) -> list[Array]:
-        """Values `(instants, batch)` of each formula at consecutive instants; for `stop` see `evaluate`."""
+        """Values of each formula at `instants`, `(instants, batch)`.
+
+        `end` is the treatment of instants after the last sample, and `stop`, for a trace that continues, the
+        number of samples at which unbounded windows end (see `evaluate`).
+        """
         return evaluate(
             formulas,
             self.env,
@@ -129,7 +133,7 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Yield pieces of the trace around several instants as the batch of a record, and their number."""
+    """Yield (record, number of instants); the batch of a record is one piece of the trace per instant."""
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]
@@ -163,7 +167,7 @@ def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formu
 
 
 def _read(num: ir.Num) -> set[str]:
-    """Names of the signals and of the frozen variables that an expression reads."""
+    """Names of the signals, and of the names bound by `freeze`, that an expression reads."""
     return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
@@ -173,7 +177,7 @@ def _read(num: ir.Num) -> set[str]:
 def by_truth(formula: ir.Formula) -> ir.Formula:
     """The formula with each predicate's margin replaced by its truth value: +inf (true) or -inf (false).
 
-    `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
+    `a > b` is true if its margin a - b is above 0, `a >= b` if it is at least 0, without any tolerance.
     """
     if isinstance(formula, ir.Predicate):
         return replace(formula, guard=True)

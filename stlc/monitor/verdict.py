@@ -123,7 +123,8 @@ class Monitor:
                 own instants.
             end: treatment of a trace that is too short: "open" computes bounds over all its continuations and
                 may be inconclusive, "strict" raises an error, "truncate" clips the windows.
-            tolerance: robustness values down to minus this count as satisfied; 0 distinguishes `<` from `<=`.
+            tolerance: a requirement is satisfied if its robustness is at least minus this value. With 0,
+                truth values of the predicates decide, which distinguish `<` from `<=`.
             require: names of the requirements to evaluate; empty: all.
             semantics: semantics of the reported robustness, or its name; verdicts and causes are always
                 exact.
@@ -240,7 +241,7 @@ class Monitor:
         return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
-        """Compile for the known time step and horizon.
+        """Return the specification compiled for the time step and horizon that are known.
 
         The time step is that of the trace, else of the argument, else of the system; the horizon is that of
         the argument, else of the system, else of the trace. What is still unknown comes from the system that
@@ -265,7 +266,10 @@ class Monitor:
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """The finding; an E311 gets a note that the system file named by the specification does not exist."""
+        """Add to an E311 (`dt` or `T` is unknown) the note that the system file does not exist.
+
+        The note is added if the specification names a system; other findings are returned unchanged.
+        """
         if finding.code != "E311" or self.spec.system is None:
             return finding
         return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
@@ -310,7 +314,7 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """True for traces that do not certainly violate the assumptions, (traces,)."""
+    """True for traces that satisfy the assumptions or for which this is undecided, (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
@@ -332,10 +336,10 @@ def _judge(
 
 
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """The judgement with its robustness in the semantics of `ready`.
+    """A copy of the judgement whose `reported` bounds are in the semantics of `ready`.
 
-    If a value is only bounded and the semantics averages (its extrema are means), only the sign of the exact
-    bounds is kept.
+    In a semantics whose minimum and maximum are means, bounds over unknown samples are not valid. There, only
+    the sign of the exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or +inf.
     """
     starts = range(judgement.start, judgement.start + judgement.instants)
     ends: Ends = "truncate" if end == "truncate" else "open"

@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
 class Tracker(Protocol):
     """Incremental evaluator of one requirement on a growing trace.
 
-    Instants become settled in order: the value at a settled instant can no longer change.
+    Instants become settled in order: the value at a settled instant can no longer change with later samples.
     """
 
     @property
@@ -54,10 +54,10 @@ class Tracker(Protocol):
         """The first instant whose value may still change with later samples."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace at the instants from `start` up to `stop`."""
+        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
 
     def ended(self, starts: range) -> Bounds:
         """Bounds at instants `starts` after the trace has ended; unbounded windows are clipped at its end."""
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns the first sample that is still needed."""
+        """Free the memory of instants before `start`; returns the index of the first sample still needed."""

@@ -1,7 +1,7 @@
 """Time series of robustness values that grow sample by sample, in memory bounded by the windows of a formula.
 
-Each such column is stored twice, as the least and as the greatest value over all continuations of the trace;
-the two are equal where nothing is unknown.
+Each such time series (column) is stored twice: with the least and with the greatest values over all
+continuations of the trace. The two are equal at samples where nothing is unknown.
 """
 
 from __future__ import annotations
@@ -49,14 +49,16 @@ _EXACT = Windows(Exact(), NUMPY)
 
 
 class ColumnReader:
-    """Evaluator of fixed formulas over growing columns (time series); it caches its evaluation plans.
+    """Evaluator of fixed formulas over growing columns (time series, one row per sample).
+
+    The order of computation is cached for every range of rows.
 
     Args:
-        formulas: formulas whose predicates are columns.
+        formulas: formulas; each predicate is the value of a column.
         end: value of rows after the last one: "lower" -inf, "upper" +inf, "both" the two side by side;
             "truncate" clips windows at the last row.
         going_on: whether the trace continues after the last row.
-        back: lookback in rows.
+        back: lookback of the formulas in rows; unknown values in earlier rows are ignored.
     """
 
     def __init__(
@@ -71,7 +73,10 @@ class ColumnReader:
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
-        """Return the values (count, traces) of each formula from row `start` on; columns are equally long."""
+        """Return the values (count, traces) of each formula at `count` rows, the first of which is `start`.
+
+        All columns in `env`, (rows, traces), must have the same number of rows.
+        """
         names = self.names or (NOTHING if NOTHING in env else next(iter(env)),)
         length = len(env[next(iter(names))])
         if count <= 0:
@@ -88,10 +93,10 @@ class ColumnReader:
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
     ) -> list[Floats]:
-        """Bounds of each formula from row `start` on, over all values that unknown (NaN) rows may have.
+        """Bounds of each formula at `count` rows from `start` on, over all values that NaN may stand for.
 
-        `least` selects the lower (True) or the upper bound. If it is None, both bounds are returned side by
-        side, (count, 2), for columns (rows, 1).
+        `least` selects the lower (True) or the upper (False) bound, (count, traces). If `least` is None, the
+        columns have one trace, and both bounds are returned side by side, (count, 2).
         """
         rows = {name: env[name] for name in self.names}
         near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
@@ -105,7 +110,7 @@ class ColumnReader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
-        """The evaluator of the lower or upper bounds of the formulas if `holes` have unknown values."""
+        """The evaluator of the lower (`least`) or upper bounds if the columns `holes` have unknown values."""
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
@@ -123,10 +128,9 @@ class Side:
             side as (rows, 2); "truncate" clips windows at the last sample.
         beyond: number of rows after the last sample that the formula reads.
         truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
-        least: unknown values of signals (NaN) are taken at their least (True), at their greatest (False), or
-            at both (None).
-        rows: views of the columns from sample `base` on.
-        history: the stored rows.
+        least: bound of predicates that read unknown samples (NaN): True lower, False upper, None both.
+        rows: column name -> view of its stored rows, the first of which is sample `base`.
+        history: storage of the rows.
     """
 
     plan: ColumnPlan
@@ -161,7 +165,7 @@ class Side:
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
 
     def _farthest(self) -> int:
-        """Number of rows needed after the last sample, by the formula or to compute other columns."""
+        """Number of rows to store after the last sample: the formula or other columns read them."""
         if self.end == "truncate":
             return 0
         pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
@@ -172,16 +176,16 @@ class Side:
 
     @property
     def base(self) -> int:
-        """Number of the first stored sample."""
+        """Index of the first stored sample."""
         return self.history.first
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples and compute the columns there.
+        """Add new samples and compute the columns at these samples.
 
         Args:
             signals: signal name -> stored samples (stored, traces), up to the newest sample.
-            first: sample number of their first row.
-            samples: total number of samples of the trace.
+            first: index in the trace of the first stored sample.
+            samples: number of samples that the trace now has.
         """
         self._last = (signals, first, samples)
         width = 2 if self.end == "both" else next(iter(signals.values())).shape[1]
@@ -212,7 +216,7 @@ class Side:
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
-        """Return a copy for which the trace ends with the last sample: windows are clipped there."""
+        """Return columns whose predicates clip windows at the last sample; `self` if none looks ahead."""
         if self._last is None or all(stream.ahead == 0 for stream in self.plan.streams):
             return self
         last = replace(self, _settled=dict(self._settled), _over=True)
@@ -221,11 +225,11 @@ class Side:
         return last
 
     def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
-        """Return values (count, traces) of formulas over the columns, time series, from sample `start` on."""
+        """Return values (count, traces) of the formulas of `reader` at `count` samples from `start` on."""
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
-        """Free the rows before sample `first`, as far as no column needs them to continue."""
+        """Free the rows before sample `first`, except those that the recursion of a past operator reads."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
         if (base := min([first, *needs])) > self.base:
             self.history.forget(base)
@@ -249,9 +253,10 @@ def _of_the_present(stream: DerivedColumn) -> bool:
 
 
 def shareable(plans: ColumnPlans) -> bool:
-    """True if both bounds are values of the same formula, so that one evaluation gives both.
+    """True if one formula gives the lower and the upper bound, so that both are computed together.
 
-    This holds if the formula has only past operators and predicates that read the present sample.
+    This is so if the formulas in `plans` are equal, every predicate reads the signals at its own sample only,
+    and unbounded past operators have no operand that looks ahead.
     """
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(
@@ -261,7 +266,13 @@ def shareable(plans: ColumnPlans) -> bool:
 
 
 def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:
-    """Values of an unbounded past operator from its operands and its previous value, None at the start."""
+    """Values (rows, traces) of an unbounded past operator, computed recursively.
+
+    Args:
+        op: the operator.
+        parts: values of its operands at the rows to compute, (rows, traces) each.
+        last: value of the operator in the row before, (traces,); None if there is no such row.
+    """
     match op:
         case "once":
             found = np.maximum.accumulate(parts[0], axis=0)
@@ -280,7 +291,7 @@ _SINCE = ColumnReader([ir.Since("since", ir.Window(0, None), column("left"), col
 
 
 def _since(left: Floats, right: Floats, last: Floats | None) -> Floats:
-    """Values of an unbounded `since`: `s(k) = min(left(k), max(right(k), s(k - 1)))`."""
+    """Values s of an unbounded `since`: `s(k) = min(left(k), max(right(k), s(k - 1)))`."""
     (found,) = _SINCE({"left": left, "right": right}, 0, len(left))
     if last is None:
         return np.asarray(found)

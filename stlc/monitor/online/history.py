@@ -15,7 +15,7 @@ _SPARE = 64
 
 
 class ColumnHistory:
-    """Storage of columns (time series), (rows, width), in growing arrays.
+    """Storage of time series (columns) in arrays (rows, width) that grow by one row per sample.
 
     Appending a row takes amortized constant time.
 
@@ -24,7 +24,7 @@ class ColumnHistory:
         fill: value of rows that are not written yet: one number, or one per column of the array.
 
     Attributes:
-        first: number of the first stored sample.
+        first: index of the first stored sample.
         samples: total number of samples received.
     """
 
@@ -35,7 +35,7 @@ class ColumnHistory:
         self._origin = self._room = 0
 
     def grow(self, names: Iterable[str], count: int, width: int = 1) -> None:
-        """Append `count` unwritten samples to the columns `names`; every call names the same columns."""
+        """Append `count` rows with value `fill` to the columns `names`, which are the same in every call."""
         stop = self.samples + count + self._beyond
         if stop - self._origin > self._room:
             known = slice(self.first - self._origin, self.samples - self._origin)
@@ -58,7 +58,7 @@ class ColumnHistory:
             self.put(name, start, columns[name])
 
     def columns(self, first: int | None = None, stop: int | None = None) -> dict[str, Floats]:
-        """Return views of the stored rows of all series, from sample `first` up to `stop`."""
+        """Return views of the stored rows of all series, from sample `first` to `stop` (exclusive)."""
         end = self.samples + self._beyond
         low = max(self.first if first is None else first, self.first) - self._origin
         high = (end if stop is None else min(stop, end)) - self._origin

@@ -30,7 +30,7 @@ class Margin:
     Attributes:
         low: least robustness over all continuations of the trace; for a requirement that is evaluated at
             every sample, the minimum over the windows that contain the latest sample.
-        high: greatest robustness over all continuations, with the same minimum over windows.
+        high: greatest robustness over all continuations; the same minimum over windows is taken.
         violated: number of window starts at which the requirement is violated, whatever samples follow.
         open: whether at some window start the requirement is still undecided.
     """
@@ -41,7 +41,7 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Violated if violated at any window start, satisfied if satisfied at every one."""
+        """Status of a trace: violated if violated at any window start, satisfied if satisfied at all."""
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -74,7 +74,7 @@ class _Watched:
 
     @property
     def ahead(self) -> int | None:
-        """Lookahead in samples; None if the requirement depends on the end of the trace."""
+        """Samples after an instant that its value depends on; None if these are all up to the trace's end."""
         moving = window_of(self.rule, self.horizon)
         if moving is not None:
             return max(moving, self.rule.reach)
@@ -84,13 +84,16 @@ class _Watched:
         return max(self.rule.reach, counted or 0)
 
     def needs(self) -> int:
-        """Number of the first sample that is still needed."""
+        """Index of the first sample that later evaluations read."""
         if not self.everywhere:
             return 0
         return max(self.next - history(self.rule.formula), 0)
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """Margin at the latest of `samples` samples; `env` holds them (stored, traces) from `first` on."""
+        """Margin at the latest sample, which has index `samples` - 1; updates the counts.
+
+        `env` contains the stored samples of each signal, (stored, traces), beginning with sample `first`.
+        """
         if not self.everywhere and self.next:
             assert self.last is not None
             return self.last

@@ -35,7 +35,7 @@ _BEYOND_FLOATS = 1 << 1023
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """A final verdict.
+    """A final verdict of one requirement at one instant.
 
     Attributes:
         requirement: name of the requirement.
@@ -61,11 +61,12 @@ class How:
     """Options of an online monitor.
 
     Attributes:
-        at: where to evaluate the requirements: "all", at every sample; a number, at that sample; None, at the
-            instants that each requirement prescribes (`stlc.monitor.instants`).
-        end: treatment of windows cut by the end of the stream: "open" gives bounds, "strict" an error,
-            "truncate" clips the windows.
-        tolerance: robustness values down to minus this count as satisfied; 0 distinguishes `<` from `<=`.
+        at: instants at which to evaluate the requirements: "all", every sample; a number, that sample; None,
+            the instants that each requirement prescribes (`stlc.monitor.instants`).
+        end: treatment of windows that extend beyond the end of the stream: "open" computes bounds, "strict"
+            raises an error, "truncate" clips the windows.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value. With 0, truth
+            values of the predicates decide, which distinguish `<` from `<=`.
         t0: time of the first sample in seconds.
         reasons: whether to store the samples that `Online.cause` needs.
     """
@@ -80,7 +81,17 @@ class How:
 @final
 @dataclass(slots=True)
 class Watched:
-    """A requirement with its incremental evaluators (trackers) and its running verdict."""
+    """A requirement with its incremental evaluators (trackers) and its running verdict.
+
+    Attributes:
+        rule: the requirement.
+        everywhere: whether the requirement is evaluated at every sample or only at one.
+        values: evaluator of the robustness.
+        truths: evaluator of truth values, +inf or -inf; None if the tolerance is not 0.
+        tolerance: as in `How`.
+        tally: summary of the counted instants, those whose verdict is final.
+        decided: True for instants after the counted ones that already have a verdict, (instants,).
+    """
 
     rule: CompiledRequirement
     everywhere: bool
@@ -127,16 +138,16 @@ class Watched:
         return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Free the memory of settled instants; returns the first sample that is still needed."""
+        """Free the memory of settled instants; returns the index of the first sample still needed."""
         return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
 
 
 class Online:
     """Monitor of a stream of samples; made by `Monitor.online`.
 
-    Memory is bounded by the windows of the requirements, not by the length of the stream. A window to the end
-    of the trace needs no memory if it is outermost or inside other such windows only. If it is inside a
-    bounded window, all samples are stored and the requirement is evaluated on them.
+    Memory is bounded by the windows of the requirements, not by the length of the stream. An unbounded future
+    window takes constant memory if it is outermost, or if all windows around it are unbounded. If it is
+    inside a bounded window, all samples are stored and the requirement is evaluated on them.
     """
 
     def __init__(
@@ -215,7 +226,7 @@ class Online:
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
-        """Record which of a signal's next samples (samples,) are NaN. Raises TraceError (E604) for inf."""
+        """Add the NaN in a signal's next values (samples,) to `gaps`. Raises TraceError (E604) for inf."""
         if np.isinf(values).any():
             first = int(np.argmax(np.isinf(values)))
             moment = f"sample {self.samples + first}"
@@ -225,10 +236,10 @@ class Online:
         self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
 
     def _take(self, columns: dict[str, Floats], count: int) -> None:
-        """Store samples (time, 1) by name.
+        """Store `count` samples: arrays (count, 1) by signal name.
 
-        If the trace buffer is full, causes of violations are computed first, and then its older samples are
-        dropped.
+        If the trace buffer (`TraceBuffer`) is full, the causes of the worst violations are stored, and then
+        the older half of the samples in the buffer is dropped.
         """
         columns = columns or {"": np.zeros((count, 1))}
         if self._buffer is not None:
@@ -247,12 +258,12 @@ class Online:
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
-        """Range (start, stop) of the instants that have begun but are not counted yet."""
+        """Range (start, stop) of the received instants that are not yet counted in the tally."""
         start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
         return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Append to `found` the verdicts that became known with the latest sample."""
+        """Append to `found` the verdicts that the latest sample decides, and count settled instants."""
         start, stop = self._pending(watched)
         judged = watched.judged(start, stop)
         known = judged.holds | judged.fails
@@ -320,7 +331,7 @@ class Online:
         return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Sample number, least and greatest robustness of every window start whose value may still change."""
+        """Triples (window start, least, greatest robustness) for all starts whose value may still change."""
         watched = self._find(name)
         if watched.over or not self.samples:
             return []
@@ -330,7 +341,7 @@ class Online:
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
     def standing(self, name: str) -> Tally:
-        """Verdict of a requirement up to now; window starts that may still change count with their bounds."""
+        """Summary of a requirement up to now; starts whose value may still change enter with their bounds."""
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> Tally:
@@ -374,13 +385,13 @@ class Online:
         return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
 
     def _ended(self, watched: Watched, starts: range) -> Tally:
-        """Verdict of a requirement once the trace has ended."""
+        """Summary of a requirement at the instants `starts` if the trace ends now."""
         watched.grow(self._history)
         rest = range(min(watched.tally.next, starts.stop), starts.stop)
         return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
 
     def _worst(self, watched: Watched) -> Worst | None:
-        """Start and margin of a requirement's worst violation if the trace ended now; None without one."""
+        """Worst violation of a requirement if the trace ended now; None if it would not be violated."""
         if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
             return None
         tally = self._ended(watched, self._starts(watched))
@@ -389,9 +400,9 @@ class Online:
     def cause(self, name: str) -> Cause | None:
         """Return the cause of the worst violation of a requirement up to now.
 
-        None if the monitor was made without `reasons`, if nothing is violated, or if the samples that show
-        the cause were dropped. The monitor stores about two million numbers and finds causes before it drops
-        samples.
+        None is returned if the monitor was made without option `reasons`, if the requirement is not violated,
+        or if the samples that show the cause were dropped. The monitor stores the latest two to four million
+        numbers; before it drops samples, it stores the causes of the worst violations in them.
         """
         watched = self._find(name)
         worst = None if self._buffer is None else self._worst(watched)

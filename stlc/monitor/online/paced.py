@@ -45,9 +45,9 @@ _FROZEN = 500
 
 
 def span(formula: ir.Formula) -> Reach:
-    """Return the lookback and lookahead of a formula in samples, each the largest sum along nested operators.
+    """Return the lookback and lookahead of a formula in samples, each summed over nested operators.
 
-    An unbounded window counts with its lower bound only.
+    Among several operands the greatest value counts; an unbounded window counts with its lower bound only.
     """
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
@@ -56,12 +56,13 @@ def span(formula: ir.Formula) -> Reach:
 
 @dataclass(frozen=True, slots=True)
 class PacedWork:
-    """Number of rows (values of a subformula at one instant) computed for one evaluation of a formula.
+    """Work of one evaluation of a formula, counted in rows (values of a subformula at one instant).
 
     Attributes:
-        rows: all rows.
-        own: rows that instants do not share, such as those of a `freeze`.
-        heaviest: the subformula that causes most of the unshared rows.
+        rows: number of all rows.
+        own: number of rows that are computed for one instant only, such as those inside a `freeze`; other
+            instants cannot use them.
+        heaviest: the subformula to which most of the rows in `own` belong.
     """
 
     rows: int = 0
@@ -74,12 +75,12 @@ class PacedWork:
 
 
 def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
-    """Return the work of evaluating a formula at several instants.
+    """Return the work of one evaluation of a formula at several instants.
 
     Args:
         formula: the formula to evaluate.
         instants: number of instants.
-        samples: width assumed for an unbounded window.
+        samples: width in samples that is assumed for an unbounded window.
     """
     if isinstance(formula, ir.Freeze):
         spanned = sum(span(formula.body)) + (samples if _unbounded(formula.body) else 0)
@@ -105,9 +106,10 @@ def _unbounded(formula: ir.Formula) -> bool:
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
     """Return a formula with shorter windows, of equal value while a stream has at most `samples` samples.
 
-    After the last sample, only bounded past windows and shifts still read known values; further on, all
-    instants have equal values. Future windows are shortened if past windows are narrow, past windows if
-    future ones are narrow; if both are wide, the formula is unchanged.
+    Instants soon after the last sample still have values that past windows and shifts read from the trace.
+    All later instants have one and the same value, so that windows need not extend to them. Future windows
+    are shortened if past windows are narrow, and past windows if future windows are narrow; if both are wide,
+    the formula is unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))
@@ -119,7 +121,7 @@ def cut(formula: ir.Formula, samples: int) -> ir.Formula:
 
 
 def _cut(formula: ir.Formula, most: Reach) -> ir.Formula:
-    """The formula with windows and shifts no longer than `most`; the inside of a `freeze` is unchanged."""
+    """Shorten windows and shifts to `most` (lookback, lookahead) samples, except inside a `freeze`."""
     if isinstance(formula, (ir.Freeze, ir.AtStart)):
         return formula
     if isinstance(formula, ir.Windowed):
@@ -140,11 +142,12 @@ class PacedTracker:
 
     Attributes:
         rule: the requirement.
-        make: returns an evaluator of the requirement, or of the requirement with shorter windows.
+        make: function that returns an evaluator of a requirement; it is called with `rule`, whose windows may
+            have been shortened.
         everywhere: whether the requirement is evaluated at every instant or only at the first one.
-        stores_all: whether that evaluator stores and reads all samples.
-        window: number of samples from each instant to the end of its planning window; None if that is not
-            fixed.
+        stores_all: whether the evaluator stores and reads all samples.
+        window: number of samples from each instant to the end of its planning window; None if this number is
+            not fixed.
         samples: number of samples received at the last evaluation.
     """
 
@@ -159,9 +162,9 @@ class PacedTracker:
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of evaluating `formula` over a piece of the trace, of `spanned` samples.
+        """Return the work of one evaluation of `formula` on a piece of the trace with `spanned` samples.
 
-        `formula` is that of the requirement, or the same with shorter windows.
+        `formula` is the formula of the requirement, or this formula with shorter windows.
         """
         many = self.everywhere or _unbounded(formula)
         found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)
@@ -203,9 +206,9 @@ class PacedTracker:
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns the first sample that is still needed.
+        """Free the memory of instants before `start`; returns the index of the first sample still needed.
 
-        While windows are shortened, all samples are needed.
+        While windows are shortened, all samples are needed, since windows may be lengthened later.
         """
         needed = self._inner.drop(start)
         return needed if self._most is None else 0

@@ -44,8 +44,8 @@ class PredicateColumn:
 class RecursiveColumn:
     """Column (time series) of an unbounded past operator, computed recursively from its previous value.
 
-    `once`: max(body, last). `since`: min(left, max(right, last)). `historically` and `trigger` are their
-    duals.
+    With the previous value `last`, `once` is max(body, last), and `since` is min(left, max(right, last)).
+    `historically` and `trigger` are the same with min and max exchanged.
 
     Attributes:
         name: name of the column.
@@ -70,9 +70,9 @@ class ColumnPlan:
     """Decomposition of a formula into columns (time series of predicates and of unbounded past operators).
 
     Attributes:
-        formula: the formula, with columns in place of these subformulas.
+        formula: the formula, in which columns replace the predicates and unbounded past operators.
         streams: the columns; each one depends only on signals and on columns before it.
-        lag: number of last rows of a column whose values may still change.
+        lag: number of rows at the end of the columns whose values may change with later samples.
     """
 
     formula: ir.Formula
@@ -179,5 +179,5 @@ class _Planner:
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """Return the number of samples that predicates read ahead; at the end of the trace these are missing."""
+    """Return the greatest number of samples by which a predicate reads signals later than its instant."""
     return max((farthest(num).future for num in numbers(formula)), default=0)

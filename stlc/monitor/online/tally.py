@@ -1,4 +1,4 @@
-"""Running summary of evaluated instants: verdict, least robustness, and the instant of the latter."""
+"""Running summary of a requirement over instants: verdict, least robustness and where it occurs."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Tally:
     first: int = 0
 
     def add(self, judged: JudgedInstants, count: int) -> None:
-        """Count the first `count` instants of `judged`, which follow the counted ones."""
+        """Add the first `count` instants of `judged`; they must follow the instants already counted."""
         if count == 1:
             self._add_one(float(judged.low[0]), float(judged.high[0]))
             self.holds += bool(judged.holds[0])
@@ -87,21 +87,21 @@ class Tally:
 
     @property
     def status(self) -> Status:
-        """Violated if one instant is violated, satisfied if all instants are."""
+        """Violated if violated at one instant, satisfied if satisfied at all, else inconclusive."""
         if self.fails:
             return "violated"
         return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"
 
     @property
     def robustness(self) -> float:
-        """The least robustness; if not known exactly, the bound from which the verdict follows, else NaN."""
+        """The least robustness; if unknown, `low` if satisfied, `high` if violated, NaN if inconclusive."""
         if self.low == self.high or self.status == "satisfied":
             return self.low
         return self.high if self.status == "violated" else math.nan
 
     @property
     def worst(self) -> int:
-        """The instant of the least robustness; if the requirement is violated, of its worst violation."""
+        """The instant of `high` if the requirement is violated, else that of `low`."""
         return self.high_at if self.fails else self.low_at
 
     @property

@@ -1,4 +1,4 @@
-"""Trace buffer for explanations: the latest samples of a stream, and causes found in dropped samples."""
+"""Buffer of the latest samples of a stream, and of causes of violations found before samples were dropped."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Worst:
 
 @dataclass(slots=True)
 class TraceBuffer:
-    """The latest samples, and the causes of violations found before older samples were dropped.
+    """Buffer of the latest samples, and of causes of violations found before older samples were dropped.
 
     Attributes:
         compiled: the specification.
@@ -60,21 +60,21 @@ class TraceBuffer:
 
     @property
     def full(self) -> bool:
-        """True if the buffer is full, so that samples must be dropped."""
+        """True if the buffer is full, so that `forget` must be called."""
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
     def forget(self) -> None:
-        """Drop the older half of the samples; call `remember` before it for causes that lie in them."""
+        """Drop the older half of the samples; `remember` must be called first to keep the causes in them."""
         self._history.forget(self._history.samples - _MOST // self._width)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Find and store the cause of a violation, so that its samples can be dropped."""
+        """Find and store the cause of a violation, so that the samples that show it can be dropped."""
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """Return the cause of a violation; None if its samples were dropped before the cause was stored."""
+        """Return the cause of a violation; None if its samples were dropped before `remember` was called."""
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
             return known[1]
@@ -99,9 +99,11 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """Samples around a violation: number of the first, offset of the start from it, arrays (samples, 1).
+        """Excerpt of the buffer that suffices to explain a violation; None if its samples were dropped.
 
-        None if these samples were dropped.
+        Returns:
+            Index of the first sample of the excerpt, offset in samples from it to the instant at which to
+            explain the violation, and arrays (samples, 1) by signal name.
         """
         history = self._history
         formula, horizon = rule.lowered, self.compiled.grid.horizon
@@ -136,7 +138,7 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Numbers of samples before and after a start that suffice to explain a violation; None if unbounded."""
+    """Numbers of samples before and after an instant on which its value depends; None if unbounded."""
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None

@@ -38,10 +38,14 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """Return a formula whose value is a bound of `formula` wherever the trace ends.
+    """Return a formula whose value bounds that of `formula`, at whichever later sample the trace ends.
 
-    If the requirement has a planning `window`, all instants up to the end of that window exist, unless
-    windows are clipped at the end of the trace.
+    Args:
+        formula: the formula to bound.
+        end: "lower" or "upper" bound.
+        ending: "truncate" if windows are clipped at the end of the trace, else "open".
+        window: length in samples of the planning window that the requirement refers to, or None. In a
+            planning window that is not clipped all instants exist; `formula` itself is then returned.
     """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
@@ -50,8 +54,8 @@ def worst(
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
     """Return the columns (time series of subformulas) for the lower bound and for the upper bound.
 
-    If windows are clipped at the end of the trace, two more follow: both bounds of the formula with clipped
-    windows, over unknown samples.
+    If windows are clipped at the end of the trace, the columns for the lower and upper bound of the formula
+    with clipped windows follow; these bounds differ only where samples are unknown (NaN).
     """
     sides = [
         Side(plans["lower"], "lower", beyond, options.truth),
@@ -64,7 +68,7 @@ def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[
 
 
 def first_needed(planned: ColumnPlan, samples: int) -> int:
-    """Return the number of the first sample that a predicate of the decomposition `planned` still reads."""
+    """Return the index of the first sample that later evaluations of the predicates in `planned` read."""
     predicates = [stream for stream in planned.streams if isinstance(stream, PredicateColumn)]
     return max(min((samples - each.ahead - each.back for each in predicates), default=samples), 0)
 
@@ -93,14 +97,14 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Return values at settled instants (not affected by later samples), windows clipped to the trace."""
+        """Return bounds at settled instants, with windows clipped at the end of the trace."""
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Return bounds at any instants, all samples outside of the trace unknown."""
+        """Return bounds at instants `start` to `stop` (exclusive); samples outside the trace are unknown."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Return bounds over all continuations of the trace.
+        """Return bounds over all continuations of the trace at instants `start` to `stop` (exclusive).
 
         If windows are clipped, predicates before the first sample count as false, not as unknown.
         """
@@ -111,7 +115,7 @@ class _CutTracker(ABC):
         return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """Return bounds at the end of the trace."""
+        """Return bounds at instants `starts` after the trace has ended."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -122,7 +126,8 @@ class _ColumnTracker(_CutTracker):
     The columns are evaluated for both bounds, and twice more if windows are clipped at the end of the trace.
 
     Attributes:
-        plans: decomposition into columns of the lower bound, the upper bound, and the formula itself.
+        plans: decompositions into columns: "lower" of the lower bound, "upper" of the upper bound, "truncate"
+            of the formula itself.
         options: options of the evaluation.
         samples: number of samples received.
     """
@@ -149,14 +154,14 @@ class _ColumnTracker(_CutTracker):
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns the first sample that is still needed."""
+        """Free the memory of instants before `start`; returns the index of the first sample still needed."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
 
     @abstractmethod
     def _values(self, which: int, start: int, stop: int) -> Floats:
-        """Values of the formula for one bound: `which` is 0 lower, 1 upper; with clipped windows 2 and 3."""
+        """Values (instants,) of one bound: `which` is 0 lower, 1 upper; 2 and 3 with clipped windows."""
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
@@ -206,8 +211,9 @@ class BoundedTracker(_ColumnTracker):
 class IntervalColumns:
     """Formulas with bounded windows whose instants become settled at the same time, evaluated together.
 
-    They share columns (time series of their predicates and past operators), (rows, 2): the least and the
-    greatest value over all continuations. One evaluation gives both bounds of all formulas.
+    The formulas share columns (time series of their predicates and past operators), (rows, 2), which hold the
+    least and the greatest value over all continuations of the trace. One evaluation gives both bounds of all
+    formulas.
 
     Attributes:
         truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
@@ -250,7 +256,7 @@ class IntervalColumns:
         return self._found[1][which]
 
     def drop(self, which: int, start: int) -> None:
-        """Drop the rows that only formula number `which` needs, for instants before `start`."""
+        """Drop the rows that no formula needs, now that number `which` needs no instant before `start`."""
         self._starts[which] = start
         self.side.drop(min(self._starts) - self._back)
 
@@ -284,17 +290,17 @@ class IntervalTracker:
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace."""
+        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         return Bounds(*self.shared.values(self.which, start, stop).T)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace: missing samples stay unknown."""
+        """Bounds at instants `starts` after the trace has ended; samples after its end stay unknown."""
         return self.live(starts.start, starts.stop)
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; no earlier samples of the signals are needed."""
+        """Free the memory of instants before `start`; returns `samples`, as no stored sample is needed."""
         self.shared.drop(self.which, start)
         return self.shared.samples
 
@@ -367,7 +373,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Values at the instants `starts` if the formula reads past operators after its planning window."""
+        """Values (instants,) at `starts` if the formula reads past operators after its planning window."""
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
         ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
@@ -380,7 +386,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """True if a column may have known values after the last sample, by a past operator or a lookback."""
+    """True if a past operator or a lookback gives a column known values after the last sample."""
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -422,23 +428,23 @@ class UnboundedTracker:
             front.advance(samples - self._lag)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace."""
+        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         low, high = self._fronts[:2]
         return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace."""
+        """Bounds at instants `starts` after the trace has ended."""
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Free samples that the running state already accounts for and nothing else reads.
+        """Free the samples that the state of the recursion (`UnboundedState`) already accounts for.
 
-        Returns the number of the first sample that is still needed.
+        Returns the index of the first sample that is still needed.
         """
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)
@@ -447,7 +453,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """Evaluator of a requirement that needs the whole trace: it stores all samples."""
+    """Evaluator of a requirement that needs the whole trace, recomputed from all samples at every call."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -466,7 +472,7 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def window(self) -> int | None:
-        """Samples from an instant to its `end`; None if `end` is the end of the trace."""
+        """Samples from an instant to the end of its planning window; None without a planning window."""
         return window_of(self.rule, self.horizon)
 
     @property
@@ -496,7 +502,7 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Return the least and greatest values over all continuations of the traces, (instants, traces)."""
+        """Return least and greatest values over all continuations of the traces, each (instants, traces)."""
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
@@ -514,12 +520,12 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace."""
+        """Bounds at instants `starts` after the trace has ended."""
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002
-        """Drop nothing: all samples stay needed."""
+        """Return 0: all samples, from the first one on, are still needed."""
         return 0
 
 
@@ -528,7 +534,9 @@ class RecomputeTracker(_CutTracker):
 
 @dataclass(slots=True)
 class Trackers:
-    """Factory of incremental evaluators (trackers); requirements settled at the same time share columns.
+    """Factory of incremental evaluators (trackers).
+
+    Requirements whose values become final the same number of samples after an instant share one evaluation.
 
     Attributes:
         horizon: value of `T`, in steps.
@@ -546,8 +554,8 @@ class Trackers:
             everywhere: whether the requirement is evaluated at every instant or only at the first one.
 
         Raises:
-            UsageError: E313, the evaluation at each instant takes too much work and cannot share it with
-                other instants.
+            UsageError: E313, the requirement takes too much work, since every instant needs many values of
+                its own (in a `freeze`, or because `end` moves with the instant).
         """
 
         def make(part: CompiledRequirement) -> Tracker:
@@ -591,10 +599,10 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with `end` replaced by `window` samples after its instant; None if impossible.
+    """Return the formula with windows to `end` bounded by `window` samples, the planning window's length.
 
-    It is impossible if `end` occurs inside another window or in segments that would extend beyond `end`
-    (`sweep`), or if bounded windows extend beyond it.
+    None is returned if `end` occurs inside another temporal operator or in the function `sweep` (motion
+    between samples), or if a bounded window extends beyond `end`: the bounded formula would then differ.
     """
     moved = _ended(formula, window)
     return None if endless(moved) or uses_end(moved) or reach(moved).future > window else moved
@@ -611,7 +619,7 @@ def _ended(formula: ir.Formula, window: int) -> ir.Formula:
 
 
 def _too_much(rule: CompiledRequirement, found: PacedWork) -> Diagnostic:
-    """Finding E313 for a formula whose instants are evaluated separately, each on too many samples."""
+    """Finding E313: a requirement takes too much work, as every instant needs many values of its own."""
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
     return Diagnostic(

@@ -1,9 +1,9 @@
 """Formulas with windows to the end of the trace, evaluated at one sample in bounded memory.
 
-The value of the formula is a monotone function (a lattice polynomial of min and max) of the values that its
-unbounded operators have from some sample, the frontier, on. The samples before the frontier enter only
-through its coefficients: the values of the formula on those samples if each unbounded operator is continued
-by -inf or by +inf.
+The samples are divided at a sample called the frontier. The value of the formula is a monotone function (a
+lattice polynomial of min and max) of the values that its unbounded operators have on the samples from the
+frontier on. The samples before the frontier determine only the coefficients of the polynomial: the value of
+the formula for each choice of -inf or +inf as the later values of the unbounded operators.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FOREVER = ir.Window(0, None)
 
 @dataclass(frozen=True, slots=True)
 class DelayedFormula:
-    """A formula without unbounded windows, evaluated `steps` samples after an instant."""
+    """A formula that is evaluated `steps` samples after an instant."""
 
     formula: ir.Formula
     steps: int
@@ -45,16 +45,17 @@ class DelayedFormula:
 
 @dataclass(slots=True)
 class UnboundedOperators:
-    """The unbounded operators of a formula, rewritten over columns (time series) with lower bound 0.
+    """Decomposition of a formula into its unbounded future operators and the subformulas without any.
 
-    A subformula without unbounded windows is a column `$0`, `$1`, …. The value that an unbounded operator has
-    on the samples after the known rows is a column `!0`, `!1`, ….
+    Columns (time series) `$0`, `$1`, … replace the subformulas. Columns `!0`, `!1`, … are the values that the
+    unbounded operators have on the samples after the known rows. Operators are rewritten such that their
+    windows begin at 0.
 
     Attributes:
         root: the formula over columns.
-        parts: column `$k` -> the subformula that it stands for.
-        origins: column `!k` -> its operator, before the lower bound was removed.
-        operators: column `!k` -> its operator over columns, `!k` among them.
+        parts: column `$k` -> the subformula that it replaces.
+        origins: column `!k` -> its operator in the formula, with the original window.
+        operators: column `!k` -> its operator over columns: the value from the known rows and from `!k`.
     """
 
     root: ir.Formula
@@ -64,7 +65,7 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Number of samples after an instant that its subformulas without unbounded windows read."""
+        """Greatest lookahead in samples of the subformulas and operators, without unbounded windows."""
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
@@ -74,7 +75,7 @@ class UnboundedOperators:
 
     @property
     def back(self) -> int:
-        """Lookback of the subformulas in rows."""
+        """Greatest lookback of the subformulas without unbounded windows, in rows."""
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
@@ -93,7 +94,7 @@ def skeleton(formula: ir.Formula) -> UnboundedOperators:
 
 
 def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """The formula `steps` samples later, its subformulas without unbounded windows replaced by columns."""
+    """The formula `steps` samples after an instant, over columns; new columns are added to `found`."""
     if not endless(formula):
         return _part(formula, steps, found)
     match formula:
@@ -121,8 +122,8 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
     """Name of the column with the value that an unbounded operator has on the samples after the known rows.
 
-    Operators that read the same columns may still differ at the end of the trace: `next (always p)` and
-    `always (next p)` are not equal there.
+    The column is added to `found` if it is missing. Operators share it only if they are equal in the formula:
+    `next (always p)` and `always (next p)`, which read the same columns, differ at the end of the trace.
     """
     return _column_of(origin, found.origins, "!")
 
@@ -137,9 +138,10 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Unbounded `until`: satisfied in the known rows, or its left side is true there and it is met later.
+    """Rewrite an unbounded `until` over the known rows and the column of its value on later samples.
 
-    `release` is the dual.
+    It holds if it is satisfied within the known rows, or if its left side is true at all of them and it is
+    satisfied later. `release` is the same with `and` and `or` exchanged.
     """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
@@ -167,14 +169,14 @@ def _neutral(origin: DelayedFormula) -> float:
 class UnboundedState:
     """Lower or upper bound on a formula with unbounded windows, computed incrementally.
 
-    The bound is a polynomial of minima and maxima in the values that the unbounded operators have from sample
-    `at` on.
+    The bound is a polynomial of minima and maxima (see the module) in the values that the unbounded operators
+    have from sample `at`, the frontier, on.
 
     Attributes:
         bones: the formula, decomposed into its unbounded operators and the other subformulas.
         side: columns (time series) of the predicates and past operators, evaluated for the bound.
         begin: the sample at which the formula is evaluated.
-        at: the first sample that the coefficients do not account for yet.
+        at: the frontier: the first sample that the coefficients do not account for yet.
         coefficients: (subsets of the operators, traces): value of the formula if the operators of the subset
             are +inf from `at` on and the others -inf; None before the first `advance`.
     """
@@ -216,7 +218,7 @@ class UnboundedState:
         self.at = settled
 
     def value(self, samples: int) -> Floats:
-        """The bound while the trace continues, computed with enough unknown samples appended."""
+        """The bound (traces,) while the trace continues; unknown samples are appended to the known ones."""
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
             env[name] = np.full(env[NOTHING].shape, _neutral(origin))
@@ -224,7 +226,7 @@ class UnboundedState:
         return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
-        """Value of the formula if the trace ends with the last sample."""
+        """Value (traces,) of `formula` if the trace ends after `samples` samples."""
         if self.coefficients is None:
             return self._plain(formula, self.begin, samples)
         origins = self.bones.origins.values()
@@ -232,15 +234,15 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at sample `at`, one row each, of every unbounded operator.
+        """Values at sample `at` of all unbounded operators, one row each.
 
-        Before the first `advance`, the one row is the value of the whole formula.
+        Before the first `advance`, the only row is the value of the whole formula.
         """
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
-        """Value of a formula at sample `at`, with unbounded windows clipped at the last sample."""
+        """Value (traces,) of a formula at sample `at`, with unbounded windows clipped at the last sample."""
         parts: dict[str, DelayedFormula] = {}
         plain = _outlined(formula, parts)
         first = min(self.at, at)
@@ -251,14 +253,18 @@ class UnboundedState:
         return ColumnReader([plain], self.side.end)(env, at - first, 1)[0]
 
     def _columns(self, count: int) -> dict[str, Floats]:
-        """Values of the subformulas without unbounded windows at the next `count` samples."""
+        """Values (count, traces) of the subformulas without unbounded windows at the samples from `at` on."""
         env = {NOTHING: np.zeros((count, self.side.rows[NOTHING].shape[1]))}
         for steps, (names, reader) in self._parts.items():
             env |= zip(names, self.side.values(reader, self.at + steps, count), strict=True)
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Evaluate the polynomial at several points: (operators, points, traces) -> (points, traces)."""
+        """Evaluate the polynomial; `rests` are values of the operators, (operators, points, traces).
+
+        Returns:
+            Values of the formula, (points, traces).
+        """
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
