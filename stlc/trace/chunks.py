@@ -22,7 +22,7 @@ LARGE = 1_500_000_000
 
 
 def size_of(path: Path) -> int:
-    """Return the approximate size in memory of a file's numbers in bytes; 0 if it cannot be read in chunks.
+    """Return the approximate bytes of memory that a file's numbers need; 0 if it cannot be read in chunks.
 
     Raises:
         StlcError: the file cannot be opened, or is damaged.
@@ -76,14 +76,18 @@ def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
 
 
 class _Clock:
-    """Time grid shared by consecutive chunks of a trace."""
+    """Converter of consecutive chunks of a trace to one time grid, that of the first chunk."""
 
     def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
         self.begin = begin
 
     def next(self, recording: Recording, reading: Reading) -> Trace:
-        """Return the next chunk as a trace whose times continue those of the previous chunks."""
+        """Convert the next chunk to a trace whose times continue those of the previous chunks.
+
+        Raises:
+            TraceError: E602, a time is not on the grid; as `stlc.trace.trace.trace_of`.
+        """
         names = dict(reading.names)
         renamed = names.pop(CLOCK, None)
         recording = recording if renamed is None else recording.clocked_by(renamed)

@@ -1,6 +1,7 @@
-"""Conversion of words in a trace to numbers: members of enums, and truth values.
+"""Conversion of words in a trace, members of enums and truth values, to numbers.
 
-Words and complex numbers that cannot be converted are kept as extras, and refused if a signal needs them.
+Arrays of words or complex numbers that no signal needs are kept as extras, which are never evaluated. In an
+array that a signal needs, a word without a number, or a complex number, is an error.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
     Args:
         recording: content of the trace file; its arrays may be texts.
-        words: signal name in the file -> number of each word; empty for a numeric signal. Signals of words
-            that are not in this mapping are moved to the extras (arrays that are never evaluated).
+        words: name in the file of every needed signal -> number of each of its words; {} for a signal of
+            numbers. Other arrays of words or complex numbers become extras, which are never evaluated.
 
     Raises:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that is not a value of
@@ -75,7 +76,7 @@ def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
 
 
 def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
-    """Dates and times (ISO 8601) of a time column, parsed. Raises TraceError (E603) for other words."""
+    """Return the dates and times (ISO 8601) in a time column. Raises TraceError (E603) for other words."""
     assert group.clock is not None
     _refuse_complex(trace, group.named, group.clock)
     written = np.char.rstrip(group.clock, "Zz")
@@ -97,7 +98,7 @@ def instant_of_word(word: str) -> np.datetime64 | None:
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
-    """The number of a word of a signal. Raises TraceError (E603) for a word that the signal does not have."""
+    """Return the number that a signal's word stands for. Raises TraceError (E603) if it is not in `words`."""
     worth = _worth(word, words)
     if worth is None:
         raise TraceError(_unknown(trace, name, word, words))
@@ -105,7 +106,7 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
 
 
 def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Dates and times of a time column, in seconds since the first one."""
+    """Times in seconds since the first one, from a column of dates and times. Raises TraceError (E603)."""
     instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
@@ -122,7 +123,7 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """Number of a word, matched without case if that is unambiguous; NaN if empty, None if unmatched."""
+    """Number of a word, if need be regardless of case; NaN for an empty word, None for an unknown one."""
     if word in words:
         return words[word]
     if not word and words:

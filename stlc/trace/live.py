@@ -1,6 +1,6 @@
-"""Samples that arrive line by line, as a table with a header or as JSON, converted to one time grid.
+"""Reading of samples that arrive line by line, as a table with a header or as JSON, on one time grid.
 
-Lines are interpreted as in a file (`stlc.trace.formats.csv`): names, units, words, times.
+Names, units, words and times in a line are interpreted as in a file (`stlc.trace.formats.csv`).
 """
 
 from __future__ import annotations
@@ -53,11 +53,12 @@ class TimedSample:
 
 @dataclass(slots=True)
 class SampleStream:
-    """A stream of lines, parsed into samples.
+    """Parser of a stream of lines, one sample per line.
 
     Attributes:
         name: name of the stream, for messages.
-        reading: names of the signals and of the time in the stream, and numbers of the words of signals.
+        reading: options: names of the signals and of the time in the stream, and the numbers that stand for
+            words.
         units: signal -> unit in the header, "" if there is none; known from the first sample on.
     """
 
@@ -106,7 +107,11 @@ class SampleStream:
     # ------------------------------------------------------------------------ names
 
     def _named(self, there: Iterable[str]) -> None:
-        """Determine which name in the stream is the time, and which names are signals."""
+        """Store which of the names in the stream is the time, and which signal each other name stands for.
+
+        Raises:
+            TraceError: E601, a requested name is not in the stream.
+        """
         known = list(there)
         names = dict(self.reading.names)
         self._clock = names.pop(CLOCK, None) or clock_among(known)
@@ -185,7 +190,11 @@ class SampleStream:
         raise self._bad(number, f"has {shown}")
 
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """Number of a value in a line; None for a word of a signal that is not needed."""
+        """Convert a value in a line to a number; None if it is a word and no requirement needs the signal.
+
+        Raises:
+            TraceError: E603, a needed signal has an unknown word or another value that is not a number.
+        """
         if value is None:
             return math.nan
         found = _plain(value)
@@ -233,10 +242,10 @@ class Uniform:
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
-    """Return samples on the grid that `stlc.trace.trace.trace_of` would use, each one as soon as it is known.
+    """Return samples on the time grid that `stlc.trace.trace.trace_of` would use, as soon as they are known.
 
     Without resampling the times must be uniform. With resampling (`reading.resample` or `reading.max_gap`) a
-    sample is known once every signal has a later value, or has had none for the longest gap allowed.
+    sample is known once every signal has a later value, or had no value for longer than the allowed gap.
 
     Raises:
         TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;
@@ -320,12 +329,15 @@ class _Track:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """Values on a time grid; the last sample is known to have no successor before time `end`."""
+        """Values (points,) on a time grid; no sample follows the last one before time `end` in seconds."""
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
-        """Time before which interpolated values can no longer change."""
+        """Time in seconds before which interpolated values can no longer change.
+
+        `now` is the time of the latest sample of the stream, `limit` the longest gap that is bridged.
+        """
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
 
@@ -368,7 +380,7 @@ class Gridded:
 
     @property
     def _has_to_wait(self) -> bool:
-        """True if the usual time step must be estimated from the first samples."""
+        """True if the first samples must be collected to estimate the usual time step from them."""
         return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
 
     def _take(self, moment: TimedSample) -> float:
@@ -420,7 +432,10 @@ class Gridded:
     def _upto(
         self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
     ) -> Iterator[Sample]:
-        """Yield the next samples of the grid, up to number `most`, while `known` is True for their times."""
+        """Yield the next samples of the grid, at most `most` in all, while `known` is True for their times.
+
+        No sample of the stream follows before time `end`. Raises TraceError (E605) if `most` is too large.
+        """
         assert self._spacing is not None
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"

@@ -56,9 +56,9 @@ class TraceMeta:
         spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
         spec_set: constants that were overridden, with their values as texts.
         spec_hash: SHA-256 of these texts, hexadecimal.
-        judge_path: path of the specification that evaluates closed-loop runs, if it differs from that of the
-            plans; likewise `judge_text`, `judge_library` and `judge_set`. Without a text, `spec_text`
-            evaluates the trace.
+        judge_path: path of the specification that evaluates closed-loop runs, if it is not the one that the
+            control sequences (plans) were made for; its other data are `judge_text`, `judge_library` and
+            `judge_set`. If `judge_text` is "", the trace is evaluated by the specification in `spec_text`.
         system_name: name of the system.
         system_path: path of the system file as the user gave it.
         system_text: text of the system file.
@@ -101,7 +101,7 @@ class TraceMeta:
 
     @property
     def carried(self) -> Carried:
-        """The specification that evaluates the trace: that of closed-loop runs if given, else `planned`."""
+        """The specification that evaluates the trace: the one in `judge_text` if any, else `planned`."""
         if not self.judge_text:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)

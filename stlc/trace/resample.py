@@ -35,7 +35,7 @@ _SAME = 1 + 1e-9
 
 
 def usual_step(times: Floats) -> float:
-    """Usual time between samples in seconds: median of the first nine steps; 0 without a positive step."""
+    """Usual time between samples in seconds: the median of the positive steps among the first nine, or 0."""
     gaps = np.diff(times[: _GAPS + 1])
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
@@ -47,11 +47,11 @@ FIRST = _GAPS + 1
 
 @dataclass(frozen=True, slots=True)
 class Spacing:
-    """A time grid, and the longest gap between samples across which values are held or interpolated.
+    """Time step of a grid, and the longest gap between samples that is bridged.
 
     Attributes:
         dt: time step of the grid in seconds.
-        limit: the longest gap, in seconds, within which values are known.
+        limit: the longest gap between two samples, in seconds, within which values are held or interpolated.
     """
 
     dt: float
@@ -59,11 +59,11 @@ class Spacing:
 
     @staticmethod
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
-        """Grid for samples at `times`; values are known within gaps of at most `max_gap` seconds.
+        """Return the spacing with step `dt` that bridges gaps of at most `max_gap` seconds.
 
-        By default the limit is three steps, a step being the longer of `dt` and the usual time between
-        samples. Without `max_gap` there is no limit for `events`: discrete signals whose values hold until
-        the next sample.
+        Without `max_gap`, gaps of three steps are bridged, where a step is the longer of `dt` and the usual
+        time between the samples at `times`. If `events` is True, all gaps are then bridged: each value of a
+        discrete signal holds until the next sample.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)
@@ -89,7 +89,8 @@ def values_on(
         values: values of the samples, (samples,).
         spacing: time step of the grid and longest allowed gap.
         held: True for zero-order hold, False for linear interpolation.
-        end: time before which the last sample is known to have no successor.
+        end: time in seconds before which no sample follows the last one; a held value is known that long, if
+            the gap is not too long.
     """
     there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
     if not there.all():
@@ -129,7 +130,7 @@ class _Timed:
 
     @property
     def last(self) -> float:
-        """The last time at which all signals are known; +inf if all are held (they keep their last value)."""
+        """The last time at which all signals are known; +inf if all are held beyond their last sample."""
         return math.inf if self.events else float(self.times[-1])
 
 
@@ -139,8 +140,8 @@ class ResampleGrid:
 
     Attributes:
         dt: time step in seconds; None: the usual time between samples.
-        max_gap: the longest gap, in seconds, within which values are known. None: three steps, or no limit
-            for a group of discrete signals beside other groups.
+        max_gap: the longest gap, in seconds, within which values are known. None: three steps; no limit for
+            discrete signals that have a time column of their own.
     """
 
     dt: float | None = None

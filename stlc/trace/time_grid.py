@@ -26,9 +26,10 @@ _SNAP = 1e-6
 
 
 def resample_advice(step: float) -> str:
-    """Help text for samples that are not on one grid: `--resample` with a step derived from their usual step.
+    """Help text for samples that are not on one grid: `--resample` with a proposed time step.
 
-    The proposed step is at most half the usual one, since a grid of the usual step would skip samples.
+    The proposed step is at most half of `step`, the usual time between samples in seconds, since a grid with
+    the usual step would skip samples.
     """
     if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
         return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
@@ -38,7 +39,7 @@ def resample_advice(step: float) -> str:
 
 
 def gap_advice(step: float) -> str:
-    """Help text for a grid with missing samples."""
+    """Help text for a grid with missing samples: `--max-gap` with a proposed longest gap of three steps."""
     return (
         f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
         "in longer ones signals are unknown, and what needs them is inconclusive"
@@ -93,7 +94,7 @@ def require_step(name: str, dt: float) -> None:
 
 
 def require_same_step(name: str, found: float, said: float) -> None:
-    """Raise TraceError (E602) if the measured time step of a trace differs from the given one."""
+    """Raise TraceError (E602) if the measured time step `found` differs from the given one, `said`."""
     if abs(found - said) > 1e-3 * said:
         message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
         help_ = ("leave out --dt: the file says what its step is",)
@@ -168,7 +169,7 @@ def snapped(step: float) -> float:
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """The given time step if it agrees with the mean; else the mean, rounded to a nearby simple fraction."""
+    """`dt` if it agrees with the measured step `mean`, else `mean`, rounded to a nearby simple fraction."""
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt
     near = float(Fraction(mean).limit_denominator(100_000))

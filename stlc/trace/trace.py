@@ -107,8 +107,8 @@ class Reading:
         max_gap: longest gap in seconds within which values are known; setting it resamples the file, by
             default at its usual time step.
         kinds: signal -> kind of its numbers, which determines how it is resampled.
-        words: signal -> number of each of its words, for all needed signals; other signals of words (with
-            None, all) become extras.
+        words: name in the file of every needed signal -> number of each of its words. Other signals of words
+            become extras (arrays that are never evaluated); with None, all signals of words do.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -181,7 +181,7 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """The recording with times of step `dt` added for signals that have none."""
+    """The recording with times of step `dt`, or of the step in its metadata, for signals without times."""
     step = dt or recording.meta.dt
     if step is None:
         return recording

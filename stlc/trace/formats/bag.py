@@ -55,7 +55,7 @@ class _Topic:
 
     @staticmethod
     def of(log: Log, name: str, definition: str, form: Form) -> _Topic:
-        """Return the topic for messages of a definition; if undecodable, record the reason in `log`."""
+        """Return the topic with its decoder; if `definition` is invalid, store the reason in `log.unread`."""
         try:
             return _Topic(name, decoder(definition, form))
         except DamageError as error:
@@ -118,7 +118,10 @@ def _word(field: bytes) -> int:
 
 
 def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, bytes], content: bytes) -> None:
-    """Process one record; `topics` maps the number of each connection read up to now to its topic."""
+    """Process one record: add a connection's topic to `topics`, or a message's numbers to `log`.
+
+    `topics` maps the number of a connection to its topic; other kinds of records are ignored.
+    """
     if kind == _CONNECTION:
         number = _word(fields[b"conn"])
         if number not in topics:
@@ -233,7 +236,7 @@ def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Topic]:
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, str]:
-    """Message definitions in the database: message type -> definition; empty if the database has none."""
+    """Message definitions in the database: message type -> definition; {} if the database has none."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
         rows = database.execute(query).fetchall()

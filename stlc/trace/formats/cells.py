@@ -1,8 +1,8 @@
-"""Numbers from the cells of a table, one at a time or, for large files, all at once in little extra memory.
+"""Conversion of the cells of a table to numbers, one at a time or, for large files, all at once.
 
 Large texts are read by `cells.c` if there is a C compiler (`stlc.native`), else by Arrow if it is installed,
-else by NumPy, in blocks. Each of these leaves unusual cells to a slower reader, and all give the same
-numbers.
+else by NumPy, in blocks; all give the same numbers. Each of the three rejects texts with unusual cells, which
+a slower reader then reads.
 """
 
 from __future__ import annotations
@@ -62,9 +62,10 @@ def value_of(text: str) -> float | None:
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers in the selected columns, (lines, columns); None without lines or for other cells.
+    """Return the numbers in the selected columns, (lines, columns).
 
-    Empty cells are NaN, truth values are 0 and 1; quotes around a number are removed.
+    Empty cells are NaN, truth values are 0 and 1; quotes around a number are removed. None is returned if
+    there are no lines, or if another cell is not a number.
     """
     if not _ANY.search(body):
         return None
@@ -125,7 +126,7 @@ def _mended(body: str, delimiter: str) -> str:
 
 
 def read_lines(lines: TableText) -> list[Array] | None:
-    """Return the columns of a table of numbers; None if a line or cell is not of the expected form.
+    """Return the columns of a table of numbers, (lines,) each; None if a line or cell is unusual.
 
     Any line ending is allowed. Lines with empty cells only are left out; other empty cells are NaN.
     """
@@ -195,7 +196,7 @@ def _arrow() -> Any:
 
 
 def _by_arrow(lines: TableText) -> list[Array] | None:
-    """Read all lines with Arrow, which also rounds numbers correctly; None if a line is unusual."""
+    """Read all lines with Arrow; None if Arrow is not installed or a line is unusual."""
     csv = _arrow()
     if csv is None or lines.data[lines.start :].translate(None, _PLAIN):
         return None
@@ -220,7 +221,7 @@ def _by_arrow(lines: TableText) -> list[Array] | None:
 
 
 def _by_numpy(lines: TableText) -> list[Array] | None:
-    """Read the columns with NumPy, in blocks of lines to bound memory."""
+    """Read the columns with NumPy, in blocks of lines to bound memory; None if a line is unusual."""
     parts: list[list[Array]] = [[] for _ in range(lines.width)]
     for stretch in _stretches(lines):
         try:

@@ -60,7 +60,7 @@ class _Sheet:
 
 
 def read(path: Path) -> Recording:
-    """Return the content of a trace file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
+    """Return the content of a `.csv` file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
     return of_table(path, read_csv(path))
 
 
@@ -110,7 +110,7 @@ def _read(path: Path) -> bytes:
 
 
 def _read_large(path: Path, data: bytes) -> Table | None:
-    """Read the columns of a large file of numbers at once; None if the file needs the slower reader."""
+    """Read the columns of a large file of numbers at once; None if only the slower reader can read it."""
     try:
         sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
         names, units = _read_header(sheet)

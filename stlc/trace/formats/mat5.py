@@ -112,7 +112,7 @@ class _Matrix:
 
 
 def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
-    """Name and content of a matrix element; an element without sub-elements is an empty array."""
+    """Name and content of an array element; an element without sub-elements is an unnamed empty array."""
     parts = list(islice(_elements(data, order), MAX_ARRAYS + 1))
     if len(parts) > MAX_ARRAYS:
         raise _DamageError("too many parts")

@@ -45,7 +45,7 @@ _READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
 def read(path: Path) -> Recording:
-    """Read the numbers in all messages; a signal that is missing in a message of its topic is left out.
+    """Read the numbers in all messages; a signal is left out if any message of its topic lacks it.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -61,7 +61,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(slots=True)
 class _File:
-    """State of reading one file."""
+    """Reader of the records of one file: its schemas, its channels and their decoders."""
 
     log: Log
     room: Room
@@ -70,7 +70,7 @@ class _File:
     decoders: dict[int, Decode | None] = field(default_factory=dict)
 
     def take(self, record: Any) -> None:
-        """Process one record of the file, inside or outside of a chunk."""
+        """Process one record: store a schema or channel, or add the numbers of a message to the log."""
         match type(record).__name__:
             case "Schema":
                 self.schemas.setdefault(record.id, record)
@@ -90,7 +90,7 @@ class _File:
             self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
 
     def decoder(self, channel: Any) -> Decode | None:
-        """Return the decoder of a channel's messages; None, with the reason in the log, if there is none."""
+        """Return the decoder of a channel's messages; None, with the reason in `log.unread`, without one."""
         schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
         described = "" if schema is None else schema.encoding
         try:
@@ -109,7 +109,7 @@ class _File:
 
 
 def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
-    """Add the messages of a file to a log; returns the metadata that stlc writes, None for other files."""
+    """Add a file's messages to a log; returns the metadata if stlc wrote the file, None for other files."""
     reader = needed("mcap.stream_reader").StreamReader
     ours: Mapping[str, str] | None = None
     with mapped(path) as data:
@@ -256,7 +256,10 @@ def _schema(trace: Trace) -> dict[str, object]:
 
 
 def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
-    """Restore the trace that stlc wrote to this file; None if the file was changed afterwards."""
+    """Restore the trace that stlc wrote to a file from its messages and the metadata `ours`.
+
+    None is returned if the messages no longer fit together, because the file was changed afterwards.
+    """
     topics, origin = json.loads(ours.get("topics", "[]")), int(ours.get("origin", "0"))
     if not isinstance(topics, list) or not topics or not all(isinstance(topic, str) for topic in topics):
         return None

@@ -101,11 +101,11 @@ def mapped(path: Path) -> Iterator[mmap]:
 
 
 class Log:
-    """Messages collected from one or several files.
+    """Collection of the numbers in logged messages, from one or several files.
 
     Attributes:
         path: path of the log, for messages.
-        unread: topic -> reason why it was left out.
+        unread: topic -> reason why its messages were left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -137,7 +137,7 @@ class Log:
             raise unreadable(self.path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
 
     def recording(self) -> Recording:
-        """Convert the messages to signals; a signal is left out unless it is in every message of its topic.
+        """Convert the messages to signals; a number that is not in every message of its topic is left out.
 
         Raises:
             TraceError: E603, no message contains a number.
@@ -158,7 +158,7 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return times in ns and signals of one topic; empty arrays if it has no message."""
+        """Return times in ns and signals of one topic, as `_Topic.arrays`; empty without a message."""
         return self._topics.get(name, _Topic()).arrays()
 
     def _nothing(self) -> str:
@@ -213,7 +213,7 @@ def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Mes
 
 
 class Room:
-    """Remaining number of bytes that may still be decompressed from a file."""
+    """Decompressor that limits the total number of bytes decompressed from one file."""
 
     def __init__(self, path: Path, size: int) -> None:
         self.path = path
@@ -250,7 +250,7 @@ class Room:
         return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
 
     def of_unknown_size(self, data: bytes) -> bytes:
-        """Decompress a `zstd` frame, which need not declare its size."""
+        """Decompress a `zstd` frame, whatever its size. Raises TraceError (E603) beyond the limit."""
         with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
             out: bytes = reader.read(self.left + 1)
         if len(out) > self.left:

@@ -222,7 +222,7 @@ def read(path: Path) -> Recording:
 
 
 def size(path: Path) -> int:
-    """Size of all arrays in bytes; 0 if the file is not an archive."""
+    """Size of all unpacked arrays in bytes; 0 if the file is not an archive, or cannot be opened."""
     if not zipfile.is_zipfile(path):
         return 0
     try:

@@ -36,10 +36,13 @@ _MAX_NESTED = 32
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field of a message: name, type and count; a nested message has its layout in `inner`.
+    """A field of a message.
 
     Attributes:
+        name: name of the field.
+        kind: type of the field, as the definition names it.
         count: length of a fixed-length array, -1 for an array of variable length, None for a single value.
+        inner: layout of a nested message; None for a number, text or time.
     """
 
     name: str
@@ -107,7 +110,7 @@ class _Builder:
         return _Field(match["name"], kind, count, self.inner(kind, package, depth))
 
     def inner(self, kind: str, package: str, depth: int) -> _Layout | None:
-        """Layout of a nested message type; None for a type that is not a message."""
+        """Layout of a nested message type; None for a basic type. Raises DamageError for an undefined one."""
         if kind in _CODES or kind in _TEXTS or (kind in _STAMPS and self.form == "ros1"):
             return None
         name = "std_msgs/Header" if kind == "Header" else _short(kind)

@@ -96,7 +96,11 @@ def clock_scale(trace: str, name: str, unit: str) -> float:
 
 
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
-    """Reshape columns (lines,) to (traces, samples)."""
+    """Reshape columns (lines,) to (traces, samples); `keys` is the trace of each line.
+
+    Raises:
+        TraceError: E605, traces differ in length.
+    """
     labels, sizes = np.unique(keys, return_counts=True)
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))
