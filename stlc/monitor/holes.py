@@ -31,9 +31,9 @@ def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """Return the signals (samples, batch) without NaN, and for each one in `holes` a column of known samples.
+    """Return the signals (samples, batch) with NaN replaced by numbers, and indicators of known samples.
 
-    In the added column 1 marks a known sample and -1 an unknown one.
+    One indicator (samples, batch) is added for each signal in `holes`: 1 at known, -1 at unknown samples.
     """
     filled = dict(env)
     for name in holes:

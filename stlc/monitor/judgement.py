@@ -40,12 +40,12 @@ class Prepared:
 
     @property
     def horizon(self) -> int | None:
-        """Value of `T` in steps; None where unknown."""
+        """Horizon `T` of the planning window in steps; None if unknown."""
         return self.compiled.grid.horizon
 
     @property
     def dt(self) -> float | None:
-        """Time step in seconds; None where unknown."""
+        """Time step in seconds; None if unknown."""
         return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
 
     @property
@@ -123,7 +123,7 @@ class Judgement:
 
     @property
     def status(self) -> Any:
-        """Status (see `Status`) of the single trace; for a batch of traces an array of statuses."""
+        """`satisfied`, `violated`, `inconclusive` or `out of scope`; an array of these for several traces."""
         return _shaped(np.array(self.statuses), self.shape)
 
     @property
@@ -226,11 +226,11 @@ class Verdict:
 
     @property
     def status(self) -> Any:
-        """Status (see `Status`) of the single trace; for a batch of traces an array of statuses."""
+        """`satisfied`, `violated`, `inconclusive` or `out of scope`; an array of these for several traces."""
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return a copy that counts only the traces with True in `scope` (traces,): assumptions satisfied."""
+        """Return a copy that counts only traces that satisfy the assumptions: True in `scope` (traces,)."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
@@ -283,7 +283,7 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Truth values expanded to `most` instants by repetition of the overall value: (most, traces)."""
+        """Truth values (most, traces); if there are fewer instants, the truth over all of them, repeated."""
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)

@@ -2,9 +2,9 @@
 
 The length of a window to the end of the trace is unknown while the trace grows. `eventually` has its least
 value if the trace ends now, `always` if the trace continues; for the greatest values it is the other way
-round. `prefix_bound` adds to the formula a predicate that is true at every existing
-sample and unknown afterwards, so that values beyond the last sample do not count. The least and the greatest
-value therefore need two formulas.
+round. `prefix_bound` adds to the formula a predicate that is true at every existing sample and unknown
+afterwards, so that values beyond the last sample do not count. The least and the greatest value therefore
+need two formulas.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class _PrefixBound:
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
         """Bound the body of a window; only existing samples count if that is the worst case for the bound.
 
-        `some` is True if the body must hold at one instant of the window, False if at all; `cut` is True if
-        the end of the trace clips the window.
+        `some` is True if the body must hold at one instant of the window, False if at every one; `cut` is
+        True if the end of the trace clips the window.
         """
         inner = self.of(body)
         return self._seen(inner, 0) if cut and some is self.least else inner

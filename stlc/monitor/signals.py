@@ -375,8 +375,8 @@ class Gap:
 
     Attributes:
         samples: number of unknown samples, over all traces.
-        first: number of the first unknown sample.
-        last: number of the last unknown sample.
+        first: index of the first unknown sample.
+        last: index of the last unknown sample.
     """
 
     samples: int = 0
@@ -386,7 +386,7 @@ class Gap:
     def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
         """Return the gap with the True samples of `unknown`, (samples,) or (samples, traces), added.
 
-        `offset` is the sample number of the first row of `unknown`.
+        `offset` is the index in the trace of the first row of `unknown`.
         """
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):

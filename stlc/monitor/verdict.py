@@ -54,7 +54,7 @@ class Monitor:
     Args:
         spec: a specification, its text, or the path of its file.
         dt: time step of the signals in seconds; default: that of the trace, or of the system.
-        horizon: value of `T` in seconds; default: that of the trace, or of the system.
+        horizon: horizon `T` of the planning window in seconds; default: that of the trace, or of the system.
         system: path or name of a system file; the specification is then checked against it. Without it, the
             system that the specification names supplies a missing `dt` or `T`.
         overrides: name of a constant -> its value, as text.
@@ -208,7 +208,7 @@ class Monitor:
         """Return a monitor that takes samples one by one and gives bounds at once, verdicts once decided.
 
         Args:
-            how: where to evaluate, treatment of the end of the stream, and tolerance.
+            how: instants at which to evaluate, treatment of the end of the stream, and tolerance.
             require: names of the requirements to evaluate; empty: all.
             like: a trace, or the first piece of one, that gives `dt` and `T`.
             dt: time step in seconds, if neither `like` nor this monitor gives it.
@@ -243,9 +243,9 @@ class Monitor:
     def _ready(self, recorded: Times) -> Compiled:
         """Return the specification compiled for the time step and horizon that are known.
 
-        The time step is that of the trace, else of the argument, else of the system; the horizon is that of
-        the argument, else of the system, else of the trace. What is still unknown comes from the system that
-        the specification names.
+        The time step is that of the trace, else argument `dt` of the monitor, else that of the system. The
+        horizon is argument `horizon`, else that of the system, else that of the trace. A time step or horizon
+        that is still unknown is taken from the system that the specification names.
         """
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)

@@ -86,7 +86,7 @@ class _Clock:
         """Convert the next chunk to a trace whose times continue those of the previous chunks.
 
         Raises:
-            TraceError: E602, a time is not on the grid; as `stlc.trace.trace.trace_of`.
+            TraceError: E602, a time is not on the grid; also the errors of `stlc.trace.trace.trace_of`.
         """
         names = dict(reading.names)
         renamed = names.pop(CLOCK, None)

@@ -98,7 +98,7 @@ def instant_of_word(word: str) -> np.datetime64 | None:
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
-    """Return the number that a signal's word stands for. Raises TraceError (E603) if it is not in `words`."""
+    """Return the number that a signal's word stands for. Raises TraceError (E603) if unknown."""
     worth = _worth(word, words)
     if worth is None:
         raise TraceError(_unknown(trace, name, word, words))
@@ -106,7 +106,7 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
 
 
 def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Times in seconds since the first one, from a column of dates and times. Raises TraceError (E603)."""
+    """Convert a time column of dates and times to seconds since the first one. Raises TraceError (E603)."""
     instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)

@@ -35,7 +35,7 @@ _SAME = 1 + 1e-9
 
 
 def usual_step(times: Floats) -> float:
-    """Usual time between samples in seconds: the median of the positive steps among the first nine, or 0."""
+    """Usual time between samples in seconds: median of the positive ones of the first nine steps, or 0."""
     gaps = np.diff(times[: _GAPS + 1])
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
@@ -167,7 +167,7 @@ def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind
     """Return the signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
-    (zero-order hold), real ones are interpolated; within gaps that are too long both are unknown.
+    (zero-order hold), real ones are interpolated; within gaps that are too long, every signal is NaN.
 
     Args:
         recording: content of a trace file, with one or more groups of common times.

@@ -79,7 +79,7 @@ class Trace:
         return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
 
     def renamed(self, names: Mapping[str, str]) -> Trace:
-        """Return the trace with signals renamed: `names` maps each new name to the present one.
+        """Return the trace with signals renamed: `names` maps each new name to the current name.
 
         Raises:
             TraceError: E601, a signal is not in the trace.

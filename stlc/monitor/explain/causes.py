@@ -154,7 +154,11 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """Robustness of a formula at a sample; the first value in `raised` is raised to the next float."""
+        """Robustness of a formula at a sample.
+
+        If `raised` is not empty, the first predicate value that it names is replaced by the next larger
+        float.
+        """
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
@@ -180,7 +184,7 @@ class CauseFinder:
 
     Attributes:
         record: signals of the trace, (samples, 1), up to the end of the evaluated window.
-        grid: time grid.
+        grid: time step and horizon of the signals.
         cache: (formula, wanted) -> the lowered formula (intervals in samples, only basic operators), negated
             if `wanted` is False.
         known: lowered formula -> ranges of evaluated instants, each with upper bounds on its robustness.
@@ -199,10 +203,10 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Return the cause tree of `formula` not being `wanted`; True if one predicate value alone decides.
+        """Return the cause tree of `formula` not being `wanted`, and whether one predicate value decides.
 
-        If several predicate values equal the robustness, the main path leads to one whose change alone
-        changes the robustness, if there is one among the first `MOST_TIED`.
+        One value decides if a change of it alone changes the robustness. If several predicate values equal
+        the robustness, the main path leads to one that decides, if there is one among the first `MOST_TIED`.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)

@@ -23,7 +23,7 @@ _MOST_LABELS = 6
 
 @dataclass(frozen=True, slots=True)
 class SignalValue:
-    """Value of a signal at the instant that decides.
+    """Value of a signal at an instant at which the deciding predicate reads it.
 
     Attributes:
         signal: name of the signal.
@@ -263,7 +263,7 @@ def _deciding(tree: CauseNode) -> CauseNode:
 
 
 def _closest(tree: CauseNode) -> bool:
-    """True if the deciding predicate is the body of a window, fails throughout, and is nearest to true."""
+    """True if the deciding predicate fails in a whole window; its instant closest to truth is then shown."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]
@@ -271,7 +271,7 @@ def _closest(tree: CauseNode) -> bool:
 
 
 def _body(node: CauseNode) -> CauseNode:
-    """A copy with the body as formula if it holds nowhere in a temporal operator's window, else `node`."""
+    """`node`, with its body as formula if it is a temporal operator whose body never holds in the window."""
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
         return replace(node, formula=operands(node.formula)[-1])
     return node

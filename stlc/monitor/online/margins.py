@@ -41,7 +41,7 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Status of a trace: violated if violated at any window start, satisfied if satisfied at all."""
+        """Status of a trace: violated if violated at any window start, satisfied if at every one."""
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -53,7 +53,7 @@ class _Watched:
 
     Attributes:
         rule: the requirement.
-        horizon: value of `T`, in steps.
+        horizon: horizon `T` of the planning window in steps; None if unknown.
         whole: evaluator of the bounds over all continuations of the traces.
         next: the first window start that is not settled.
         violated: number of settled window starts that are violated, (traces,).
@@ -142,7 +142,7 @@ class Margins:
 
     Args:
         rules: compiled requirements.
-        horizon: value of `T`, in steps.
+        horizon: horizon `T` of the planning window in steps; None if unknown.
     """
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:

@@ -44,7 +44,7 @@ class Decision:
         status: satisfied or violated.
         low: least robustness over all continuations of the trace.
         high: greatest robustness over all continuations.
-        sample: number of the sample that decided the verdict.
+        sample: index of the sample that decided the verdict.
     """
 
     requirement: str
@@ -287,7 +287,7 @@ class Online:
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Count those of the uncounted instants that are settled (their value is final); returns how many."""
+        """Add the settled instants of `judged` (their value is final) to the tally; returns their number."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count

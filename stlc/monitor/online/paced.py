@@ -198,11 +198,11 @@ class PacedTracker:
         return self._inner.settled
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace."""
+        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the end of the trace."""
+        """Bounds at instants `starts` after the trace has ended."""
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:

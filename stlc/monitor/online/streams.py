@@ -20,7 +20,7 @@ RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
 
 class EndlessError(Exception):
-    """The formula needs unbounded memory: a past operator reads a value known only when the trace ends."""
+    """The formula cannot be evaluated in bounded memory; the whole trace must be stored."""
 
 
 @dataclass(frozen=True, slots=True)

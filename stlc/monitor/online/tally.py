@@ -87,7 +87,7 @@ class Tally:
 
     @property
     def status(self) -> Status:
-        """Violated if violated at one instant, satisfied if satisfied at all, else inconclusive."""
+        """Violated if violated at any instant, satisfied if satisfied at every one, else inconclusive."""
         if self.fails:
             return "violated"
         return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"

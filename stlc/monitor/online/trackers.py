@@ -209,7 +209,7 @@ class BoundedTracker(_ColumnTracker):
 
 @dataclass(slots=True)
 class IntervalColumns:
-    """Formulas with bounded windows whose instants become settled at the same time, evaluated together.
+    """Evaluator of several formulas with bounded windows whose instants become settled at the same time.
 
     The formulas share columns (time series of their predicates and past operators), (rows, 2), which hold the
     least and the greatest value over all continuations of the trace. One evaluation gives both bounds of all
@@ -453,7 +453,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """Evaluator of a requirement that needs the whole trace, recomputed from all samples at every call."""
+    """Evaluator of a requirement that needs the whole trace; every call computes from all samples."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -539,7 +539,7 @@ class Trackers:
     Requirements whose values become final the same number of samples after an instant share one evaluation.
 
     Attributes:
-        horizon: value of `T`, in steps.
+        horizon: horizon `T` of the planning window in steps; None if unknown.
     """
 
     horizon: int | None

@@ -48,7 +48,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A topic, and the decoder of its messages; None if the messages cannot be decoded."""
+    """A ROS topic and the decoder of its messages, which is None if they cannot be decoded."""
 
     name: str
     decode: Decode | None
@@ -156,7 +156,7 @@ def _read_ros2(path: Path) -> Recording:
 
 
 def _order(path: Path) -> tuple[object, ...]:
-    """Sort key of a file: the numbers in its name are compared as numbers."""
+    """Sort key of a file, by which `bag_10.db3` follows `bag_9.db3`: digits are compared as numbers."""
     return tuple(
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", path.name)
     )

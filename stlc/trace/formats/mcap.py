@@ -90,7 +90,7 @@ class _File:
             self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
 
     def decoder(self, channel: Any) -> Decode | None:
-        """Return the decoder of a channel's messages; None, with the reason in `log.unread`, without one."""
+        """Return the decoder of a channel's messages; if there is none, store the reason in `log.unread`."""
         schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
         described = "" if schema is None else schema.encoding
         try:

@@ -149,7 +149,7 @@ class Decoder:
     form: Form
 
     def __call__(self, data: bytes) -> Iterator[MessageNumber]:
-        """Yield all numbers of a message with their paths; headers are skipped.
+        """Yield all numbers of a message with their paths, except in fields called `header`.
 
         Raises:
             DamageError: the message is shorter than its definition, or an array is longer than the message.
@@ -211,7 +211,7 @@ class _Cursor:
             yield from _kept(self.value(f"{name}[{i}]", each, depth + 1), wanted)
 
     def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
-        """Yield the numbers of an array; long arrays (images, point clouds) are skipped."""
+        """Yield the numbers of an array if `wanted`; else (images, point clouds) only move past the array."""
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
             self.align(size)
@@ -252,7 +252,7 @@ class _Cursor:
         self.at += length
 
     def take(self, code: str) -> tuple[Any, ...]:
-        """Read values of the `struct` format `code`."""
+        """Read values of the `struct` format `code` and move past them."""
         if self.form == "cdr":
             self.align(struct.calcsize(code[0]))
         values = struct.unpack_from(self.order + code, self.data, self.at)
