@@ -311,7 +311,7 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
 
 @dataclass(slots=True)
 class _Track:
-    """Samples of one signal that later interpolation may still need."""
+    """Buffer of the samples of one signal that later interpolation may still need."""
 
     held: bool
     times: list[float] = field(default_factory=list)
@@ -344,7 +344,7 @@ class _Track:
 
 @dataclass(slots=True)
 class Gridded:
-    """Samples at arbitrary times, resampled to a uniform grid as they arrive.
+    """Resampler of samples at arbitrary times to a uniform grid, as they arrive.
 
     Attributes:
         name: name of the stream, for messages.

@@ -110,6 +110,8 @@ class TraceMeta:
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
     """Return the metadata in the array `meta` of a trace, and the signals (columns) that it describes.
 
+    Both are empty if `array` is None.
+
     Raises:
         TraceError: E603, the array is not a JSON text of the expected form.
     """

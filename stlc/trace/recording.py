@@ -29,7 +29,7 @@ EXTRA = "extra."
 
 @dataclass(frozen=True, slots=True)
 class ClockGroup:
-    """Signals that share their sampling times.
+    """Group of signals that share their sampling times.
 
     Attributes:
         arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
