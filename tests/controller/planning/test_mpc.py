@@ -10,8 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.methods.planners.mpc import Mpc
+from stlc.controller.planning.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.problem.task import Task
+from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -75,6 +77,27 @@ def test_plans_are_found(boat: System, text: str) -> None:
     assert not found.infeasible.any()
 
 
+def test_other_guesses_leave_a_local_minimum(boat: System) -> None:
+    """Straight ahead of the boat, the middle of every control range touches an obstacle at its centre."""
+    task = task_of(boat, "eventually[0 s, 4 s] p > 2.5 and always[0 s, 4 s] norm(p - 1.5, q) > 0.6")
+    x0 = torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0]])
+    one = plan(task, x0, "mpc", budget=PlanBudget(20.0), guesses=1)
+    found = plan(task, x0, "mpc", budget=PlanBudget(20.0))
+    assert not one.satisfied.all()
+    assert found.satisfied.all()
+    assert int(found.evaluations) > int(one.evaluations)
+
+
+def test_nearly_robust_plans_are_repaired(boat: System) -> None:
+    task = task_of(boat, "eventually[0 s, 4 s] p > 1.55")
+    search = PlanSearch(task, torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.0]]), PlanBudget(20.0))
+    rows = torch.tensor([0])
+    search.offer(rows, torch.zeros(1, 8, 2))  # p = 2 at the end
+    search.budget = PlanBudget(20.0, target=0.5)
+    Mpc()._mend(search, rows, Searcher(task, search.generator, enough=0.5))
+    assert float(search.rho) >= 0.5
+
+
 def test_robustness_is_maximised(boat: System) -> None:
     """Straight ahead at full speed: p(4 s) is 4 from rest at speed 1."""
     task = task_of(boat, "eventually[0 s, 4 s] p > 1")
@@ -117,8 +140,6 @@ _formulas = st.recursive(
 @settings(max_examples=30, deadline=None)
 def test_conditions_agree_with_the_exact_robustness(boat: System, text: str, seed: int) -> None:
     """The least of the conditions is the robustness, up to what is rounded; no dynamics are off."""
-    from stlc.controller.methods.planners.mpc import Mpc
-
     task = task_of(boat, text)
     generator = torch.Generator().manual_seed(seed)
     plans = 0.4 * torch.rand(1, 8, 2, generator=generator).double() - 0.2

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import Diagnostic, MissingError, usage
 from stlc.dynamics.model.step import build_step
 
@@ -40,18 +42,22 @@ class Mpc:
     Attributes:
         guesses: number of guesses; the first is the initial guess of the search, the others are random
             controls that are constant over five pieces.
+        drawn: number of random plans of which the most robust is a guess.
         iterations: maximum number of iterations of the interior-point method from each guess.
         smoothing: scale of log-sum-exp for minima and maxima within conditions.
         sharpness: greatest slope of the smooth indicators of conditions.
         margin: robustness added to the target in the program, since the program approximates by smooth
             functions.
+        repair: number of plans that a local search tries where a plan nearly reaches the target.
     """
 
-    guesses: int = 3
+    guesses: int = 12
+    drawn: int = 16
     iterations: int = 100
     smoothing: float = 50.0
     sharpness: float = 20.0
     margin: float = 0.01
+    repair: int = 100
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by solving the nonlinear program of the task.
@@ -101,6 +107,7 @@ class Mpc:
             ) from None
 
     def _run(self, search: PlanSearch, shooting: Shooting, solve: Callable[..., Any]) -> None:
+        searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
         for row in search.open().tolist():
             for number in range(self.guesses):
                 if row not in search.open():
@@ -108,6 +115,7 @@ class Mpc:
                 rows = torch.tensor([row])
                 with search.charged(rows):
                     self._improve(search, rows, self._guess(search, row, number), shooting, solve)
+                    self._mend(search, rows, searcher)
             search.ended[row] = True
 
     def _improve(
@@ -133,15 +141,28 @@ class Mpc:
                 return
             margin += self.margin + target - rho
 
+    def _mend(self, search: PlanSearch, rows: Tensor, searcher: Searcher) -> None:
+        """Continue with a short local search from the best plan of one initial state, if nearly robust."""
+        missed = search.budget.target - float(search.rho[rows])
+        if self.repair and TOLERANCE < missed <= NEARLY:
+            found = searcher.at_once(search.states[rows], search.plans[rows], tries=self.repair)
+            search.offer(rows, found.plans, evaluations=self.repair)
+
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
-        """Guess of a plan, (T, m) float64: for `number` 0 the initial guess of the search, else random."""
+        """Guess of a plan, (T, m) float64.
+
+        For `number` 0 it is the initial guess of the search, else the most robust of some random plans.
+        """
         if not number:
             return search.start[row]
-        system = search.task.system
+        system, shape = search.task.system, (self.drawn, PIECES)
         low, high = system.control_low.double(), system.control_high.double()
-        held = torch.rand(PIECES, len(low), generator=search.generator).double()
+        held = torch.rand(*shape, len(low), generator=search.generator).double()
         length = math.ceil(system.horizon / PIECES)
-        return (low + (high - low) * held).repeat_interleave(length, 0)[: system.horizon]
+        plans = (low + (high - low) * held).repeat_interleave(length, 1)[:, : system.horizon]
+        x0 = search.states[row].expand(self.drawn, -1)
+        search.evaluations[row] += self.drawn
+        return plans[search.task.judge(x0, plans, states=False).rho.argmax()]
 
 
 PLANNER = Mpc
