@@ -121,10 +121,10 @@ def requirement_record(
     Args:
         rule: the requirement.
         cause: cause of its violation, if any.
-        margins: minimum, mean and bounds of the robustness, by key of the record.
+        margins: the entries of the record about the robustness: minimum, mean, bounds.
         trace: index of the trace with the least robustness.
         start: instant at which the robustness is least, in seconds.
-        found: the verdict and the counts, by key of the record.
+        found: the entries of the record for the verdict and the counts.
     """
     robustness = {
         **margins,
@@ -212,7 +212,8 @@ def _attribute(text: str) -> str:
 def write_robustness(path: Path, result: Checked, question: Question) -> None:
     """Write the robustness of each requirement to the trace file `path`, one signal per requirement.
 
-    A signal has the shape (traces, samples); it is NaN at samples from which the robustness is not defined.
+    A signal has the shape (traces, samples). Its value at a sample is the robustness of the requirement
+    evaluated there, or NaN if that is not defined.
 
     Raises:
         MissingError: R201, the disk is full, or the user may not write there.

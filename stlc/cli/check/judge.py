@@ -87,7 +87,10 @@ class Work:
 
 
 def found(name: str, runs: Path) -> Path:
-    """Return the path of a trace: `name` if it exists, else that trace in the newest run below `runs`."""
+    """Return the path of a trace file called `name`.
+
+    It is `name` itself if that file exists, else the file of that name in the newest run below `runs`.
+    """
     from stlc.files import find_trace
 
     path = find_trace(name, runs)

@@ -1,8 +1,8 @@
 """Online monitoring: samples from the standard input, and files larger than memory, read in chunks.
 
-The lines of the standard input are a `.csv` with a header, or one JSON object each. The time step is that of
-`--dt`, of the first two values of `t`, or of the system; with `--resample`, samples at any times are
-resampled to a uniform grid.
+The standard input is a `.csv` with a header, or has one JSON object per line. The time step is the value of
+`--dt`. Without that option it is the difference of the first two values of `t`; without times, it is the time
+step of the system. With `--resample`, samples at any times are resampled to a uniform grid.
 """
 
 from __future__ import annotations

@@ -216,9 +216,10 @@ ASSUMED = (
 
 
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
-    """Bound the probability that the grid search of a run's backup policy finds a plan that works.
+    """Compute lower bounds on the probability that the backup policy of a run finds a plan that works.
 
-    The record that is returned also states the assumptions behind these lower bounds.
+    There is one bound for each prefix length of its grid search and each assumed size of the set of plans
+    that work. The record that is returned also states the assumptions behind the bounds.
     """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances

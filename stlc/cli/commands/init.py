@@ -165,7 +165,8 @@ def _example_files(name: str) -> dict[str, str]:
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
     """Yield (path of a specification, name of the installed system file to which it refers).
 
-    The specifications are `specs`, or by default all installed ones; those of other systems are skipped.
+    The specifications are `specs`, or by default all installed ones. A specification that refers to no
+    installed system file is skipped.
     """
     for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
@@ -218,10 +219,12 @@ def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
 
 
 def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
-    """Path of a new file: `name` itself if it is a path, else in the folder for its kind if that exists.
+    """Path of a new file in `folder`; `suffix` is added to `name` if it has none.
+
+    A bare name is placed in the subfolder `kind` (such as `specs`) if that exists.
 
     Raises:
-        UsageError: U101, it is not a valid name of the language.
+        UsageError: U101, `name` is not a valid name of the language.
     """
     from stlc.grammar.words import BUILT_IN, RESERVED
 

@@ -116,7 +116,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
 
 
 def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], code: int) -> None:
-    """Print the findings in the format of `--format`; they do not change the exit code."""
+    """Print the findings in the format of `--format`; a JSON document also contains the exit code `code`."""
     match format_:
         case "json":
             ok = code == CLEAN

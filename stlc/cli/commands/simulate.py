@@ -313,8 +313,8 @@ def _satisfied(document: Simulation, guard: Mode) -> float:
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
     """Simulate without a scenario and with each of `scenarios`, and return one record of all results.
 
-    The record is also written to the run's folder, and so is the trace of the simulation without a scenario,
-    which replaces the traces of the scenarios.
+    The record is also written to the run's folder. The trace in that folder is then the one of the simulation
+    without a scenario; the traces of the scenarios are not kept.
     """
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():

@@ -16,7 +16,10 @@ _COMMENT = re.compile(r"(#|//).*")
 
 
 def run_names(context: typer.Context, incomplete: str) -> list[str]:
-    """Names of runs below `--runs` for completion: `latest`, the runs, newest first, their specifications."""
+    """Names that the shell proposes for a run below `--runs`.
+
+    They are `latest`, the names of all runs (newest first), and the names of their specifications.
+    """
     from stlc.rundir import LATEST, every_run
 
     root = Path(str(context.params.get("runs") or "runs"))

@@ -220,7 +220,10 @@ class Pulse:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """Context in which the progress message is shown; no effect within another one or with `--quiet`."""
+        """Context in which the progress message is shown.
+
+        It has no effect with `--quiet`, or inside another such context.
+        """
         stream = sys.stderr
         if self._doing or QUIET.get() or stream is None:
             yield

@@ -98,9 +98,9 @@ def only_help(context: typer.Context) -> None:
 def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function that typer calls for a command; it prints the `Answer` and returns the exit code.
 
-    Each field of a dataclass parameter becomes an option, whose default is the value of the field in the
-    parameter's default. A function declared to return an `Answer` gets the option `--json`, whose value is
-    passed on if the function has a parameter `json`.
+    A parameter that is a dataclass becomes several options, one per field. Their defaults are the fields of
+    the parameter's default. A function declared to return an `Answer` gets the option `--json`; its value is
+    passed to the function only if that has a parameter `json`.
     """
     signature = inspect.signature(function, eval_str=True)
     groups: dict[str, Any] = {
@@ -285,8 +285,8 @@ def _flush() -> None:
 def _stoppable() -> Iterator[list[int]]:
     """Context in which Ctrl-C and SIGTERM raise an exception, so that the `finally` blocks of a command run.
 
-    Yields a list to which the exit code of each received signal is appended: interrupted C code may replace
-    the exception by another one, so the list tells that there was a signal.
+    Yields a list, to which the exit code of each received signal is appended. The list is needed because
+    interrupted C code may replace the exception by another one.
     """
     stopped: list[int] = []
     if threading.current_thread() is not threading.main_thread():

@@ -31,8 +31,8 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     """Lines of text that show the results of a simulation.
 
     Results on drives (closed-loop runs) come first; with `windows`, results on plans and start instants
-    follow. If the system names no specification for drives, these are always shown, because drives are then
-    judged like plans.
+    follow. The latter are always shown if the system names no specification for drives, because drives are
+    then judged like plans.
     """
     from stlc.cli.framework.output import table
 
@@ -157,8 +157,8 @@ def compared(document: Record) -> Iterator[str]:
 def _both(guard: Record) -> list[str]:
     """Cells for one guard in the comparison of scenarios.
 
-    The first is the number of drives that obeyed every rule, of those that were not lost; the second is the
-    share of plans that satisfy the specification.
+    The first cell counts drives (closed-loop runs): `37 of 40` means that 40 were not lost and 37 obeyed
+    every rule. The second is the share of plans that satisfy the specification.
     """
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
@@ -194,7 +194,8 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
     """Rows with the shares of satisfying plans and start instants, one column per guard.
 
-    Shares of safe plans and starts are included if `safe`: if a requirement has the tag `@safety`.
+    With `safe`, shares of safe plans and start instants are included. `safe` tells whether a requirement has
+    the tag `@safety`.
     """
     from stlc.controller.evaluation.metrics import METRICS
 

@@ -69,9 +69,10 @@ class Session:
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
-        """Predicted time in seconds by which the run would exceed `budget`, for work beside the training.
+        """Predict how many seconds longer than `budget` the run would take if the training used all of it.
 
-        It is estimated from the time that the imports took.
+        The excess is due to other work, such as imports and pictures. It is estimated from the time that the
+        imports took; a negative value means no excess.
         """
         return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
 
