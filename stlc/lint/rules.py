@@ -80,7 +80,10 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """Return the word or sign of this language for that of another tool; None to keep the lexeme `item`."""
+    """Return the spelling in this language of a word or sign of another tool, such as `always` for `alw`.
+
+    It is None if the lexeme `item` needs no replacement.
+    """
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":
