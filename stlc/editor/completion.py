@@ -134,7 +134,7 @@ def _units_at(piece: str, text: str) -> str | None:
 
 
 def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
-    """Yield proposals for the terminals `accepted`, one of which the parser accepts at the cursor.
+    """Yield proposals for the terminals `accepted`: the kinds of token that the parser accepts at the cursor.
 
     `piece` is the text of the declaration up to the word under the cursor.
     """

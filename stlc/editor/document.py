@@ -47,7 +47,7 @@ class Finding:
     """A diagnostic and its location in the edited text.
 
     Attributes:
-        diagnostic: the diagnostic as on the command line.
+        diagnostic: the same diagnostic that `stlc lint` prints.
         span: location in the edited text.
         mild: whether it is an error that prevents training but not monitoring; it is shown as a warning.
     """
@@ -257,9 +257,10 @@ class Meaning:
             return None
 
     def steps(self, name: str) -> int | None:
-        """Return the lookahead of a formula: how many samples after its instant its value requires.
+        """Return the lookahead of a formula in samples.
 
-        It is None if there is no formula of that name, or if the time step is unknown.
+        A lookahead of 5 means that the value at sample k depends on samples up to k + 5. The result is
+        None if there is no formula of that name, or if the time step is unknown.
         """
         formula = self.formulas.get(name)
         if formula is None:

@@ -66,6 +66,7 @@ def _line(document: Document) -> int:
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
     """Return the edit that adds `from "old"` to the declaration of a renamed signal; [] for other symbols.
 
+    With this addition, the signal still reads the state (or column of a trace) that has the old name.
     Raises RenameError if the signal shares its declaration with others.
     """
     if not isinstance(item, ast.Signal) or item.column is not None:
@@ -98,5 +99,8 @@ def _bindings(names: SymbolNames) -> list[int]:
 
 
 def _declared(names: SymbolNames) -> tuple[int, int, int]:
-    """Return the numbers of distinct names of values, of types, and of requirements or assumptions."""
+    """Return the numbers of distinct names of values, of types, and of requirements or assumptions.
+
+    A number that decreases tells that two symbols got the same name.
+    """
     return len(names.values), len(names.types), len(names.rules)
