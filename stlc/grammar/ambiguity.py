@@ -2,10 +2,10 @@
 
 Precedence in other tools, from their grammars:
 
-    RTAMT      `or` binds tighter than `and`, temporal words loosest of all, `->` from left
-    MoonLight  `->` binds tighter than `or`, that tighter than `and`, temporal words loosest, `->` from left
+    RTAMT      `or` binds tighter than `and`, temporal words bind loosest, `->` is left-associative
+    MoonLight  `->` binds tighter than `or`, `or` than `and`, temporal words loosest; `->` is left-associative
     STLRom     `and`, `or` and `=>` have one rank, temporal words bind tightest
-    FalCAuN    `&&`, `||` and `->` have one rank, from left; `!` and temporal words bind loosest
+    FalCAuN    `&&`, `||` and `->` have one rank, left-associative; `!` and temporal words bind loosest
 """
 
 from __future__ import annotations

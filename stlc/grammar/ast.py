@@ -92,7 +92,7 @@ class Arg(Node):
 
 @dataclass(frozen=True, slots=True)
 class Call(Node):
-    """Call of a function: `func(args)`; `func` is a `Name`, or an `Attr` for one of an imported file."""
+    """Call of a function: `func(args)`; `func` is a `Name`, or an `Attr` as in `module.func(args)`."""
 
     func: Expr
     args: tuple[Arg, ...]

@@ -21,9 +21,10 @@ class TemporalOperator:
             the phrase contains `{q}`.
         aliases: other spellings.
         past: whether the window lies in the past.
-        mirror: for a future operator, the corresponding operator of the past, for help texts, or "".
-        expansion: equivalent formula of `p` and `q` that replaces the operator; all operators in it have the
-            window of the replaced one. "" if the operator is not replaced.
+        mirror: past operator that corresponds to this future operator, such as `once` to `eventually`; named
+            in help texts. "" if there is none.
+        expansion: equivalent formula of `p` and `q` that replaces the operator. Its temporal operators get
+            the window of the replaced operator. "" if the operator is not replaced.
     """
 
     name: str

@@ -369,7 +369,9 @@ def format_text(source: Source) -> str:
 
 
 def _read(source: Source) -> tuple[Source, ast.Spec]:
-    """Return the source if it parses, else the source with symbols such as `≤` replaced; and the syntax tree.
+    """Parse a source; return the source that was parsed, and its syntax tree.
+
+    If the given source does not parse, symbols such as `≤` are replaced, and the result is parsed.
 
     Raises:
         SpecError: neither text parses; the errors are those of the given text.

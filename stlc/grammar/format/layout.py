@@ -30,7 +30,10 @@ class Blank:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Possible line break: taken if the surrounding group does not fit on a line, else the text `flat`."""
+    """Possible line break.
+
+    If the surrounding group fits on a line, the text `flat` is printed instead of a line break.
+    """
 
     flat: str = " "
 

@@ -49,7 +49,7 @@ class Token:
         before: comments between the previous token and this one, except the comment that is `after` of the
             previous token.
         after: comment after it on the same line.
-        apart: whether an empty line precedes it (and follows its comments).
+        apart: whether an empty line directly precedes it, that is, between its comments and the token.
     """
 
     kind: str
@@ -126,7 +126,7 @@ def _at(token: LarkToken) -> int:
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
     """Yield the items (pragmas, imports, declarations) with their tokens; `places` are their offsets.
 
-    A comment at a token between two items, such as `;`, is moved to the next item.
+    A token between two items, such as `;`, belongs to no item; its comments are moved to the next item.
     """
     index = 0
     for rule, start, end in places:
@@ -182,10 +182,10 @@ def _inside(token: Token) -> tuple[Comment, ...]:
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
-    """Attach the first of the comments `found` to the token before it on its line; return the others.
+    """Attach a comment that follows a token on its line to this token; return the other comments.
 
-    `index` is the index of the token before the comments. If that token is `;`, the comment is attached to
-    the token before the `;`.
+    Only the first of the comments `found` can be such a one. `index` is the index of the token before the
+    comments. If that token is `;`, the comment is attached to the token before the `;`.
     """
     if not found or found[0].own_line or index < 0:
         return found
