@@ -95,7 +95,7 @@ def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
 
     Args:
         texts: file name -> text; a name declared in one file is prefixed in all files.
-        guard: macro of the include guard; a text that uses it repeats it at the `#endif` in its last line.
+        guard: macro of the include guard. A text with an include guard must end with its `#endif`.
     """
     names = dict(found for text in texts.values() for found in _renamed(text))
     names |= {"restrict": "STLC_RESTRICT", guard: guard}
@@ -306,7 +306,7 @@ class _Template(Template):
 
 
 def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
-    """Placeholder in the header's template -> its size, constant or generated code."""
+    """Values for the template of the header: placeholder -> a size, a constant or generated code."""
     grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
@@ -413,7 +413,8 @@ def _block(lines: Sequence[str]) -> str:
 def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
     """C statements that lower `least` to the least weighted robustness of the requirements `rules`.
 
-    They read the robustness of the requirements `among`, in order, from the C array `each`.
+    The C variable `least` is a running minimum. Entry i of the C array `each` is the robustness of the
+    requirement `among[i]`; `among` contains `rules`.
     """
     names = [rule.name for rule in among]
     return [
@@ -425,7 +426,8 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """C function `fall`: robustness of the safety requirements on a prefix of a trajectory.
 
-    Besides the states it reads a signal, with index STATES, that is positive beyond the end of the prefix.
+    Its input is the states and one further signal, with index STATES. This signal is positive at the samples
+    after the prefix.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

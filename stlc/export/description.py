@@ -26,13 +26,19 @@ def observation(task: Task) -> list[ir.Num]:
 
 
 def state_images(task: Task) -> dict[str, ir.Num]:
-    """Return name of a state -> its mirror image, as an expression; states without an image are absent."""
+    """Return the states that the mirror symmetry of the system changes: name -> expression of the image.
+
+    An example is `{"y": -y}`. The symmetry is declared by the key `mirror` of a system file.
+    """
     names = set(task.system.names)
     return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
 
 
 def control_images(task: Task) -> dict[str, ir.Num]:
-    """Return name of a control -> its mirror image, as an expression; angles are wrapped into their range."""
+    """Return the image of every control under the mirror symmetry of the system: name -> expression.
+
+    The image of an unaffected control is the control itself. Angles are wrapped into their range.
+    """
     images = {each.name: each.value for each in task.system.decl.policy.mirror}
     found: dict[str, ir.Num] = {}
     for each in task.system.decl.controls:

@@ -457,7 +457,11 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
-    """Rank, plan and verdicts of several plans (batch, count, T, m) per agent, by name: (batch, count, …)."""
+    """Judge `count` plans per agent, (batch, count, T, m).
+
+    Returns a table: name of a result (rank, verdict) -> its values, (batch, count, …). The plans themselves
+    are the entry `plan`.
+    """
     names = task.system.names
     count, steps, controls = plans.shape[1:]
     each = state.T.reshaped(len(names), BATCH, 1).expand(len(names), BATCH, count, like=state.T)
@@ -501,9 +505,9 @@ def _one(values: Value, place: int) -> Value:
 
 
 def _added(task: Task, state: Value) -> dict[str, Value]:
-    """States that the specification adds (parameters and timers) one step later, as the output `added`.
+    """Graph output `added`: the states that the specification adds, one step after `state`.
 
-    The result is empty if the specification adds none.
+    These states are parameters and timers. The result is an empty mapping if the specification adds none.
     """
     if not task.system.added:
         return {}

@@ -117,9 +117,9 @@ class Guarding(nn.Module):
     """Module from states (B, n) and the policy's plans (B, T, m) to the plans that the guard chooses.
 
     The guard is that of Meng and Fan 2023. Outputs in float64: plan (B, T, m), rho and safe (B,), and
-    requirements (B, R). Outputs in int64: source (B,), which is 1 if the plan satisfies the specification or
-    the safety requirements, and 2 if it keeps the safety requirements as long as possible; and t0 (B,), the
-    number of first steps taken from the grid, as in `stlc.controller.guard.candidates.Candidates`.
+    requirements (B, R). Outputs in int64: source (B,) and t0 (B,). The source is 1 if the plan satisfies the
+    specification or the safety requirements; else it is 2, and the plan keeps the safety requirements as long
+    as possible. t0 is the number of first steps taken from the grid.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
@@ -193,8 +193,8 @@ class Guarding(nn.Module):
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
     """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
 
-    Among plans that keep them equally long, the highest robustness decides, then the least violation,
-    averaged over all prefixes.
+    Among plans that keep them equally long, the one with the highest robustness is chosen. Ties are decided
+    by the smaller safety violation (mean over all prefixes), then by the smaller cost.
     """
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)
@@ -209,7 +209,10 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Select `before`, the results of shorter prefixes, where `decided`; elsewhere `here`."""
+    """Select results state by state: those of shorter prefixes, `before`, where `decided`; else `here`.
+
+    `decided` marks the states for which a shorter prefix sufficed.
+    """
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)
@@ -217,7 +220,7 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
 
 
 def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
-    """Return the guard of Meng and Fan 2023 as an exported torch program for any number of states.
+    """Return the guard of Meng and Fan 2023 as an exported torch program for any batch size.
 
     All floating-point inputs and outputs are float64.
     """

@@ -153,7 +153,10 @@ def _answer(judged: JudgedPlans) -> Answer:
 
 
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Compare the graphs with the guard in the step after random states, given the previous plans.
+    """Compare decisions of the graphs and of the guard that have a previous plan.
+
+    Both decide one step after random states. The previous plan is the rest of the plan that the guard chose
+    in the random states.
 
     Raises:
         RunError: R105, they disagree.
@@ -239,7 +242,9 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Run the example program; return for each state source, t0, rho, safe, requirements, plan.
+    """Run the example program; return its decisions, one list of numbers per state.
+
+    The numbers are source, t0, rho, safe, requirements, plan, in this order.
 
     Raises:
         RunError: R105, the program fails or does not end.
