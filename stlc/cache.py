@@ -53,8 +53,8 @@ class Cache:
 
     Attributes:
         shown: path of the folder, for messages.
-        folder: path used to read and write. Where the system supports that, it leads through an open file
-            descriptor to the folder that was checked, even if a parent folder is renamed or replaced.
+        folder: path used to read and write. Where the system supports that, it is the path of an open file
+            descriptor: it leads to the folder that was checked even if a parent folder is replaced.
     """
 
     shown: Path

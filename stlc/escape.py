@@ -48,8 +48,8 @@ def screen(text: str, *, styled: bool = False) -> str:
 
     Args:
         text: text of one or more lines.
-        styled: whether `text` contains colour codes, which are kept. Then its caller must have applied
-            `visible` to every name in it.
+        styled: whether colour codes in `text` are kept. If so, the caller of `screen` must have applied
+            `visible` to every untrusted name in the text, because a name could contain such codes.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -99,7 +99,7 @@ def _ansi(char: str) -> str:
 
 
 def _raw(char: str) -> bool:
-    """True for a character that stands for a byte of a file name that is not UTF-8."""
+    """True for a character by which Python represents an invalid UTF-8 byte in a file name."""
     return "\udc80" <= char <= "\udcff"
 
 
@@ -120,7 +120,10 @@ _C_BYTES = {code: chr(code) for code in range(0x20, 0x7F)} | {0x22: r"\"", 0x5C:
 
 
 def c_comment(text: str) -> str:
-    """Text within a `//` or `/* */` comment: it cannot end, continue or nest the comment."""
+    """Return a text for use within a C comment, `//` or `/* */`.
+
+    The text cannot end the comment, continue it on the next line, or open another one.
+    """
     words = visible(text).replace("\\", "\N{SET MINUS}")
     return re.sub(r"\*(?=/)|/(?=[*/])|\?(?=\?)", r"\g<0> ", words)
 

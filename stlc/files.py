@@ -193,9 +193,10 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
 
 
 def find_spec(name: Path | str) -> Path:
-    """Find the specification called `name`: the given path, else an installed one, with or without `specs/`.
+    """Find the specification called `name`: a file at that path, else an installed specification.
 
-    A name that is not found is returned unchanged; an attempt to read it then raises the error.
+    An installed specification is found as `specs/traffic.stl` and as `traffic.stl`. A name that is not found
+    is returned unchanged; an attempt to read it then raises the error.
     """
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
@@ -258,8 +259,8 @@ def _shown(path: Path) -> str:
 def beside(home: Path, name: str) -> Path:
     """Return the path of the file `name` to which a file in the folder `home` refers.
 
-    It is the path relative to `home` if that exists, else the file of that name in `home` itself: a run
-    folder holds copies of such files without their subfolders.
+    For `systems/car.yaml` it is `home/systems/car.yaml` if that file exists, else `home/car.yaml`. The second
+    case occurs in run folders, which hold copies of such files without their subfolders.
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there

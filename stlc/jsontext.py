@@ -1,4 +1,7 @@
-"""JSON that every reader accepts: numbers that are not finite become texts, arrays lists, paths texts."""
+"""JSON that every reader accepts: conversion of values, writing and parsing.
+
+Numbers that are not finite become texts, arrays become lists, and paths become texts.
+"""
 
 from __future__ import annotations
 

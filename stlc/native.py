@@ -73,8 +73,8 @@ class SearchOptions:
         bounds: lowest value, highest value, and 1 for a periodic angle (else 0) of each control, (3, m).
         factors: weight / scale of each requirement, (R,); the search maximises the least of the robustness
             values multiplied by these.
-        bank: plans that satisfied the specification from other states, (k, T, m); a change may replace the
-            last part of a plan, or all of it, by that of one of these.
+        bank: plans that satisfied the specification from other states, (k, T, m). The search may replace the
+            last steps of a plan, or all of its steps, by those of a plan in the bank.
         generations: largest number of iterations, in each of which several changes of the best plan are
             tried.
         enough: robustness at which the search for one initial state ends.
@@ -148,9 +148,9 @@ class Kernel:
             threads: number of threads; the result does not depend on it.
 
         Returns:
-            Improved plans, (B, T, m), and for each the least of its robustness values times `search.factors`,
-            (B,), which is -inf if a state is NaN. After an early stop, plans that were not reached are
-            unchanged, and this number is NaN.
+            Improved plans, (B, T, m), and the objective of each, (B,). The objective is the least robustness
+            value after multiplication by `search.factors`; it is -inf if a state is NaN. After an early stop,
+            plans that were not reached are unchanged, and their objective is NaN.
 
         Raises:
             MemoryError: there is not enough memory.
@@ -170,13 +170,16 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveSlopes:
-    """Derivatives of an objective by robustness and states, from which `Adjoint` computes its gradient.
+    """Derivatives of an objective with respect to robustness and states.
+
+    `Adjoint` computes from them the gradient of the objective with respect to the plans.
 
     Attributes:
-        by_rho: derivative by the robustness of each requirement, (B, R).
-        by_columns: derivative by the states, (n, T+1, B); None if the objective does not depend on states.
-        slope: k in tanh(k z), which replaces the sign of z in conditions z >= 0 of the dynamics, per unit of
-            z.
+        by_rho: derivative with respect to the robustness of each requirement, (B, R).
+        by_columns: derivative with respect to the states, (n, T+1, B); None if the objective does not depend
+            on states.
+        slope: number k, per unit of z. In derivatives, a condition z >= 0 of the dynamics is replaced by the
+            smooth step (1 + tanh(k z)) / 2.
     """
 
     by_rho: NDArray[np.float64]
@@ -185,7 +188,7 @@ class ObjectiveSlopes:
 
 
 class Adjoint:
-    """Loaded library with the compiled function `pull`: the gradient of an objective by the plans.
+    """Loaded library with the function `pull`: gradient of an objective with respect to plans.
 
     Its C code comes from `stlc.compile.backends.c.adjoint`.
     """
@@ -202,12 +205,14 @@ class Adjoint:
         *,
         threads: int = 1,
     ) -> NDArray[np.float64]:
-        """Compute the gradient, by the plans, of an objective that depends on their robustness and states.
+        """Compute the gradient of an objective with respect to plans.
+
+        The objective is a function of the robustness of the plans and of the states under them.
 
         Args:
             x0: initial states, (B, n).
             u: plans, (B, T, m).
-            outcome: derivatives of the objective by robustness and states.
+            outcome: derivatives of the objective with respect to robustness and states.
             threads: number of threads.
 
         Returns:
@@ -268,7 +273,8 @@ class Advance:
             share: elapsed share of the episode, stored as the last value of every observation.
 
         Returns:
-            The states after the step, (B, n), their observations, (B, k + 1), and the rewards, (B,), or None.
+            The states after the step, (B, n), their observations, (B, k + 1), and the rewards, (B,). The
+            rewards are None if the library computes none.
         """
         after = np.empty_like(x)
         seen = np.empty((len(x), self._seen + 1), dtype=np.float32)

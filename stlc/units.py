@@ -30,7 +30,7 @@ class Unit:
     Attributes:
         dims: exponents of m, kg, s, A and K.
         ratio: size of the unit in SI units, exactly (pi to double precision).
-        text: text of the unit in the file; "" for an undeclared unit, in contrast to `1`.
+        text: text of the unit in the file; "" if none is declared, but "1" for the declared unit `1`.
         offset: value of the unit's zero in SI units, exactly: 273.15 for `degC`, 0 for units without offset.
     """
 
@@ -244,7 +244,10 @@ def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
 
 
 def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
-    """Product of the powers of units, given as (unit, power); its text uses the symbols of their texts."""
+    """Product of powers of units, given as pairs (unit, power).
+
+    Its text keeps the symbols of the given units: the square of `km` is `km^2`.
+    """
     dims, ratio = _NONE, Fraction(1)
     powers: dict[str, int] = {}
     parts = [(unit.interval, power) for unit, power in parts]
