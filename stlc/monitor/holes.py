@@ -46,12 +46,13 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """Return the formula whose value is the least, or the greatest, value over all unknown samples.
+    """Return a formula whose value bounds that of `formula`, whatever values the unknown samples have.
 
     Args:
         formula: in negation normal form.
-        holes: signals with unknown values; names that a `freeze` binds to them count as unknown, too.
-        least: True for the least value, False for the greatest.
+        holes: names of the signals with unknown values. A name that a `freeze` binds to such a signal is
+            treated in the same way.
+        least: True for the lower bound (least value), False for the upper bound (greatest value).
     """
     match formula:
         case ir.Predicate(num=num):

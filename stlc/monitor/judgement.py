@@ -283,7 +283,11 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Truth values (most, traces); if there are fewer instants, the truth over all of them, repeated."""
+        """Return truth values of a judgement at `most` instants, (most, traces).
+
+        A judgement with fewer instants gets one truth value per trace, repeated `most` times: whether the
+        requirement holds at all of its instants, or, if `truth` is `fails`, whether it fails at any.
+        """
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)

@@ -38,7 +38,7 @@ def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bo
     Args:
         formula: the formula to bound.
         end: "lower" or "upper" bound.
-        cut: whether the end of the trace clips bounded windows, too, and not only unbounded ones.
+        cut: True if the end of the trace clips all windows, False if it clips only unbounded ones.
     """
     return _PrefixBound(end == "lower", cut).of(formula)
 
@@ -72,10 +72,14 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """Bound the body of a window; only existing samples count if that is the worst case for the bound.
+        """Bound the body of a window, at whichever later sample the trace ends.
 
-        `some` is True if the body must hold at one instant of the window, False if at every one; `cut` is
-        True if the end of the trace clips the window.
+        If an early end of the trace is the worst case for the bound, only existing samples count.
+
+        Args:
+            body: the body.
+            some: True if the body must hold at one instant of the window, False if at every one.
+            cut: whether the end of the trace clips the window.
         """
         inner = self.of(body)
         return self._seen(inner, 0) if cut and some is self.least else inner
@@ -83,8 +87,8 @@ class _PrefixBound:
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
         """Make the bound of an unbounded operator infinite if its window starts after the last sample.
 
-        `some` is as in `_found`. The formula is unchanged if an empty window makes the bound infinite
-        already, or if the end of the trace clips all windows (`cut`).
+        `some` is as in `_found`. The formula is returned unchanged if its value on an empty window is the
+        infinite bound anyway, or if the end of the trace clips all windows (`cut`).
         """
         if window.hi is not None or self.cut or some is self.least:
             return formula
@@ -120,7 +124,10 @@ def own_span(node: ir.Formula) -> Reach:
 
 
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return the formula with unbounded future windows bounded, beyond all instants with known values."""
+    """Return the formula with every unbounded future window replaced by a long bounded one.
+
+    It is long enough: beyond its end, no value depends on any of the `samples` known samples.
+    """
     length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
 
     def longer(node: ir.Formula) -> ir.Formula:

@@ -175,8 +175,8 @@ class Signals:
 def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False) -> Signals:
     """Convert the signals that requirements need to arrays (time, batch).
 
-    NaN is an unknown value. NumPy arrays and lists become float64; torch tensors keep dtype, device and
-    gradients, or with `plain` become NumPy arrays too.
+    NaN is an unknown value. NumPy arrays and lists become float64. Torch tensors keep dtype, device and
+    gradients; if `plain`, they become NumPy arrays.
 
     Raises:
         TraceError: E601, a signal is missing; E604, a signal contains infinity (NumPy only); E605, the shapes
@@ -291,7 +291,10 @@ def _torch_columns(
 
 
 def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Convert signals to their declared units, if both units are known. Raises TraceError (E605)."""
+    """Convert signals from recorded to declared units; a signal with an unknown unit is unchanged.
+
+    Raises TraceError (E605) if two units measure different quantities.
+    """
     converted = dict(columns)
     findings: list[Diagnostic] = []
     for need in needs:

@@ -67,8 +67,8 @@ class Record:
     ) -> list[Array]:
         """Values of each formula at `instants`, `(instants, batch)`.
 
-        `end` is the treatment of instants after the last sample, and `stop`, for a trace that continues, the
-        number of samples at which unbounded windows end (see `evaluate`).
+        `end` is the treatment of instants after the last sample. `stop` is the number of samples that a
+        continuing trace will have in the end; unbounded windows end there (see `evaluate`).
         """
         return evaluate(
             formulas,
@@ -114,9 +114,10 @@ def window_bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values if `end` is `window` samples after each instant, each `(count, batch)`.
 
-    Every instant is evaluated on its own piece of the trace, from the lookback of the past operators to its
-    own `end`; many pieces are evaluated at once, as the batch. If the trace ends before the `end` of an
-    instant, the missing samples are unknown, or with `ends` "truncate" the last sample is the end.
+    Each instant is evaluated on its own excerpt of the trace. The excerpt begins before the instant, by the
+    lookback of the past operators, and stops at the `end` of the instant. Many excerpts form one batch. If
+    the trace is too short for an excerpt, the missing samples are unknown; with `ends` "truncate" the excerpt
+    stops at the last sample.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
@@ -133,7 +134,12 @@ def window_bounds(
 
 
 def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
-    """Yield (record, number of instants); the batch of a record is one piece of the trace per instant."""
+    """Cut the trace into overlapping excerpts, one per instant in `starts`, and yield them in groups.
+
+    The excerpt of instant k contains the samples from k - `back` to k + `window`; it is shorter at the end of
+    the trace. A group is yielded as (record, number of instants). The batch of the record contains the
+    excerpts of that many instants.
+    """
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
     batch = next(iter(record.env.values())).shape[1]
@@ -151,9 +157,9 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
 
 
 def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
-    """An upper bound of the formula: predicates that read signals not in `names` are assumed true.
+    """Return an upper bound of the formula: predicates that read signals not in `names` are assumed true.
 
-    Names that `freeze` binds to missing signals count as missing, too.
+    Such signals are missing. A name that `freeze` binds to a missing signal is treated in the same way.
     """
     match formula:
         case ir.Predicate(num=num):

@@ -100,7 +100,7 @@ class Monitor:
 
     @property
     def horizon(self) -> float:
-        """Seconds of signal that a verdict at time 0 needs; of an unbounded window only its start counts."""
+        """Seconds of signal that a verdict at time 0 needs; a window `[a, inf)` counts as `a` seconds."""
         return float(self.compiled.reach * (self.compiled.grid.dt or 0))
 
     # ----------------------------------------------------------------- evaluation

@@ -32,8 +32,9 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
     Args:
         recording: content of the trace file; its arrays may be texts.
-        words: name in the file of every needed signal -> number of each of its words; {} for a signal of
-            numbers. Other arrays of words or complex numbers become extras, which are never evaluated.
+        words: numbers that stand for words, such as `{"sign": {"stop": 0, "light": 1}}`. The keys are the
+            names, in the file, of all needed signals; a signal of numbers has an empty value. Other arrays of
+            words or complex numbers become extras, which are never evaluated.
 
     Raises:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that is not a value of
@@ -123,7 +124,10 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """Number of a word, if need be regardless of case; NaN for an empty word, None for an unknown one."""
+    """Return the number that a word stands for; NaN for an empty word, None for an unknown one.
+
+    A word that is not found is looked up again regardless of case.
+    """
     if word in words:
         return words[word]
     if not word and words:

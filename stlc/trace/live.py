@@ -242,10 +242,11 @@ class Uniform:
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
-    """Return samples on the time grid that `stlc.trace.trace.trace_of` would use, as soon as they are known.
+    """Return an iterator over samples on a uniform time grid; each is yielded as soon as it is known.
 
-    Without resampling the times must be uniform. With resampling (`reading.resample` or `reading.max_gap`) a
-    sample is known once every signal has a later value, or had no value for longer than the allowed gap.
+    The grid is the one that `stlc.trace.trace.trace_of` would use for a file with the same samples. Without
+    resampling the times must be uniform. With resampling (`reading.resample` or `reading.max_gap`) a sample
+    is known once every signal has a later value, or had no value for longer than the allowed gap.
 
     Raises:
         TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;
@@ -329,7 +330,7 @@ class _Track:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """Values (points,) on a time grid; no sample follows the last one before time `end` in seconds."""
+        """Return the values of the signal on a time grid, (points,); for `end` see `values_on`."""
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
@@ -364,7 +365,7 @@ class Gridded:
     _last: float = -math.inf
 
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
-        """Yield the samples on the grid one by one; the first follows as soon as the time step is known."""
+        """Yield the samples on the grid one by one; none is yielded before the time step is known."""
         waiting: list[float] = []
         for moment in chain([first], rest):
             now = self._take(moment)
@@ -432,9 +433,15 @@ class Gridded:
     def _upto(
         self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
     ) -> Iterator[Sample]:
-        """Yield the next samples of the grid, at most `most` in all, while `known` is True for their times.
+        """Yield the next samples of the grid, as long as they are known.
 
-        No sample of the stream follows before time `end`. Raises TraceError (E605) if `most` is too large.
+        Args:
+            known: function that tells for which times, in seconds, samples on the grid are known.
+            most: greatest number of samples to yield since the start of the stream.
+            end: time in seconds up to which no further sample of the stream comes.
+
+        Raises:
+            TraceError: E605, `most` is too large.
         """
         assert self._spacing is not None
         if most > MAX_SAMPLES:

@@ -56,9 +56,9 @@ class TraceMeta:
         spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
         spec_set: constants that were overridden, with their values as texts.
         spec_hash: SHA-256 of these texts, hexadecimal.
-        judge_path: path of the specification that evaluates closed-loop runs, if it is not the one that the
-            control sequences (plans) were made for; its other data are `judge_text`, `judge_library` and
-            `judge_set`. If `judge_text` is "", the trace is evaluated by the specification in `spec_text`.
+        judge_path: path of a second specification, which evaluates closed-loop runs. `judge_text`,
+            `judge_library` and `judge_set` describe it as the fields `spec_…` do the first one. If
+            `judge_text` is "", there is no second one: the specification in `spec_text` evaluates the trace.
         system_name: name of the system.
         system_path: path of the system file as the user gave it.
         system_text: text of the system file.

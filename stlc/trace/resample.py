@@ -35,7 +35,10 @@ _SAME = 1 + 1e-9
 
 
 def usual_step(times: Floats) -> float:
-    """Usual time between samples in seconds: median of the positive ones of the first nine steps, or 0."""
+    """Usual time between samples in seconds; 0 if it is unknown.
+
+    It is the median of the first nine time differences, without those that are 0.
+    """
     gaps = np.diff(times[: _GAPS + 1])
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
@@ -61,9 +64,9 @@ class Spacing:
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
         """Return the spacing with step `dt` that bridges gaps of at most `max_gap` seconds.
 
-        Without `max_gap`, gaps of three steps are bridged, where a step is the longer of `dt` and the usual
-        time between the samples at `times`. If `events` is True, all gaps are then bridged: each value of a
-        discrete signal holds until the next sample.
+        Without `max_gap`, gaps of three steps are bridged. Such a step is `dt`, or the usual time between the
+        samples at `times` if that is longer. Without `max_gap` but with `events`, all gaps are bridged: each
+        value of a discrete signal holds until the next sample.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)
@@ -89,8 +92,8 @@ def values_on(
         values: values of the samples, (samples,).
         spacing: time step of the grid and longest allowed gap.
         held: True for zero-order hold, False for linear interpolation.
-        end: time in seconds before which no sample follows the last one; a held value is known that long, if
-            the gap is not too long.
+        end: time in seconds up to which no further sample comes. A held last value is known until `end`,
+            unless the gap from the last sample to `end` is too long.
     """
     there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
     if not there.all():

@@ -169,7 +169,10 @@ def snapped(step: float) -> float:
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """`dt` if it agrees with the measured step `mean`, else `mean`, rounded to a nearby simple fraction."""
+    """Return `dt` if it agrees with the measured step `mean`.
+
+    Otherwise `mean` is returned, rounded to a simple fraction if there is one nearby.
+    """
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt
     near = float(Fraction(mean).limit_denominator(100_000))

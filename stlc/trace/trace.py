@@ -104,11 +104,12 @@ class Reading:
         names: signal -> its name in the file; the key `t` gives the name of the time column.
         resample: time step in seconds of a new grid; None keeps the grid of the file, which must be uniform.
         dt: time step in seconds, if the file does not give it; must not contradict the file.
-        max_gap: longest gap in seconds within which values are known; setting it resamples the file, by
-            default at its usual time step.
+        max_gap: longest gap in seconds within which values are known. If it is given, the file is resampled,
+            with time step `resample` or else with the usual time step of the file.
         kinds: signal -> kind of its numbers, which determines how it is resampled.
-        words: name in the file of every needed signal -> number of each of its words. Other signals of words
-            become extras (arrays that are never evaluated); with None, all signals of words do.
+        words: numbers that stand for words, such as `{"sign": {"stop": 0, "light": 1}}`. The keys are the
+            names, in the file, of all needed signals. Other signals of words become extras (arrays that are
+            never evaluated). None: all signals of words become extras.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -181,7 +182,10 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """The recording with times of step `dt`, or of the step in its metadata, for signals without times."""
+    """Return the recording with times added to the signals that have none.
+
+    The time step is `dt` or, if that is None, the one in the metadata. Without either, nothing is added.
+    """
     step = dt or recording.meta.dt
     if step is None:
         return recording

@@ -210,9 +210,9 @@ NARROWEST = 160  # pixels
 
 
 def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> bytes:
-    """Encode pictures as a GIF; reduce its width until it has at most `max_bytes`, or `NARROWEST` pixels.
+    """Encode pictures as a GIF, each shown for `milliseconds`.
 
-    Each picture is shown for `milliseconds`.
+    The width is reduced until the file has at most `max_bytes`, but not below `NARROWEST` pixels.
     """
     data = encoded(pictures, milliseconds)
     while len(data) > max_bytes and pictures[0].width > NARROWEST:
@@ -251,10 +251,11 @@ def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
 
 
 def _palette(sheet: Image) -> Image:
-    """Colour palette of a picture: its most frequent colours, then the colours worst represented by these.
+    """Choose the colour palette of a picture.
 
-    White stays exactly white. The worst represented colour has the largest distance to the palette, weighted
-    by its frequency; small details such as a legend's dot or a violating line thus keep their colour.
+    Half of it are the most frequent colours of the picture. The others are added one by one: each time the
+    colour with the largest distance to the palette, weighted by its frequency. Small details, such as a dot
+    in a legend or a red line, thus keep their colour. White stays exactly white.
     """
     from PIL import Image
 

@@ -74,7 +74,10 @@ def _setting(simulation: Record) -> str:
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
-    """Paragraph on the share of starts from which the world followed the model; None if it always did."""
+    """Paragraph on the share of start instants from which the world behaved as the model predicts.
+
+    None if it always did.
+    """
     consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if consistent is None or consistent >= 1.0:
         return None
@@ -92,9 +95,10 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: share of closed-loop runs that satisfy all rules, the same of viable runs, and per rule.
+    """Table rows with the number of closed-loop runs that satisfy all rules, then each rule.
 
-    A run is viable unless no satisfying plan is known from its start or after an exogenous event.
+    If some runs are lost, a row in between leaves them out. A run is lost if no satisfying plan is known from
+    its start, or from its state after an exogenous event.
     """
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]

@@ -48,8 +48,8 @@ class HeldOut:
         rho: robustness over all requirements, (starts,).
         each: robustness per requirement, (starts, requirements).
         known: True for starts from which a satisfying plan is known, (starts,); None if not recorded.
-        searched: True for starts that the policy solves, and for those for which a satisfying plan was
-            searched for, (starts,); None: all.
+        searched: False for starts from which the policy's plan fails and no other plan was searched for, else
+            True, (starts,). None means True for all.
     """
 
     names: tuple[str, ...]
@@ -229,9 +229,10 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
 
 
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """Indices of the two states to draw: first those that inequalities of the region compare.
+    """Indices of the two states to draw.
 
-    The others follow in the order in which they separate failing from satisfied starts.
+    States that occur in an inequality of the region come first. The others follow, beginning with the one
+    that separates failing from satisfied starts best.
     """
     used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
     focus = _region(x0, [each for each in conditions if each.op == "="])

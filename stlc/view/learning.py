@@ -43,12 +43,12 @@ class Curve:
     """Extrapolation of a learning curve.
 
     Attributes:
-        state: `short`: too few search rounds for an extrapolation; `flat`: twice the steps would change
-            little; `rising`.
-        times: factor by which the number of steps must grow until the policy solves the share `TRAINED` of
-            the feasible starts, at the present slope of the curve. Curves flatten, so the square of the
-            factor is the upper end of the forecast. None if it exceeds `MOST_TIMES` or if the curve is not
-            rising.
+        state: `short`: there were too few search rounds for an extrapolation; `flat`: twice as many steps
+            would change little; `rising`: more steps would help.
+        times: factor by which the number of steps must grow so that the policy solves the share `TRAINED` of
+            the feasible starts. It assumes the present slope of the curve. Curves flatten: the upper end of
+            the forecast is therefore the square of the factor. None if the factor exceeds `MOST_TIMES`, or
+            if the curve is not rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -154,7 +154,10 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def _driven_line(each: Mapping[str, Any]) -> str:
-    """Line on a guard: `51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) without a guard`."""
+    """Line on the closed-loop runs (drives) under one guard; `each` is their result.
+
+    Example: `51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) with the full guard`.
+    """
     low, high = each["interval"]
     safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
     part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
@@ -287,7 +290,10 @@ def _log_odds(value: float) -> float:
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
-    """Advice on a longer training, and the command for it; the command is "" if that would not help."""
+    """Return advice on a longer training, and the command for it.
+
+    The command is "" if a longer training would not help.
+    """
     twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
     match curve.state, curve.times:
         case "rising", float(times):

@@ -232,7 +232,7 @@ def _up(values: Floats, limits: tuple[float, float]) -> Floats:
 
 
 def _across(times: Floats) -> Floats:
-    """Horizontal coordinates of the samples in a strip chart, and of its right edge."""
+    """Horizontal coordinates in a strip chart: one per sample, then one for its right edge."""
     span = float(times[-1] - times[0]) or 1.0
     return np.append(_WIDE * (times - times[0]) / span, _WIDE)
 

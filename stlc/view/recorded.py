@@ -58,7 +58,10 @@ def recorded_section(contents: RunContents) -> Section | None:
 
 
 def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
-    """Verdicts on the trace by its separate specification for closed-loop runs; None if it stores none."""
+    """Verdicts on the trace by the specification for closed-loop runs that is stored in it.
+
+    None if the trace stores only the specification that controls were planned for.
+    """
     if not trace.meta.judge_text:
         return None
     try:

@@ -33,13 +33,16 @@ FLASHES = 4
 
 
 def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
-    """The monitor of the specification stored in a trace; if the trace has none, of `text`.
+    """Return a monitor of the specification that is stored in a trace.
+
+    A trace may store two specifications: the one that controls were planned for, and a separate one that
+    evaluates closed-loop runs.
 
     Args:
         trace: the recorded trace.
-        text: specification used for a trace without one.
+        text: specification to use if the trace stores none.
         system: path of the system file, which supplies external functions.
-        drives: use the separate specification for closed-loop runs, if one is stored, not that of plans.
+        drives: True: use the separate specification for closed-loop runs, if it is stored.
 
     Raises:
         SpecError: the specification is invalid.
@@ -90,14 +93,14 @@ def trace_names(trace: Trace) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class SceneVerdicts:
-    """Evaluated traces of a scene's agents, which are those of the first seed.
+    """Evaluated traces of the agents in a scene; the scene shows the first seed.
 
     Attributes:
         trace: recorded traces of these agents.
-        monitor: monitor of the specification of plans.
+        monitor: monitor of the specification that controls were planned for.
         verdict: verdict of that monitor.
-        executed: verdict by the separate specification for closed-loop runs, if one is stored; else
-            `verdict`.
+        executed: verdict by the separate specification for closed-loop runs. It is `verdict` if the trace
+            stores no such specification.
         consistent: True at samples from which the world behaves as the model, (agents, samples); None if not
             recorded.
     """
@@ -179,14 +182,16 @@ def least(rho: Floats, counts: Mask | bool = True) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A violation by one agent.
+    """A violation by one agent, which lasts from `sample` to `until` without interruption.
+
+    Example: `always[0, 5 s] p` is violated at `start`: `p` is false from `sample` to `until`.
 
     Attributes:
         requirement: name of the requirement.
         agent: number of the agent's trace.
-        sample: first sample of the violation.
-        until: last sample of the violation, which lasts without interruption.
-        start: first sample of the violated window.
+        sample: sample of the cause, at which the deciding predicate is false.
+        until: last sample up to which it stays false.
+        start: sample at which the requirement was evaluated; its time windows are relative to it.
         because: cause in one line.
     """
 
@@ -201,8 +206,8 @@ class Event:
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
     """Violations by the first `agents` traces, in order of time.
 
-    The time of a violation is that of its cause. The search then continues with windows that begin later, so
-    that each cause is found once; it ends after `most` violations of a requirement.
+    The time of a violation is the time of its cause. Several overlapping windows may be violated for the same
+    cause; it is listed once. The list contains at most `most` violations of each requirement.
     """
     found: list[Event] = []
     for judgement in verdict:

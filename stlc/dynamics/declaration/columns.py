@@ -382,9 +382,10 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Return the column with a range: its own, or else the range of nearly all draws of its distribution.
+    """Add a range to a column that declares none: the range in which nearly all of its random values lie.
 
-    `assigns` holds the distribution. If that range is unknown, the column is returned unchanged.
+    `assigns` holds the distribution of these values. A column that declares a range is returned unchanged.
+    So is a column for which nothing is known about the values.
     """
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)

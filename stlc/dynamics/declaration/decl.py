@@ -211,7 +211,8 @@ def _control(decl: SystemDecl, index: int) -> Row:
 def _feedback(decl: SystemDecl) -> list[Row]:
     """Return one row per control that describes the feedback law.
 
-    For example `u  [N]  actuator [-8, 8]  plan +0, and +3.1 (0 - x) within 4`.
+    A row has four cells: control, unit, range of the actuator, and law. The law may read `plan +0, and +3.1
+    (0 - x) within 4`: the actuator gets the planned control, plus 0, plus 3.1 (0 - x) limited to ±4.
     """
     feedback = decl.feedback
     rows: list[Row] = []

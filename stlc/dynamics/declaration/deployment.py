@@ -172,7 +172,8 @@ class JudgeRef:
 
     Attributes:
         path: path of the file.
-        written: the path as the system file writes it; the index of the copies in a run folder has it as key.
+        written: the path as it is written in the system file. A run folder holds a copy of the
+            specification, which is looked up by this text.
         span: source location of the path.
     """
 

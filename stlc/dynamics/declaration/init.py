@@ -62,11 +62,13 @@ class FileDecl:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Component of the mixture from which initial states are drawn: assignments, then one of the branches.
+    """One of several ways to draw an initial state.
+
+    The assignments `draws` give values to states. If there are branches, one of them gives the other values.
 
     Attributes:
         name: for messages and tables; "" for an unnamed branch.
-        weight: relative probability among the components of the same mixture, not normalised.
+        weight: relative probability of this situation among the alternatives; not normalised.
         draws: assignments in order; later ones may read earlier ones. Names that are not columns are local.
         branches: alternative situations, one of which is drawn by weight after `draws`; may be empty.
         points: grid or file, from which a state is drawn before `draws`; None if the situation has neither.
@@ -217,7 +219,7 @@ class _Draws:
     def require_all(self, called: str, node: Node) -> None:
         """Report S102 if a state has no initial value.
 
-        `called` names the situation at `node` in the message.
+        The message is located at `node` and begins with `called`, such as "this situation".
         """
         undrawn = [column.name for column in self.cx.names.columns if column.name not in self.ready]
         missing = list(dict.fromkeys(map(base_name, undrawn)))
@@ -288,7 +290,10 @@ class _Draws:
 
 
 def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
-    """Read initial states from a grid or a file; `draw` must give the states that these lack."""
+    """Read initial states from a grid or a file.
+
+    Every state that the grid or the file does not contain must be drawn by `draw`, else S102 is reported.
+    """
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [

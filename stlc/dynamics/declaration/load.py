@@ -239,8 +239,8 @@ class _Named:
         cx: context that knows all declared names, and the time step.
         clock: the section `time`.
         states: keys of each state, timers included.
-        drawn: distributions of the parameters, and initial values of the states that record which jumps with
-            `once` have happened; all are assigned before the other states are drawn.
+        drawn: assignments that are made before the other states are drawn. They give the parameters, and for
+            each jump with `once` the initial value of the bool state that records whether it has happened.
         functions: external functions.
     """
 
@@ -268,7 +268,11 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 
 @dataclass(frozen=True, slots=True)
 class MovingParts:
-    """YAML nodes of the sections `flow` and `jump` of a valid file, and the context to read them in again."""
+    """YAML nodes of the sections `flow` and `jump` of a valid file.
+
+    `read_flow` and `read_jumps` can read them a second time in the context `cx`, for example with changed
+    numbers.
+    """
 
     cx: Context
     flow: Node | None
@@ -276,7 +280,7 @@ class MovingParts:
 
 
 def moving_parts(decl: SystemDecl) -> MovingParts:
-    """Return the YAML nodes of `flow` and `jump` of a declared system, and the context to read them in."""
+    """Return the YAML nodes of `flow` and `jump` of a system, for reading these sections a second time."""
     reader = Reader(decl.source)
     found, _ = _sections(decl.source, decl.overrides, reader)
     return MovingParts(_named(found, reader).cx, found.flow, found.jump)

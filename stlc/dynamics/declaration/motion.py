@@ -236,11 +236,11 @@ def latch_name(jump: str) -> str:
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """Make assignments draw a sampler that several of them share, such as `uniform(0, 1)`, only once.
+    """Return assignments in which a random number that several of them use is drawn only once.
 
-    A preceding assignment to a local name draws the sampler; the other assignments read this name. `p:
-    "uniform(0, 1) * [1, 2]"` multiplies one random number by each component; `p: "uniform(low, high)"` with
-    vectors draws one random number per component.
+    For a vector, `p: "uniform(0, 1) * [1, 2]"` gives two assignments that use the same `uniform(0, 1)`. An
+    assignment before them draws the number and stores it in a local name, which both read. In contrast, `p:
+    "uniform(low, high)"` with vectors `low` and `high` draws one random number per component.
     """
     if len(assigns) < 2:
         return tuple(assigns)

@@ -32,7 +32,10 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Number of rows (states) to draw, and the random generator, on whose device the values are (float64)."""
+    """Source of random numbers: one number per row, for `count` rows (states to draw).
+
+    The numbers are float64, on the device of `generator`.
+    """
 
     count: int
     generator: torch.Generator
@@ -385,7 +388,10 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Return random indices below `count`, one per row; the numbers of occurrences differ by at most one."""
+    """Return random indices from 0 to `count` - 1, one per row.
+
+    They are drawn evenly: any two indices occur equally often, or one of them once more.
+    """
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)
     orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]

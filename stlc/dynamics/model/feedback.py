@@ -226,8 +226,8 @@ def _lqr(decl: SystemDecl, weights: Mapping[str, float], state: Doubles, control
 def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
     """Limit of the gain (m, n) in the Riccati recursion with costs `q` of states and `r` of controls.
 
-    Unlike the algebraic Riccati equation, the recursion also works if an integrator is uncontrollable, so
-    that no stabilising solution exists.
+    If an integrator is uncontrollable, the algebraic Riccati equation has no stabilising solution. The
+    recursion gives a gain even then.
     """
     cost: Doubles = q.copy()
     gain: Doubles = np.zeros((b.shape[1], len(a)))

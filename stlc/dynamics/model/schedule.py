@@ -26,11 +26,11 @@ class RolloutStage:
 
     Attributes:
         early: name -> expression computed for all steps at once, before the rest of the stage.
-        follows: state -> name of the expression in `early`, of this or an earlier stage, that is its next
-            value.
-        sums: state -> name of the expression in `early` that is its increment per step.
+        follows: state -> name of the expression that gives its next value. The expression is in `early`,
+            of this stage or of an earlier one.
+        sums: state -> name of the expression in `early` that gives its increment per step.
         blocks: expressions computed in a loop over the steps; each block reads only earlier blocks.
-        stepped: state -> name of the expression in `blocks` that is its next value.
+        stepped: state -> name of the expression in `blocks` that gives its next value.
         lets: names of expressions in `blocks` that later stages read.
     """
 
@@ -43,7 +43,10 @@ class RolloutStage:
 
 
 def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
-    """Split a step into stages; each reads only states and expressions of itself and earlier stages."""
+    """Split a step into stages, in the order of computation.
+
+    A stage reads only its own states and expressions, and those of earlier stages.
+    """
     numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
@@ -207,9 +210,9 @@ class Hoist:
                 return map_parts(num, self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
-        """Add a loop-invariant expression to `early` and return its name.
+        """Add a loop-invariant expression to `early`, and return the name that stands for it.
 
-        Constants and columns are returned unchanged.
+        `early` is computed once, before the loop. Constants and columns are returned unchanged.
         """
         if isinstance(num, ir.Const | ir.Signal):
             return num

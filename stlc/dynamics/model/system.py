@@ -87,8 +87,8 @@ class System:
     def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
         """Return the same system with the parameters and timers of a specification as its last state columns.
 
-        Parameters are drawn once per trajectory. Timers are updated from the previous states, without
-        gradient; initial states contain their initial values.
+        Each parameter is drawn once per trajectory. The next value of a timer is computed from the present
+        states; no gradient flows through it. Initial states include the initial values of the timers.
         """
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 

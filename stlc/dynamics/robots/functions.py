@@ -37,8 +37,8 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
 def function_files(decl: SystemDecl) -> dict[str, Path]:
     """Return the other files that a system file refers to: name -> path.
 
-    These are the files that it extends, those of its functions, and those of initial states. The name is the
-    path below the folder of the system file, or else the file name.
+    These are the files that it extends, the files of its functions, and files of initial states. A file
+    below the folder of the system file is named by its path from there, any other file by its file name.
     """
     home = decl.path.parent.resolve()
     named = [Path(base.name) for base in decl.bases]

@@ -1,9 +1,9 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
 `test: {uncertain: […]}` lists the uncertain constants. Without it, all constants and literals that `flow` and
-the resets of jumps compute with are uncertain, with two exceptions. Conditions read positions and instants
-(where a station is, when a light changes), which are not properties of the plant, so constants that a
-condition reads are exact. Exponents, indices and arguments of functions are mathematics, and exact as well.
+the resets of jumps compute with are uncertain, with two exceptions. A constant that a condition reads is
+exact: it is a place or a time (where a station is, when a light changes), not a property of the plant. A
+constant or literal in an exponent, an index or an argument of a function is exact: it is mathematics.
 """
 
 from __future__ import annotations
@@ -93,9 +93,9 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """Return the declaration with new guards, and with new equations and resets of its real states.
+    """Return the declaration with guards, equations and resets replaced by those of `flow` and `jumps`.
 
-    They come from `flow` and `jumps`; equations and resets of bool and enum states are kept.
+    Only the equations and resets of real states are replaced; those of bool and enum states are kept.
     """
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
 

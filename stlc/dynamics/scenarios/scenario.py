@@ -63,9 +63,9 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """Return new values of the constants that a scenario changes in both model and specification.
+    """Return the constants that a scenario changes: name -> text of the new value.
 
-    The result maps the name of a constant to the text of its value.
+    They change in the specification as well as in the system.
     """
     return find_scenario(load_system_decl(path, overrides), name).constants
 
@@ -73,7 +73,8 @@ def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> M
 def under(decl: SystemDecl, name: str) -> SystemDecl:
     """Return the declaration with a scenario applied.
 
-    The model that plans are made with changes only in the constants (`const`) of the scenario.
+    Of the scenario, only the constants (`const`) change the model with which controls are planned. Its model
+    mismatch changes only the true system (`truth`).
 
     Raises UsageError (U101) if the scenario does not exist.
     """
@@ -82,7 +83,10 @@ def under(decl: SystemDecl, name: str) -> SystemDecl:
 
 
 def truth(decl: SystemDecl) -> SystemDecl:
-    """Return the true system: the declaration with the model mismatch of its scenario, or else unchanged."""
+    """Return the true system, which may differ from the model with which controls are planned.
+
+    It is the declaration with the model mismatch of its scenario. Without a mismatch it is `decl` itself.
+    """
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:
         return decl

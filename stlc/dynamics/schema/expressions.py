@@ -48,7 +48,8 @@ class Expressions:
         reader: collects the findings.
         scope: table of the names that expressions may use.
         ready: columns that already have a value; None means all. Reading another column is an error.
-        amounts: whether numbers are increments of columns; one in degC is then a temperature difference.
+        amounts: whether numbers are added to columns, as in a disturbance. 5 degC is then a temperature
+            difference, otherwise a temperature.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
             nothing.
     """
@@ -105,7 +106,10 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """Read a number, converted to SI units; a temperature in degC keeps the zero of the Celsius scale."""
+        """Read a number and scale it to SI units; None if it is invalid.
+
+        The zero of a temperature scale is not shifted: 20 degC becomes 20, not 293.15.
+        """
         expr = self.parse(node, where)
         return None if expr is None else self._typed(resolve_number, expr)
 
@@ -152,10 +156,10 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """Resolve an expression with `resolve`, a function of the compiler.
+        """Resolve an expression with `resolve`, a function of the compiler, and return the result.
 
-        Returns None if that reports errors, or (with S202) if a column that the result reads has no value
-        yet.
+        Returns None if `resolve` reports an error. Reports S202 and returns None if the result reads a column
+        that has no value yet.
         """
         sink: list[Diagnostic] = []
         try:

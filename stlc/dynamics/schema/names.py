@@ -173,5 +173,5 @@ class Context:
         return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
 
     def amounts(self) -> Context:
-        """Return the context in which numbers are increments of columns (in degC: differences)."""
+        """Return the context for numbers that are added to columns: 5 degC is a temperature difference."""
         return replace(self, here=replace(self.here, amounts=True))

@@ -111,7 +111,10 @@ class Reader:
         return node.items
 
     def _whole(self, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Report and drop entries that are in fact the rest of an expression, cut at a comma inside `{…}`."""
+        """Report and drop entries that are only pieces of an expression; return the others.
+
+        In `{x: min(a, b)}` YAML ends the value of `x` at the comma, and reads `b)` as a further key.
+        """
         kept: list[Entry] = []
         open_value = False
         for entry in entries:

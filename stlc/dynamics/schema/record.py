@@ -129,7 +129,10 @@ def values_of(
 
 
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
-    """Read a mapping into a record; invalid values are reported and, as missing ones, get their defaults."""
+    """Read a mapping into a record. A missing or invalid value is replaced by its default.
+
+    Invalid values are reported.
+    """
     return record(**values_of(record, cx, node, of, label))
 
 
@@ -229,7 +232,11 @@ def part(record: type) -> Kind:
 
 
 def section(record: type, *, free: bool = False) -> Kind:
-    """Kind of a section of the file, kept as YAML node; with `free`, a mapping from any name to a record."""
+    """Kind of a section of the file, kept as YAML node.
+
+    The section contains one `record`. If `free`, it contains a `record` under each name, and any name is
+    allowed.
+    """
     schema = json_schema(record)
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
 

@@ -58,14 +58,16 @@ class CauseNode:
         holds: truth value of the sub-formula; the opposite value was wanted.
         sample: the instant, as a sample number.
         rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
-        until: last instant of the window, if a temporal operator fails at every instant of its window.
+        until: last instant of the window, if the body of a temporal operator fails at every instant of it;
+            else None.
         reads: for a predicate, the signals that it reads, each with the offset in samples at which it reads
             it.
         parts: causes among the operands; empty for a predicate.
         main: index in `parts` of the operand whose value is the robustness of the sub-formula.
         premise: whether the sub-formula is the left side of an implication.
-        moves: whether the robustness of the sub-formula changes if the deciding predicate value changes
-            alone; False, for example, for a `freeze` that binds a signal sample which the predicate reads.
+        moves: whether the deciding predicate value can change alone, and the robustness of the sub-formula
+            with it. False, for example, if a `freeze` binds a sample of a signal, and the predicate below
+            it reads the same sample.
     """
 
     formula: typed.Formula
@@ -154,10 +156,10 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """Robustness of a formula at a sample.
+        """Return the robustness of a formula at a sample.
 
-        If `raised` is not empty, the first predicate value that it names is replaced by the next larger
-        float.
+        `raised` is a list of (predicate, sample). The predicate value of its first entry is replaced by the
+        next larger float; an empty list replaces nothing.
         """
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
@@ -203,10 +205,11 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Return the cause tree of `formula` not being `wanted`, and whether one predicate value decides.
+        """Explain a truth value of `formula` at `sample` that is the opposite of `wanted`.
 
-        One value decides if a change of it alone changes the robustness. If several predicate values equal
-        the robustness, the main path leads to one that decides, if there is one among the first `MOST_TIED`.
+        Returns the cause tree, and True if one predicate value decides: a change of this value alone changes
+        the robustness. Several predicate values may be equal to the robustness. The first `MOST_TIED` of them
+        are then tested, and the main path of the tree leads to one that decides, if there is one.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)
@@ -256,7 +259,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """Return the cause tree of `formula` not having the truth value `wanted` at `sample`."""
+        """Return the tree of causes of a truth value of `formula` at `sample` that is not `wanted`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -298,10 +301,10 @@ class CauseFinder:
         }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
-        """Values that a `freeze` formula binds at a sample.
+        """Return the values that a `freeze` formula binds at a sample: name -> value.
 
-        An unknown value is replaced by a signal that is read after the end of the trace, so that the
-        predicates that use it are unknown.
+        An unknown value is represented by an expression that reads a signal after the end of the trace.
+        Predicates that use this value are then unknown.
         """
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
@@ -414,10 +417,11 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """The operand with the least margin, in each of two cases that give an equivalence value `wanted`.
+        """Return two (operand, sample, wanted) triples that explain a failed equivalence.
 
-        If both sides should be equal, the cases are "both true" and "both false"; if they should differ,
-        "only the left side true" and "only the right side true".
+        There are two ways for an equivalence to have the value `wanted`: both sides true or both false, if
+        they should be equal; only the left or only the right side true, if they should differ. For each way,
+        the operand with the least margin is returned.
         """
         left, right = formula.items
         same = (formula.op == "<->") is wanted

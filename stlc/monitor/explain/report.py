@@ -271,7 +271,10 @@ def _closest(tree: CauseNode) -> bool:
 
 
 def _body(node: CauseNode) -> CauseNode:
-    """`node`, with its body as formula if it is a temporal operator whose body never holds in the window."""
+    """Return a copy of the node with the body of its temporal operator in place of its formula.
+
+    This is done only if the body holds nowhere in the window. Any other node is returned unchanged.
+    """
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
         return replace(node, formula=operands(node.formula)[-1])
     return node

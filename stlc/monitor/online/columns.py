@@ -58,7 +58,8 @@ class ColumnReader:
         end: value of rows after the last one: "lower" -inf, "upper" +inf, "both" the two side by side;
             "truncate" clips windows at the last row.
         going_on: whether the trace continues after the last row.
-        back: lookback of the formulas in rows; unknown values in earlier rows are ignored.
+        back: lookback of the formulas in rows. Rows further back than this before the first requested row
+            are not read; unknown values (NaN) in them do not matter.
     """
 
     def __init__(
@@ -216,7 +217,10 @@ class Side:
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
-        """Return columns whose predicates clip windows at the last sample; `self` if none looks ahead."""
+        """Return the columns for a trace that ends with the last sample, at which windows are clipped.
+
+        If no column looks ahead, the end makes no difference, and `self` is returned.
+        """
         if self._last is None or all(stream.ahead == 0 for stream in self.plan.streams):
             return self
         last = replace(self, _settled=dict(self._settled), _over=True)

@@ -74,7 +74,10 @@ class _Watched:
 
     @property
     def ahead(self) -> int | None:
-        """Samples after an instant that its value depends on; None if these are all up to the trace's end."""
+        """Number of later samples on which the value at an instant depends.
+
+        None if the value depends on all samples up to the end of the trace.
+        """
         moving = window_of(self.rule, self.horizon)
         if moving is not None:
             return max(moving, self.rule.reach)
@@ -127,7 +130,7 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Index, among the unsettled window starts, of the first whose window contains the latest sample."""
+        """Number of unsettled window starts to leave out: their windows end before the latest sample."""
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)

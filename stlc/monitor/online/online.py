@@ -341,7 +341,10 @@ class Online:
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
     def standing(self, name: str) -> Tally:
-        """Summary of a requirement up to now; starts whose value may still change enter with their bounds."""
+        """Summary of a requirement over all instants at which it has been evaluated up to now.
+
+        At an instant whose robustness may still change, its lower and upper bound are counted.
+        """
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> Tally:

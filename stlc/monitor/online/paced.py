@@ -104,12 +104,12 @@ def _unbounded(formula: ir.Formula) -> bool:
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return a formula with shorter windows, of equal value while a stream has at most `samples` samples.
+    """Return a formula with shorter windows and, for streams of at most `samples` samples, the same value.
 
-    Instants soon after the last sample still have values that past windows and shifts read from the trace.
-    All later instants have one and the same value, so that windows need not extend to them. Future windows
-    are shortened if past windows are narrow, and past windows if future windows are narrow; if both are wide,
-    the formula is unchanged.
+    At instants far after the last sample nothing is known, and each sub-formula has the same value at all of
+    them. A future window therefore need not contain more than one of these instants. A past window need not
+    reach back beyond the first sample. Future windows are shortened only if past windows are narrow, and past
+    windows only if future windows are narrow. If both are wide, the formula is unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))

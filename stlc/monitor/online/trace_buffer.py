@@ -64,7 +64,10 @@ class TraceBuffer:
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
     def forget(self) -> None:
-        """Drop the older half of the samples; `remember` must be called first to keep the causes in them."""
+        """Drop the older half of the samples.
+
+        To keep the cause of a violation that these samples show, call `remember` first.
+        """
         self._history.forget(self._history.samples - _MOST // self._width)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:

@@ -44,8 +44,8 @@ def worst(
         formula: the formula to bound.
         end: "lower" or "upper" bound.
         ending: "truncate" if windows are clipped at the end of the trace, else "open".
-        window: length in samples of the planning window that the requirement refers to, or None. In a
-            planning window that is not clipped all instants exist; `formula` itself is then returned.
+        window: length in samples of the planning window that the requirement refers to, or None. If there is
+            a planning window and it is not clipped, all its instants exist: `formula` itself is returned.
     """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
@@ -106,7 +106,8 @@ class _CutTracker(ABC):
     def live(self, start: int, stop: int) -> Bounds:
         """Return bounds over all continuations of the trace at instants `start` to `stop` (exclusive).
 
-        If windows are clipped, predicates before the first sample count as false, not as unknown.
+        A predicate that reads a signal before the first sample is unknown. If windows are clipped at the end
+        of the trace, such a predicate counts as false.
         """
         middle = min(max(self.settled, start), stop)
         if not self.cuts or middle <= start:
@@ -309,11 +310,10 @@ class IntervalTracker:
 class PlanningWindowTracker(_ColumnTracker):
     """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
 
-    At every instant k the formula is evaluated on the samples up to k + `window`, the end of the planning
-    window of k. Intervals of the formula may extend beyond that end and read past operators there, whose
-    values are partly known; the past operators are then continued beyond the end with unknown predicates. In
-    that case samples are processed one by one, and the value at an instant is stored when its planning window
-    is complete.
+    The planning window of instant k ends with sample k + `window`; the value at k depends on the samples up
+    to there. An interval of the formula may extend beyond that end. A past operator that is evaluated there
+    still reads samples before the end; it is computed with unknown predicates beyond the end. In this case
+    samples are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
 
     Attributes:
         window: samples from an instant to the end of its planning window.

@@ -45,17 +45,18 @@ class DelayedFormula:
 
 @dataclass(slots=True)
 class UnboundedOperators:
-    """Decomposition of a formula into its unbounded future operators and the subformulas without any.
+    """Decomposition of a formula into its unbounded future operators and its other subformulas.
 
-    Columns (time series) `$0`, `$1`, … replace the subformulas. Columns `!0`, `!1`, … are the values that the
-    unbounded operators have on the samples after the known rows. Operators are rewritten such that their
-    windows begin at 0.
+    Columns (time series) `$0`, `$1`, … replace the subformulas without unbounded operators. Columns `!0`,
+    `!1`, … stand for the values of the unbounded operators on the samples that are not received yet.
+    Operators are rewritten such that their windows begin at 0.
 
     Attributes:
         root: the formula over columns.
         parts: column `$k` -> the subformula that it replaces.
         origins: column `!k` -> its operator in the formula, with the original window.
-        operators: column `!k` -> its operator over columns: the value from the known rows and from `!k`.
+        operators: column `!k` -> formula for the value of its operator, computed from the columns `$k` on the
+            samples received and from `!k`.
     """
 
     root: ir.Formula
@@ -120,10 +121,11 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Name of the column with the value that an unbounded operator has on the samples after the known rows.
+    """Name of the column that stands for the value of an unbounded operator on samples not received yet.
 
-    The column is added to `found` if it is missing. Operators share it only if they are equal in the formula:
-    `next (always p)` and `always (next p)`, which read the same columns, differ at the end of the trace.
+    The column is added to `found` if it is missing. Two operators share a column only if they are written in
+    the same way. `next (always p)` and `always (next p)` read the same signals, but get two columns: their
+    values differ at the end of the trace.
     """
     return _column_of(origin, found.origins, "!")
 
@@ -138,10 +140,10 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Rewrite an unbounded `until` over the known rows and the column of its value on later samples.
+    """Rewrite an unbounded `until` over the samples received and the column of its value on later samples.
 
-    It holds if it is satisfied within the known rows, or if its left side is true at all of them and it is
-    satisfied later. `release` is the same with `and` and `or` exchanged.
+    An `until` holds in two cases: it is satisfied on the samples received, or its left side is true at all of
+    them and it is satisfied later. `release` is the same with `and` and `or` exchanged.
     """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)

@@ -158,7 +158,10 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return times in ns and signals of one topic, as `_Topic.arrays`; empty without a message."""
+        """Return increasing times in ns, and the signals of one topic: name -> (messages,).
+
+        Both are empty if there was no message.
+        """
         return self._topics.get(name, _Topic()).arrays()
 
     def _nothing(self) -> str:
