@@ -39,8 +39,8 @@ class VerdictRow:
         name: name of the requirement.
         status: verdict.
         robustness: least robustness, as printed; "" if there is none.
-        share: percentage of the start instants at which the requirement holds, as printed; "" if it is judged
-            at only one instant.
+        share: percentage of the judged instants at which the requirement holds, as printed; "" if it is
+            judged at only one instant.
         where: trace and time of the least robustness.
         why: reason in one line, if the requirement is not satisfied.
         least: least robustness as a number, or its lower bound if inconclusive; 0 if there is none.
@@ -66,8 +66,8 @@ class Outcome:
         rows: results of the requirements.
         text: printed result.
         traces: number of traces to which the specification applies.
-        holds: share of the start instants at which all requirements hold.
-        fails: share of the start instants at which at least one requirement is violated.
+        holds: share of the judged instants at which all requirements hold.
+        fails: share of the judged instants at which at least one requirement is violated.
         seconds: time it took to judge the file.
         warnings: warnings of the compiler.
         remarks: further messages for the user.
@@ -93,9 +93,10 @@ class Outcome:
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
     """Exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
-    With `fail_under`, 0 means that at least this share of the start instants satisfies all requirements, 1
-    that it cannot be reached, and 4 that this is undecided. A file that cannot be judged takes precedence
-    over every verdict. Traces to which the specification does not apply (out of scope) do not count.
+    With `fail_under`, 0 means that all requirements hold at least at this share of the judged instants, 1
+    that this share cannot be reached, and 4 that this is undecided. A file that cannot be judged takes
+    precedence over every verdict. Traces to which the specification does not apply (out of scope) do not
+    count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:

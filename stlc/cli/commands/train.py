@@ -322,8 +322,8 @@ LOST = "R403"
 def one_voice() -> Iterator[None]:
     """Context for one of several training processes that `torchrun` started: only the first one prints.
 
-    Of the other processes, the first one on each machine prints its errors, and every one reports a missing
-    package.
+    The output of all other processes is dropped. Two kinds of errors are still printed: those of the first
+    process on each machine, and a missing package in any process.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

@@ -263,8 +263,8 @@ def _listed(agents: Sequence[Record]) -> str:
 def _acted(decisions: Mapping[str, float]) -> str:
     """Text on how often the guard intervened, and by which means.
 
-    An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`; T0 is the length in
-    steps of the prefix that the backup policy puts before the policy's plan.
+    An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`. T0=2 means that the
+    backup policy chose the first 2 steps of the plan, and the policy the rest.
     """
     total = 1.0 - decisions["policy"]
     if total <= 0.0:
