@@ -200,15 +200,18 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 
 def show_name(name: str) -> str:
-    """Return a name as an expression writes it, in backticks if it is a reserved word or no identifier.
+    """Return the text of a name in an expression: in backticks if it is a reserved word or no identifier.
 
-    `T`, `end` and `dt` get no backticks: they refer to the built-in names.
+    `T`, `end` and `dt` get no backticks, because in an expression they are the built-in names.
     """
     return f"`{name}`" if name in RESERVED or not _IDENTIFIER.fullmatch(name) else name
 
 
 def own_name(name: str) -> str:
-    """Return a name as a declaration writes it, in backticks if needed; `T`, `end` and `dt` need them."""
+    """Return the text of a name in its declaration, in backticks if needed.
+
+    `T`, `end` and `dt` need them there, because without backticks they are built-in names.
+    """
     return f"`{name}`" if name in BUILT_IN else show_name(name)
 
 
