@@ -192,7 +192,7 @@ def _float(value: float) -> str:
 
 
 def squashed(task: Task) -> list[str]:
-    """C statements that compute the controls `u` of one step from the network's outputs `raw` for it."""
+    """C statements that compute the controls `u` of one time step from outputs `raw` of the network."""
     lines, at = [], 0
     for i, each in enumerate(task.system.decl.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)

@@ -344,7 +344,10 @@ def rank(found: Verdicts) -> Value:
 
 
 def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
-    """Cost of plans, (1, batch): sum of the cost terms, as if every plan satisfied the specification."""
+    """Cost of plans, (1, batch): sum of the cost terms.
+
+    Terms that depend on whether a plan satisfies the specification are computed as if it did.
+    """
     moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
     once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
     once |= {name + START: column[:1] for name, column in states.items()}
@@ -431,10 +434,12 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """Graph from `state` (batch, n) and `begun` (batch, T, m) to the plan that `Guard` chooses.
 
-    `begun` is the rest of the previous plan. It is kept if it satisfies the specification, and either the
-    policy's plan ranks no higher, or `begun` increases the margin of a goal that is satisfied now; otherwise
-    the policy's plan is chosen. The outputs are those of `deciding`, for the chosen plan; `kept` (batch,),
-    whether `begun` was kept; and `policy_plan` and `policy_rho`, the policy's plan and its robustness.
+    `begun` is the rest of the previous plan. It is kept if it satisfies the specification and one of two
+    conditions holds: the policy's plan ranks no higher, or `begun` increases the margin of a goal that is
+    satisfied now. Otherwise the policy's plan is chosen.
+
+    The outputs of `deciding` are returned for the chosen plan. Further outputs are `kept` (batch,), which
+    tells whether `begun` was kept, and the policy's plan and its robustness, `policy_plan` and `policy_rho`.
 
     Raises:
         Untranslatable: a part of the task has no ONNX form.
