@@ -493,7 +493,9 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Compile C code with the option `level` (such as `-O3`), and with vectorised sine etc. if available.
+    """Compile C code with the option `level` (such as `-O3`).
+
+    Vectorised functions such as sine are used if the system has them.
 
     Returns:
         The reason if the compiler failed, else "".

@@ -281,7 +281,9 @@ def _by_name(where: str, root: Path) -> RunDir:
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
-    """Newest run trained for the specification file `path`, else for any specification of that name.
+    """Return the newest run that was trained for the specification file `path`.
+
+    If there is none, it is the newest run for a specification of the same name in another folder.
 
     Raises:
         UsageError: R101, there is none.

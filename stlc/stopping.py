@@ -77,8 +77,8 @@ def age() -> float:
 def finish(code: int) -> int:
     """End an interrupted process at once with the exit code `code`, since libraries take long to unload.
 
-    If the process was not interrupted, `code` is returned; from then on signals are ignored, so that they do
-    not change the exit code.
+    If the process was not interrupted, it is not ended, and `code` is returned. Later signals are then
+    ignored, so that they do not change the exit code.
     """
     if not _asked and code not in (128 + signal.SIGINT, 128 + signal.SIGTERM):
         with suppress(ValueError):  # not the main thread

@@ -316,14 +316,17 @@ def _await(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """Resources used by all processes of a session: processor time in seconds, memory in bytes."""
+    """Resources used by all processes of a POSIX session: processor time in seconds, memory in bytes."""
 
     seconds: float
     memory: int
 
 
 def _use(session: int) -> _Use | None:
-    """Resources used by the processes of a session, including ended child processes; None if unknown."""
+    """Resources used by the processes of POSIX session `session`, ended children included.
+
+    The result is None if they are unknown, as on systems without `/proc`.
+    """
     ticks, pages, known = 0, 0, False
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):
