@@ -115,7 +115,8 @@ class Compiled:
             horizon; None without such deadlines.
         mission: last step of the mission to which a requirement refers; None if none does.
         recurring: for a mission without end, the greatest number of steps that a timer counts, about one
-            period; None if the mission ends.
+            period of a goal such as `always@[a, end] once[0, c] p`; it determines the length of simulated
+            missions. None if the mission ends.
         grid: time step and horizon.
         warnings: findings that are not errors.
         typed: the specification after the first stage.

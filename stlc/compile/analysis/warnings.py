@@ -32,7 +32,11 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """Greatest lower and least upper bound that predicates impose on a linear form, and these predicates."""
+    """Bounds that predicates impose on a linear form.
+
+    `low` is the greatest lower bound and `high` the least upper bound; `low_at` and `high_at` are the
+    predicates that impose them.
+    """
 
     low: float = -math.inf
     high: float = math.inf
@@ -148,9 +152,9 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W503 for each implication in a formula whose left side is never true.
+    """Yield W503 for each implication whose left side is never true.
 
-    If no left side is such, yield W503 if the formula itself is never false. Only ranges that signals never
+    If there is none, W503 is yielded for a formula that is itself never false. Only ranges that signals never
     leave (`facts`) are used, since a signal may leave its nominal range.
     """
     found = False

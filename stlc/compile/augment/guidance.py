@@ -23,7 +23,9 @@ _ZERO = ir.Const(0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Guidance:
-    """Violation of a goal, to be added to the guidance cost, and the time left for the goal.
+    """Violation of a goal, and the time left for the goal.
+
+    The guidance cost is computed from these values.
 
     Attributes:
         gap: violation of the goal, `max(-margin, 0)`.

@@ -45,9 +45,11 @@ def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
 
 
 def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Return `node` applied to `body`, with the parts of `body` moved out whose truth is constant.
+    """Move the constant parts of `body` out of `node`, and return the result.
 
-    E307 is reported for other absolute operators (`always@[a, b]`) in `body`; the result then contains
+    A part is constant if its truth is the same at every instant, as for `always@[a, b] p`. The result is
+    `node` applied to the other parts, joined to the constant parts by the `and` or `or` of `body`. If an
+    absolute operator (`always@[a, b]`) cannot be moved out, E307 is reported, and the result is the formula
     `true`.
     """
     if _constant(body):
@@ -96,8 +98,9 @@ def from_first_sample(formula: typed.Formula) -> typed.Formula:
     """Return the formula of a requirement that is evaluated only at the first sample of a recorded trace.
 
     At that sample, mission time and relative time are equal, so absolute operators (`always@[a, b]`) become
-    relative ones (`always[a, b]`). Absolute operators below another temporal operator are not changed; they
-    too are evaluated at the first sample.
+    relative ones (`always[a, b]`). This does not apply to absolute operators below another temporal operator,
+    which evaluates them at later samples too. They stay absolute: their interval still counts from the first
+    sample.
     """
     if isinstance(formula, (typed.Temporal, typed.Until)):
         return from_now(formula)

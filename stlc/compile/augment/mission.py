@@ -1,11 +1,12 @@
-"""Absolute formulas, each with an added state that holds its status, and their progression over a plan.
+"""Absolute formulas (`always@[a, b] p`), and their progression over a plan.
 
-An absolute formula such as `always@[a, b] p` has an interval that counts from the start of the mission. Its
-status is open (undecided), true or false; once true or false it stays so. Progression turns the formula into
-one that a plan must satisfy: the samples up to the plan's end must not falsify the absolute formula. An open
-formula is evaluated over the horizon and assumed satisfiable beyond it. An executed trace whose plans all
-satisfy the progressed formula satisfies the formula. This also holds for any combination of absolute formulas
-by `and`, `or`, `not` and `->`.
+The interval of an absolute formula counts from the start of the mission. The compiler adds a state that holds
+the formula's status: open (undecided), true or false. Once true or false, it stays so.
+
+Progression turns the absolute formula into one that a plan must satisfy: the samples up to the plan's end
+must not falsify the absolute formula. An open formula is evaluated over the horizon and assumed satisfiable
+beyond it. If every plan made during a mission satisfies the progressed formula, the executed trace satisfies
+the absolute formula. This also holds for any combination of absolute formulas by `and`, `or`, `not` and `->`.
 """
 
 from __future__ import annotations
@@ -71,7 +72,10 @@ class GoalLeaf:
 
 @dataclass(frozen=True, slots=True)
 class GoalBranch:
-    """Conjunction or disjunction (`op`) of goals, as an inner node of the tree that a goal is."""
+    """Inner node of a goal tree: conjunction or disjunction (`op`) of goals.
+
+    The leaves of the tree are absolute formulas (`GoalLeaf`).
+    """
 
     op: Literal["and", "or"]
     items: tuple[Goal, ...]

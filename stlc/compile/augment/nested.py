@@ -1,9 +1,10 @@
 """Absolute operators (`always@[a, b]`) over future formulas, rewritten to be over past formulas.
 
 The interval of an absolute operator counts from the start of the mission. `eventually@[a, b] always[0, c] p`
-holds iff p has held for c at some sample from a + c to b + c. Each part is stated at the instant at which it
-is decided, so it needs only memory of the past: one timer per window. Where parts are decided at different
-instants, the earlier ones are stored until the last one is decided, in one state per sample.
+holds iff p has held for c at some sample from a + c to b + c. The rewritten formula thus refers to the sample
+at which the inner formula is decided. There it needs only memory of the past: one timer per window. If the
+parts of a formula are decided at different samples, the truth of the earlier parts is stored until the last
+part is decided. This takes one state per sample of delay.
 
 In the example, `always[0, c] p` must begin by b, so the formula is violated as soon as p fails after b. The
 rewritten formula is a `left until@ right`; its left side detects this at once, not only at b + c. The method
@@ -68,8 +69,8 @@ def in_past_form(
         formula: formula in negation normal form: absolute operators (`always@[a, b]`), and relative ones at
             the start of the mission, joined by `and` and `or`.
         grid: time step and horizon.
-        table: table of added states, to which the mission clock (steps since the start of the mission) is
-            added if deadlines need it.
+        table: table of added states. The mission clock (steps since the start of the mission) is added to it
+            if the rewritten formula reads the clock.
         sink: list to which findings about interval bounds are appended.
 
     Raises:

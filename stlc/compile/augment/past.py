@@ -4,9 +4,9 @@ A timer counts the samples before the current one: `historically[0, c] p` is `p 
 is the number of samples for which p has held; `once[0, c] p` is `p or since_p <= c`, where `since_p` is the
 number of samples since p last held. Windows of the past are cut at the start of the mission.
 
-At a single instant, timers decide truth without a gradient. Along a plan the operator is evaluated on the
-plan's samples, and the timer's value at the first sample stands for the samples before the plan: k steps into
-the plan, `historically[0, c] p` lacks `c - held - k` steps.
+At a single instant, timers decide truth but have no gradient. Along a plan, the operator is therefore
+evaluated on the samples of the plan. For the samples before the plan, the timer's value at the first sample
+of the plan is used: at step k of the plan, `historically[0, c] p` still lacks `c - held - k` steps.
 """
 
 from __future__ import annotations
@@ -59,13 +59,20 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test as an operand of `or`: its robustness is +inf or -inf."""
+        """Return the test in the form for an operand of `or`.
+
+        Its robustness is +inf where the test holds and -inf where it fails.
+        """
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test as an operand of `and`: where it fails, its robustness counts the missing steps."""
+        """Return the test in the form for an operand of `and`.
+
+        Where the test fails, its robustness is negative and finite: it is proportional to the number of
+        missing steps.
+        """
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
         )
@@ -283,7 +290,7 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, by windows that end now.
+        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, to windows that end now.
 
         The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q` held a ago.
         """
@@ -299,7 +306,8 @@ class Past:
     ) -> typed.Formula:
         """Rewrite `p since[a, end] q` with a > 0, or its negation if not `positive`, with a timer.
 
-        The timer counts the steps since the first sample at which q held and from which on p has always held.
+        The timer starts at a sample at which p and q hold. It counts steps while p holds, and is reset when p
+        fails.
         """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
@@ -381,7 +389,7 @@ def _short(formula: typed.Formula) -> str:
 
 
 def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
-    """Return a window as an interval in steps from now or from the start of the mission (`clock`)."""
+    """Return a window as an interval in steps, from now or from the start of the mission (`clock`)."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
     return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, clock=clock, span=span)
 

@@ -124,11 +124,11 @@ def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """Return a formula that holds if `left >= right`, with finite robustness where a timer is too small.
+    """Return a formula that holds if `left >= right`, with finite robustness where it fails.
 
-    The robustness is +inf where the formula holds, and `-MISSING` per missing step where it fails. The latter
-    is less than the robustness of any predicate, so that instants that the plan can influence are preferred;
-    it is finite, so that plans that all fail can still be ranked.
+    The robustness is +inf where the formula holds. Where it fails, it is `-MISSING` times the number of
+    missing steps. This is less than the robustness of any predicate, so that a maximum prefers instants that
+    the plan can influence. It is finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))

@@ -73,10 +73,10 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
-    """Convert numbers to a common unit, which a number without a unit takes from the others.
+    """Convert numbers to a common unit. A number without a unit takes the unit of the others.
 
     Args:
-        args: numbers that must have one unit, those without a unit (`Number.bare`) excepted.
+        args: the numbers; those with a unit must have units of the same dimensions.
         what: verb for the message: "compare", "add", or the name of a function.
         span: source location for the finding.
         scope: receives findings.
@@ -269,9 +269,10 @@ def _sense(args: Sequence[Number]) -> Sense:
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
-    """True if the result is a temperature difference: a multiple of a difference, or a root in kelvin.
+    """True if the result of a function is a temperature difference.
 
-    `unit` is the unit of the result.
+    This is so for a difference multiplied or divided by a plain number, and for a root or power whose result
+    is in kelvin, such as `sqrt(x)` with x in K^2. `unit` is the unit of the result.
     """
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
@@ -295,8 +296,9 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
     """Convert numbers, some of them temperatures in degC, to a common unit.
 
-    The common unit is kelvin if one of the numbers is a temperature difference; otherwise the unit of a
-    temperature that varies is preferred.
+    The common unit is kelvin if one of the numbers is a temperature difference. Otherwise it is the unit of
+    the numbers that are not constant; if these have different units, or if all numbers are constant, it is
+    degC.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -539,7 +541,7 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
 
 
 def _fold(function: Function, args: Sequence[Number], template: Number, scope: Scope) -> Number:
-    """Return the value of a function of constants as a number like `template`.
+    """Compute a function of constants, and return its value as a number with the unit of `template`.
 
     The value is exact if all arguments are exact and the function preserves this.
 
@@ -634,7 +636,10 @@ def negated(number: Number, span: Span) -> Number:
 
 
 def half(span: Span) -> Number:
-    """Return 1/2, halfway between neighbouring integers and between the values 0 and 1 of a bool."""
+    """Return the number 1/2.
+
+    It is the threshold between neighbouring integers, and between the values 0 and 1 of a bool.
+    """
     return literal(Fraction(1, 2), span)
 
 

@@ -106,7 +106,7 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Return the unit in which a comparison is reported: the unit of a side that varies, if there is one."""
+    """Return the unit in which a comparison is reported: that of a side that is not constant, if any."""
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 

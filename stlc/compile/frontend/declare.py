@@ -301,7 +301,8 @@ def _ends(
 ) -> tuple[float | None, float | None] | None:
     """Return the least and greatest value of a declared range or set, in the unit of the column.
 
-    For `inf` the value is None; for a distribution, and for a set without values, the result is None.
+    A value is None if the bound is `inf`. The result is None for a distribution, and for a set without
+    values.
     """
     if isinstance(domain, tuple):
         low, high = _stored(domain, column, unit, scope)

@@ -242,8 +242,8 @@ def _refuse_products(
 ) -> None:
     """Raise Failed (E205) for an operator that is not defined between a vector and its other operand.
 
-    Not defined are the sum or difference of a vector and a number, the product of two vectors, and a vector
-    on the right of `/`, `%` or `^`.
+    Such operators are the sum or difference of a vector and a number, the product of two vectors, and `/`,
+    `%` or `^` with a vector on the right.
     """
     vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
@@ -484,7 +484,10 @@ def _charge(cost: Cost, place: Span, scope: Scope) -> None:
 
 
 def _refuse_excess(place: Span, scope: Scope) -> None:
-    """Raise Failed if the expanded declaration exceeds the size limit; the first time, report E005."""
+    """Raise Failed if the expanded declaration exceeds the size limit.
+
+    E005 is reported once per declaration.
+    """
     meter = scope.meter
     if not meter.over:
         return
@@ -597,7 +600,7 @@ def _expansion(op: str) -> ast.Expr:
 def _repeats_operand(op: str) -> bool:
     """True if the expansion of a temporal operator contains an operand twice.
 
-    `unless` is such an operator too, although it is expanded at a later stage.
+    The result is also True for `unless`, which is expanded at a later stage.
     """
     names = [node.name for node in descendants(_expansion(op)) if isinstance(node, ast.Name)]
     return op == "unless" or len(names) > len(set(names))

@@ -146,9 +146,10 @@ def stored(number: Number, unit: Unit) -> ir.Num:
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
-    """Return a value as the number that a column stores; without a column, as any number.
+    """Convert a value to the number that a column stores.
 
-    For a bool column, a formula is the number 1 where it holds, else 0.
+    Without a column, the result is the value as a number in any unit. For a bool column, a formula becomes
+    the number 1 where it holds, else 0.
 
     Raises:
         Failed: the value has a type (E202, E205, S203) or unit (E203) that does not fit the column.

@@ -18,7 +18,7 @@ class InterfaceFunction(Protocol):
     def bound(
         self, arguments: tuple[int | None, ...], result: int | None
     ) -> Callable[..., Sequence[Any]] | Body:
-        """Return the function in the form that the compiler calls, on the components of its arguments.
+        """Return the function in the form that the compiler calls.
 
         Args:
             arguments: size of each vector argument; None for a number.

@@ -163,7 +163,7 @@ def interval(
         bounds: values of the two bounds.
         op: name of the operator.
         place: source location of the operator.
-        body: operand of the operator, for the help of a message.
+        body: operand of the operator, which an error message repeats in its hint.
         scope: receives findings.
 
     Raises:

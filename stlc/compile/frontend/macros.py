@@ -75,7 +75,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Return a value in the declared unit, which a number without a unit takes.
+    """Return a value in the declared unit; a number without a unit is taken to be in that unit.
 
     Raises:
         Failed: a number has another unit (E203).

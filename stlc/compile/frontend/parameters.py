@@ -172,9 +172,10 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
 
 
 def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:
-    """Raise Failed (E104) if the system draws a parameter of the same name differently.
+    """Raise Failed (E104) if specification and system disagree on how a parameter is drawn.
 
-    This is so if the specification gives a distribution, or a range other than that of the system.
+    They disagree if the specification gives a distribution, since the system already has one, or if both give
+    a range and the ranges differ.
     """
     place = interface.places.get(columns[0].name)
     labels = () if place is None else (Label(place, "declared here"),)

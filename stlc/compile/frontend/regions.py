@@ -1,8 +1,8 @@
 """Regions and the signed distance of a point to a region, positive inside.
 
 Distances to balls, boxes, half-spaces and polygons are Euclidean and exact. The distance to a union is the
-greatest, to an intersection the least distance to its parts. The sign of these distances is exact; inside a
-union and outside an intersection their magnitude is a lower bound.
+greatest of the distances to its parts. The distance to an intersection is the least of them. The sign of
+these distances is exact; inside a union and outside an intersection their magnitude is a lower bound.
 """
 
 from __future__ import annotations
@@ -184,7 +184,8 @@ def composed(
 def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the signed distance to a box.
 
-    Inside the box this is the distance to the nearest face, outside minus the Euclidean distance.
+    Inside the box, it is the distance to the nearest face. Outside, it is the Euclidean distance to the box
+    with a minus sign.
     """
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:

@@ -77,7 +77,8 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
     """Return the distinct columns of a file and its imports, and the components of their parameters.
 
-    E104 is reported if two files declare a column differently, or a file and the system a parameter.
+    E104 is reported if two files declare a column differently, or if a file and the system disagree on how a
+    parameter is drawn.
     """
     columns: dict[str, tuple[Column, Span]] = {}
     drawn: dict[str, typed.Parameter] = {}
@@ -322,7 +323,10 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 def _requirements(
     spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: KnownRanges
 ) -> tuple[typed.Requirement, ...]:
-    """Return the requirements or assumptions (`kind`) without errors; errors are reported to `scope`."""
+    """Return the requirements or assumptions (`kind`) that have no errors.
+
+    The errors of the others are reported to `scope`.
+    """
     found: list[typed.Requirement] = []
     for item in _items(spec, kind):
         tags = read_tags(item.tags, scope)

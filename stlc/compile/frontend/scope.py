@@ -86,7 +86,11 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Context that counts the expressions evaluated in a block from zero, as those of one declaration."""
+        """Context in which the count of expressions starts again at zero.
+
+        It is entered for each declaration, since the size limit holds per declaration. The previous count is
+        restored at the end.
+        """
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:

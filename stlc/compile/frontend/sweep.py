@@ -1,10 +1,11 @@
 """`sweep(p)`: signed distances of the straight segment from a point to its position at the next sample.
 
 `sweep(p) in R` is the least signed distance along the segment to the region R; `sweep(p) not in R` is the
-least signed distance to its complement. Both are exact for balls, boxes, half-spaces and convex polygons.
-Where the parts are exact, so are `in` of an intersection and `not in` of a union; `in` of a union and `not
-in` of an intersection are lower bounds. For a polygon that is not convex the sign is exact, and so is the
-value where it is not negative.
+least signed distance to its complement. Both are exact for balls, boxes, half-spaces and convex polygons. For
+a polygon that is not convex the sign is exact, and so is the value where it is not negative.
+
+For an intersection of regions with exact distances, `in` is exact and `not in` is a lower bound. For a union
+of such regions, `not in` is exact and `in` is a lower bound.
 
 A region that moves is assumed to move in a straight line too.
 """
@@ -127,19 +128,21 @@ class _Sweep:
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
         """Return the greatest signed distance of the segment to a convex region.
 
-        Where the segment enters the region, this is the greatest depth below the faces (`_depth`), elsewhere
-        the greatest of `outside`: signed distances that include the one of the segment's nearest point.
+        If the segment enters the region, this is its greatest depth below the faces (`_depth`). Otherwise it
+        is the greatest of `outside`. These are signed distances of points of the segment; the point nearest
+        to the region must be among them.
         """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
         return self._choose(ir.Predicate(depth.num), depth, close)
 
     def _depth(self, faces: Sequence[Pair]) -> Number:
-        """Return the maximum along the segment of the least distance to a face, positive inside.
+        """Return the greatest depth of the segment in a convex region, negative if the segment stays outside.
 
-        The result is negative if the segment stays outside. By duality of linear programs it is the least of
-        two kinds of values: for each face, the greater of its distances at both ends of the segment; for two
-        faces whose distances have opposite slopes, the distance at the point where the two are equal.
+        The depth of a point is its least distance to a face, positive inside. By duality of linear programs,
+        the greatest depth is the least of two kinds of values. For each face: the greater of its distances to
+        the two ends of the segment. For each pair of faces whose distances have opposite slopes along the
+        segment: the distance at the point where the two distances are equal.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]

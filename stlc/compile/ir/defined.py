@@ -18,10 +18,11 @@ _Instants: TypeAlias = NDArray[np.int_]
 
 
 def defined(formula: ir.Formula, samples: int) -> Defined:
-    """Return where `formula` is defined on a trace of `samples` samples, as a mask `(samples,)`.
+    """Return a mask `(samples,)`: at which samples of a trace `formula` is defined.
 
-    Windows of the future are not cut: a formula is undefined if its window extends beyond the last sample, as
-    are `prev`, `next` and `shift` outside the trace. A window "to the end" is defined where it has a sample.
+    Windows of the future are not cut: a formula is undefined if its window extends beyond the last sample.
+    `prev`, `next` and `shift` are undefined if they read a sample outside the trace. A window "to the end" is
+    defined if it contains a sample.
     """
     return fold(formula, _Definedness(samples))
 

@@ -193,8 +193,8 @@ def _function(
         rule: as in `Function`.
         fold: as in `Function`.
         c: C expression of the result, in the arguments `{0}`, `{1}`, ….
-        slopes: one C expression per argument: the derivative by it, in the arguments `{0}`, `{1}`, … and the
-            result `{r}`.
+        slopes: one C expression per argument: the derivative with respect to it, in the arguments `{0}`,
+            `{1}`, … and the result `{r}`.
         bounds: as in `Function`; None: the function is monotone in each argument.
         **rest: other attributes of `Function`.
     """
@@ -215,8 +215,8 @@ def _function(
 def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
     """Return the entry of an operator.
 
-    Without a kernel (`numpy`), the array back ends append the operation to a tape by the method of the tape
-    that has the operator's name.
+    If the operator has no kernel (`numpy`), the array back ends append it to a tape. They call the method of
+    the tape that has the operator's name.
     """
     flags = {"kind": "operator", "exact": True, "whole": True, **flags}
     if "numpy" not in flags:

@@ -210,11 +210,11 @@ def uses_end(formula: ir.Formula) -> bool:
 
 
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
-    """Return an instant from which on a formula is constantly +inf or -inf, or None if none is known.
+    """Return an instant from which on the robustness of a formula is constant, +inf or -inf.
 
-    The trace is open: it continues beyond its last sample with unknown predicates, all of which are bounded
-    by +inf, or all by -inf. From some instant on most formulas are then constant, so that a window far beyond
-    a short trace needs only one such instant.
+    The result is None if no such instant is known. The trace is open: beyond its last sample the predicates
+    are unknown, and all count as +inf, or all as -inf. Most formulas are therefore constant from some instant
+    on. A window that ends far beyond a short trace needs only one of these instants.
 
     Args:
         formula: formula in negation normal form.
@@ -239,8 +239,9 @@ class _Tail(Analysis[int | None]):
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
         """Return an instant from which on an operator is constant, or None if none is known.
 
-        From this instant on all operands are constant wherever they are read, or the window is empty. A
-        window that begins at the start of the trace must contain all instants at which its operand varies.
+        From this instant on, the operator reads its operands only where they are constant, or its window is
+        empty. If the window begins at the start of the trace, it must contain all instants at which its
+        operand varies.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

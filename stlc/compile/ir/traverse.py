@@ -96,7 +96,7 @@ def map_children(
 def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
     """Return the fields of a class that hold formulas: (name, whether the value is a tuple of formulas).
 
-    For `Recalled`, a past operator rewritten with timers, this is only `now`.
+    For `Recalled`, a past operator rewritten with timers, this is only its field `now`.
     """
     found = ((name, sort == "formulas") for name, sort in _shape(kind) if sort.startswith("formula"))
     return (("now", False),) if kind is typed.Recalled else tuple(found)
@@ -267,8 +267,8 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
     Args:
         formula: typed formula.
         augmented: whether the formula is for training. `Recalled` nodes, which are past operators rewritten
-            with timers, then count as state formulas; formulas with frozen values do not, as these come from
-            other instants.
+            with timers, then count as state formulas. Formulas with frozen values do not, since frozen values
+            come from other instants.
     """
     state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
     elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)

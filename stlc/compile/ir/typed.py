@@ -175,10 +175,10 @@ class Recalled(Node):
     The node stands under no negation.
 
     Attributes:
-        now: state formula that is equivalent at one instant: tests of timers decide its truth, without a
-            margin.
-        along: equivalent formula with a robustness, for a plan or any other part of a trace; it reads the
-            timers at the first sample of that part only.
+        now: state formula that is equivalent to the operator at one instant. In it, tests of timers stand for
+            the past; their robustness is +inf or -inf.
+        along: formula that is equivalent to the operator along a plan or another part of a trace; its
+            robustness is used there. It reads the timers only at the first sample of that part.
     """
 
     now: Formula

@@ -75,8 +75,8 @@ def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Form
     """Lower a typed formula to an IR formula in negation normal form, with time in steps.
 
     The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
-    has no such operator (`stlc.compile.augment`). Findings about intervals (`to_window`) are appended to
-    `sink`; if one of them is an error, the result must not be used.
+    has no such operator (`stlc.compile.augment`). Findings about intervals are appended to `sink`, see
+    `stlc.compile.ir.discretize.to_window`. If one of them is an error, the result must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 

@@ -2,9 +2,9 @@
 
 Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true until q`
 becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
-associative, nested `and`s and nested `or`s are merged; if it is idempotent, repeated items are removed; if it
-is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`, and likewise for `F`, `H` and `O` (eventually,
-historically, once).
+associative, nested `and`s and nested `or`s are merged. If it is idempotent, repeated items are removed. If it
+is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`. The laws for `G` (always) hold for `F` (eventually), `H`
+(historically) and `O` (once) in the same form.
 """
 
 from __future__ import annotations

@@ -121,7 +121,10 @@ class IndexRange:
 
     @property
     def count(self) -> int:
-        """Number of instants from the earliest start to the latest end; 0 or less for an empty range."""
+        """Number of instants in the range; 0 or less for an empty range.
+
+        If `start` and `last` depend on loop indices, the earliest `start` and the latest `last` count.
+        """
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
         return latest(self.last) - earliest(self.start) + 1
@@ -151,8 +154,8 @@ class TraceDomain:
         end: treatment of the instants beyond the last sample (`Boundary`).
         stop: final length of an open trace (one that continues, with unknown predicates), at which windows to
             the end are cut; None: they are cut at the last known sample.
-        counted: whether every instant contributes to the value, even one with unknown predicates, since the
-            semantics is a mean.
+        counted: whether every instant contributes to the value, even one with unknown predicates, as in a
+            mean. If so, no instant may be left out.
     """
 
     samples: int
@@ -177,9 +180,10 @@ class TraceDomain:
 def operands(
     node: ir.Formula, run: IndexRange, domain: TraceDomain
 ) -> tuple[tuple[ir.Formula, IndexRange], ...]:
-    """Return the operands that a formula needed at `run` reads, each with its instants.
+    """Return the operands of a formula, each with the range of instants at which the formula reads it.
 
-    The range of instants may be empty; `truth`, predicates and `freeze` have no operands.
+    `run` holds the instants at which the value of the formula is needed. A range may be empty; `truth`,
+    predicates and `freeze` have no operands.
     """
     match node:
         case ir.Truth() | ir.Predicate() | ir.Freeze():
@@ -201,9 +205,10 @@ _NEVER = IndexRange(0, -1)
 
 
 def _first(read: ir.Offsets, run: IndexRange) -> Instant:
-    """Return the first instant at which a formula needed at `run` reads an operand.
+    """Return the first instant at which a formula reads an operand.
 
-    `read` holds the offsets, from an instant of the formula, at which it reads the operand.
+    `run` holds the instants at which the value of the formula is needed. `read` holds the offsets from such
+    an instant at which the formula reads the operand.
     """
     return 0 if read.first is None else at_least(run.start + read.first, 0)
 
@@ -211,14 +216,14 @@ def _first(read: ir.Offsets, run: IndexRange) -> Instant:
 def _last(
     read: ir.Offsets, run: IndexRange, window: ir.Offsets, parts: Sequence[ir.Formula], domain: TraceDomain
 ) -> Instant:
-    """Return the last instant at which a formula needed at `run` reads an operand.
+    """Return the last instant at which a formula reads an operand.
 
     An open trace (one that continues with unknown predicates) may need instants far beyond the last sample.
     If all operands are known to be constant from some instant on, later instants are left out.
 
     Args:
-        read: offsets, from an instant of the formula, at which it reads the operand.
-        run: instants at which the formula is needed.
+        read: offsets from such an instant at which the formula reads the operand.
+        run: instants at which the value of the formula is needed.
         window: offsets of the formula's window.
         parts: all operands of the formula.
         domain: length of the trace, and treatment of instants beyond its last sample.
@@ -275,7 +280,7 @@ class Step:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Step numbers of the operands that are needed."""
+        """Numbers of the steps that compute the operands, without operands that are needed at no instant."""
         return tuple(number for number in self.args if number is not None)
 
 

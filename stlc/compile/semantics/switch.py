@@ -36,8 +36,8 @@ class Switch(Protocol):
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
         """Return the indicator of a condition that contains both strict and non-strict inequalities.
 
-        The margin of such a condition does not determine its truth at 0. `weight` is the indicator of the
-        margin, `truth` the mask of the exact truth.
+        Where the margin of such a condition is 0, the condition may be true or false. `weight` is the
+        indicator computed from the margin, `truth` the mask of the exact truth.
         """
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:

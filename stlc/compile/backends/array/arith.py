@@ -230,9 +230,10 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
 
     def _truth(self, cond: ir.Formula) -> int | bool:
-        """Register of the mask where a state formula is true, or its truth value if that is constant.
+        """Return the register of the mask that is true where a state formula holds.
 
-        A state formula has no temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
+        If the truth of the formula is constant, the truth value itself is returned. A state formula has no
+        temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
         """
         match cond:
             case ir.Truth(value):
@@ -256,11 +257,11 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """Register of the soft weight, between 0 and 1, of a state formula, or the weight if it is constant.
+        """Return the register of a state formula's soft weight, a number between 0 and 1.
 
-        The weight follows from the margin of the formula. If the formula contains both `>` and `>=`, the
-        margin does not determine the truth at 0, so the weight is adjusted by the exact truth
-        (`Switch.settle`).
+        If the weight is constant, its value is returned. The weight is computed from the margin of the
+        formula. If the formula contains both `>` and `>=`, it may be true or false where its margin is 0; the
+        weight is then adjusted by the exact truth (`Switch.settle`).
         """
         kinds = _strictness(cond)
         margin = self.margin(cond)
@@ -290,7 +291,8 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
     """Return the arrays that `program` reads at the instants `run`, by name, `(count, batch)` each.
 
-    For a program that reads no signal an arbitrary signal is returned, whose shape its constant outputs take.
+    If the program reads no signal, the result contains an arbitrary signal, since the constant outputs of the
+    program take their shape from it.
 
     Args:
         program: program whose inputs are read; all samples that it needs at these instants must exist.

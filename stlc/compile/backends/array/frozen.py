@@ -196,10 +196,11 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 
 
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
-    """Return `body` with each predicate that reads an undefined value, one of `names`, made constant.
+    """Return `body` with a constant in place of each predicate that reads a value in `names`.
 
-    If the trace is open (continues beyond its last sample), the constant is the bound that is computed: true
-    for an upper bound, false for a lower one. Otherwise the inequality of the predicate counts as false.
+    These values are undefined. On an open trace (one that continues beyond its last sample) the constant is
+    true if an upper bound is computed, and false if a lower bound is computed. On any other trace the
+    predicate counts as false, and its negation as true.
     """
     match body:
         case ir.Predicate(num, sign):

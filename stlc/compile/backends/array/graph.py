@@ -53,8 +53,8 @@ def evaluate(
         start: first instant.
         count: number of instants.
         end: treatment of instants beyond the last sample (`stlc.compile.schedule.schedule.Boundary`).
-        stop: final number of samples of a trace that continues (`end` "lower" or "upper"), where unbounded
-            windows end; None: they end with the last known sample.
+        stop: final number of samples of a trace that continues (`end` "lower" or "upper"). Unbounded windows
+            end there; if None, they end with the last known sample.
 
     Returns:
         For each formula an array `(count, batch)`.
@@ -77,9 +77,10 @@ def evaluate_parts(
     end: Boundary,
     stop: int | None = None,
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
-    """Yield the exact robustness of a formula at `instants`, and of its sub-formulas where it reads them.
+    """Yield the exact robustness of a formula and of its sub-formulas.
 
-    If `end` is "lower" or "upper", instants may lie beyond the last sample; for `stop` see `evaluate`.
+    The formula is evaluated at `instants`, each sub-formula at the instants at which its value is needed. If
+    `end` is "lower" or "upper", instants may lie beyond the last sample; for `stop` see `evaluate`.
 
     Yields:
         Formula, instants and values `(instants, batch)`, operands before the formula that reads them; nothing

@@ -61,11 +61,11 @@ class WindowKernel:
     traces: int
 
     def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Compute extrema or `until` from the operands; with `back`, gradients of the operands.
+        """Compute extrema or `until`; with `back`, compute the gradients of the operands instead.
 
         Args:
-            arrays: operands, then values; with `back` operands, gradients of the values, then gradients of
-                the operands. The last array, or with `back` the last `operands` arrays, are written.
+            arrays: without `back`, the operands, then the array for the values. With `back`, the operands,
+                then the gradients of the values, then one array for the gradient of each operand.
             operands: 1 for extrema, 2 for `until` and `release`.
             back: whether to compute gradients.
 

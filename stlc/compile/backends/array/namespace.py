@@ -82,7 +82,7 @@ class Ops(Protocol):
         """`a ^ b`."""
 
     def mod(self, a: Array | float, b: Array | float) -> Array:
-        """Floored modulo: the result has the sign of `b`; the gradient by `a` is 1."""
+        """Floored modulo: the result has the sign of `b`; the gradient with respect to `a` is 1."""
 
     def atan2(self, a: Array | float, b: Array | float) -> Array:
         """Angle of the point (b, a), in radians."""
@@ -175,7 +175,10 @@ class Ops(Protocol):
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
-        """Key of an array, such as (dtype, device): arrays with equal keys can share converted constants."""
+        """Key of an array, such as (dtype, device).
+
+        Constants are converted once per key, so arrays with equal keys share the converted constants.
+        """
 
     def constant(self, value: float, like: Array) -> Array | float:
         """Convert a number to the form that is fastest in operations with `like`."""

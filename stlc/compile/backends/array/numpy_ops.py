@@ -142,7 +142,7 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return None: all arrays can share constants, since floats take the dtype of the other operand."""
+        """Return the key of an array's constants: None, since constants are floats and fit every array."""
         return None
 
     def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002

@@ -164,7 +164,8 @@ class Machine:
     def unknown(self) -> float:
         """Robustness of an unknown predicate: -inf in a lower bound, +inf in an upper bound.
 
-        For the domain `end` "both", in which the batch holds one trace per bound, an array of both values.
+        If both bounds are computed at once (`end` of the domain is "both"), the batch holds one trace per
+        bound. The result is then an array of the two values.
         """
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])

@@ -99,9 +99,9 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Merge partial results: those of blocks of rows, with those of the blocks `shift` rows later.
+        """Merge the partial result of each block of rows with that of the block `shift` rows later.
 
-        `a` and `b` hold the partial results of the blocks that start at each row.
+        Row j of `a` and `b` is the partial result of the block that starts at row j.
         """
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
@@ -228,9 +228,9 @@ class Windows:
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
         """`until` over windows inside the array, in about log2(width) compositions of adjacent blocks.
 
-        A block of rows has two values: the least `left` over the block (`held`), and `until` within the block
-        (`met`). In the loop `held` and `met` belong to the blocks of `size` rows that start at each row, and
-        `total` to the first `done` rows of every window.
+        Each block of rows has two values: the least `left` over the block (`held`), and `until` within the
+        block (`met`). In the loop, row j of `held` and `met` belongs to the block of `size` rows that starts
+        at row j. Row j of `total` belongs to the first `done` rows of window j.
         """
         size, done = 1, 0
         total: tuple[Array, Array] | None = None

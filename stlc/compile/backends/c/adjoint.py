@@ -73,10 +73,11 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
 
 
 def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
-    """C code that propagates the gradient by the states at sample k + 1 to states and controls at k.
+    """C code that propagates the gradient one step back in time.
 
-    It treats one lane, one of the trajectories that are computed side by side. No gradient is propagated
-    through the update of a state in `fixed`.
+    The gradient with respect to the states at sample k + 1 is passed to the states and controls at sample k.
+    The code is for one lane, one of the trajectories that are computed side by side. No gradient is
+    propagated through the update of a state in `fixed`.
     """
     index = state_index(motion)
     writer = SlopeWriter(place_in_step(motion), soft=True)

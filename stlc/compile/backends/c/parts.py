@@ -62,9 +62,10 @@ def _parts(blocks: Sequence[Sequence[str]]) -> Iterator[list[str]]:
 
 
 def declared(plan: Plan, *, room: str = "room", prefix: str = "") -> dict[str, str]:
-    """Return C name of each buffer of a plan -> its declaration, as a part of the working memory `room`.
+    """Return the C declaration of each buffer of an evaluation plan, by the C name of the buffer.
 
-    The names begin with `prefix`, so that values and their gradients can have buffers of different names.
+    Each buffer is declared as a pointer into the C array `room`, the working memory. The names begin with
+    `prefix`, so that values and their gradients can have buffers of different names.
     """
     return {
         f"{prefix}{buffer.name}": f"double (*restrict {prefix}{buffer.name})[LANES] ="

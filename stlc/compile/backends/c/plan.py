@@ -113,8 +113,8 @@ class Tabled:
 
     Attributes:
         table: parameters of each row.
-        pick: minimum or maximum over the rows at each instant; None: no extremum, the result has one value
-            per row, that at the first sample.
+        pick: minimum or maximum over the rows at each instant. If None, no extremum is taken: the step has
+            one value per row, the value at the first sample.
         loop: body of the loop.
     """
 
@@ -394,7 +394,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
 
 
 def _distributed(num: ir.Op) -> ir.Op:
-    """Rewrite `min(a, b) + c` as `min(a + c, b + c)`, and likewise for `max` and differences.
+    """Rewrite `min(a, b) + c` as `min(a + c, b + c)`; `max` and differences are rewritten accordingly.
 
     The values are equal bit for bit, since rounding is monotone. Any other expression is returned unchanged.
     """

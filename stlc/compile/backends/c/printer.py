@@ -80,7 +80,7 @@ class StepForm(ABC):
         """Return C statements that propagate the gradient of the values to the operands."""
 
     def filled(self, value: float) -> list[str]:
-        """Return C statements that set the step to `value` at all instants."""
+        """Return C statements that set the values of the step to `value` at all instants."""
         return [f"{loop(self.run)} LANE {self.out['k']} = {literal(value)};"]
 
 
@@ -145,8 +145,8 @@ class LeafReader:
 def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
     """C statements that propagate the gradient of an expression at sample `k` to its leaves (signals, calls).
 
-    `seed` is the C expression of the derivative with respect to the expression. Several leaves may read the
-    same sample, so gradients are added to them outside of the vectorized loop.
+    `seed` is the C expression of the derivative of the robustness with respect to the expression. Several
+    leaves may read the same sample, so gradients are added to them outside of the vectorized loop.
     """
     writer = SlopeWriter(reader, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
@@ -165,7 +165,8 @@ def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
 def column(index: Mapping[str, int], name: str, k: str) -> str:
     """Return the C expression of a state, or of the elapsed time, at sample `k`, for trajectory `j`.
 
-    The name may stand for a table entry, that is, for a state that differs from row to row.
+    `name` is the name of a state, or of an entry in the table of a family of formulas (`FamilyTable`). Such
+    an entry stands for a different state in each row.
     """
     if name == ir.ELAPSED:
         return f"(double)({k})"
@@ -242,7 +243,8 @@ class _Constant(StepForm):
 class _Extremum(StepForm):
     """C code of `and` or `or`, one statement per operand.
 
-    In a nested call of the C macros the text would double in length with each operand.
+    A single statement would nest the C macros for minimum and maximum, which repeat their arguments: the text
+    would double in length with each operand.
     """
 
     def forward(self) -> list[str]:
@@ -357,7 +359,10 @@ class _Windowed(StepForm):
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
 
     def _empty(self, statement: str) -> list[str]:
-        """C branch with `statement` for instants whose past window lies before the trace; [] if none."""
+        """C branch that executes `statement` at instants whose past window lies before the trace.
+
+        If there are no such instants, the result is empty.
+        """
         late = self.back and earliest(self.run.start) < self.window.lo
         return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
 
@@ -445,9 +450,9 @@ class _Until(_Windowed):
     def _scan_back(self) -> list[str]:
         """C statements that pass the gradient of the value at `k` to the operand that attains the value.
 
-        They look for the first instant of the window at which the value is attained. The gradient goes to the
-        right side at that instant, or, if the left side decides, to the left side at its worst instant up to
-        then.
+        They search the window for the first instant at which the value is attained. If it is attained by the
+        right side, the right side gets the gradient at that instant. If it is attained by the left side, the
+        left side gets the gradient at its worst instant up to there.
         """
         out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
         near, far = self._outwards()
@@ -545,7 +550,10 @@ class _FreezeLoop(_Repeated):
 
 
 class _TableLoop(_Repeated):
-    """C code of a family of formulas: one iteration per row of its table."""
+    """C code of a family of formulas, which differ in parameters only.
+
+    The code is a loop over a table, in which each row holds the parameters of one formula.
+    """
 
     def _head(self) -> list[str]:
         """C statements with the table and the head of the loop over its rows; two braces close the loop."""

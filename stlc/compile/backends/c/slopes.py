@@ -42,7 +42,8 @@ class SlopeWriter(NumberWriter):
         """Return C statements that propagate gradients from registers to leaves (signals, calls).
 
         Args:
-            seeds: register -> C expression of the derivative of the output with respect to it.
+            seeds: register -> C expression of the derivative of the final output with respect to the
+                register.
 
         Returns:
             The statements; and a mapping from the C expression of a leaf's gradient (`gx[…]` for `x[…]`) to
@@ -59,7 +60,8 @@ class SlopeWriter(NumberWriter):
         """Return C statements that compute expressions and add up the gradients of the signals in them.
 
         Args:
-            outputs: pairs of an expression and the C expression of the output's derivative by its value.
+            outputs: pairs of an expression and the C expression of the derivative of the final output with
+                respect to it.
         """
         seeds: dict[str, str] = {}
         for num, own in outputs:
@@ -103,7 +105,7 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
-        """Derivatives of a minimum or maximum by its two operands.
+        """Derivatives of a minimum or maximum with respect to its two operands.
 
         Equal operands share the derivative; a constant operand gets none.
         """
@@ -120,7 +122,7 @@ class SlopeWriter(NumberWriter):
         return operand in self._texts.values() and operand not in self._constants
 
     def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
-        """Derivatives of `min(max(x, low), high)` by its operands."""
+        """Derivatives of `min(max(x, low), high)` with respect to its operands."""
         raised = super()._apply("max", [x, low])
         of_x, of_low = self._shares("max", x, low)
         of_raised, of_high = self._shares("min", raised, high)

@@ -260,7 +260,7 @@ class CasadiOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None: constants are floats, whatever the array."""
+        """Return the key of an array's constants: None, since constants are floats and fit every array."""
         return None
 
     def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002

@@ -261,8 +261,8 @@ class Shooting:
         """Values of the program's parameters for one initial state.
 
         Args:
-            columns: signal name -> values (T + 1,); the first values of the states are read, and all values
-                of the signals in `given`.
+            columns: signal name -> values (T + 1,). For the states of the program only the first value is
+                read, for the signals in `given` all values.
             margin: robustness that every condition should reach.
         """
         first = [columns[name][0] for name in self.states]
@@ -302,7 +302,7 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals whose value at the first sample an expression reads, at whatever instant."""
+    """Names of the signals that an expression reads at the first sample, wherever it is evaluated."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 

@@ -3,9 +3,10 @@
 Signals that no control affects are constants, and expressions of constants are evaluated at once. The
 encoding is tight or relaxed. In a tight encoding the conditions in the dynamics hold or fail with a margin of
 at least `MARGIN`, so that every solution is a plan. A relaxed encoding has every satisfying plan among its
-solutions, so that its infeasibility proves that no plan satisfies the specification. Both are exact up to
-`MARGIN` except for norms, whose circles are replaced by polygons with `SIDES` sides, such that a condition
-becomes stronger in the tight encoding and weaker in the relaxed one.
+solutions, so that its infeasibility proves that no plan satisfies the specification.
+
+Without norms, both encodings are exact up to `MARGIN`. For norms, circles are replaced by polygons with
+`SIDES` sides. This makes a condition stronger in the tight encoding and weaker in the relaxed one.
 """
 
 from __future__ import annotations
@@ -223,9 +224,10 @@ class Encoding:
         self.rows.pop()
 
     def _demanded(self, formula: ir.Formula, k: int, what: Demand) -> Iterator[ir.Formula]:
-        """Subformulas on the states alone that hold at sample `k` in any trace that satisfies `formula`.
+        """Yield state formulas that must hold at sample `k` if `formula` holds at the first sample.
 
-        `what` is the requirement that `formula` belongs to.
+        A state formula has no temporal operators. For `always[0, 5] p` and k = 3, this is p. `what` is the
+        requirement that `formula` belongs to.
         """
         match formula:
             case ir.Predicate() if k == 0:
@@ -325,7 +327,10 @@ class Encoding:
         return self._condition(value, ZERO if node.guard else margin, node.num)
 
     def _decided(self, cond: ir.Formula, k: int, *, holds: bool) -> Tree:
-        """Condition that the state formula `cond` is true, or if not `holds` false, at sample `k`."""
+        """Condition that the state formula `cond` is true at sample `k`.
+
+        If `holds` is False, it is the condition that `cond` is false.
+        """
         match cond:
             case ir.Truth(truth):
                 return truth == holds
@@ -520,11 +525,12 @@ class Encoding:
         return Expression(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
 
     def _held(self, args: Sequence[Expression]) -> Expression | None:
-        """`clip(v + c u, low, high)` as a new variable within [low, high]; None if that excludes solutions.
+        """Encode `clip(v + c u, low, high)` as a variable that equals `v + c u`, without clipping.
 
-        Here `v + c u` is the first argument, and u a control that no other expression reads. Such a control
-        can be chosen such that the sum reaches a bound exactly instead of exceeding it, provided that v
-        itself lies within the bounds.
+        Here `v + c u` is the first argument, and u a control that no other expression reads. If v itself lies
+        within the bounds, u can be chosen such that the sum reaches a bound exactly instead of exceeding it.
+        So the sum can be constrained to [low, high]. The result is None if v may leave the bounds, or if the
+        arguments have another form.
         """
         form, low, high = args[0].form, args[1].known, args[2].known
         free = self._free & form.terms.keys()

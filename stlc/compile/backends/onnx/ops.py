@@ -179,7 +179,7 @@ class OnnxOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: Value) -> Hashable:
-        """Return the element type: a float becomes a constant of this type in the graph."""
+        """Return the key of an array's constants: the element type, to which the graph converts floats."""
         return like.kind
 
     def constant(self, value: float, like: Value) -> float:  # noqa: ARG002

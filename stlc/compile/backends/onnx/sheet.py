@@ -130,9 +130,9 @@ class OnnxGraph:
         Args:
             carried: initial values of the loop state.
             rows: values (count, …); an iteration gets one row (1, …) of each.
-            turn: loop body, a function of the graph to write to, the loop state and the rows; returns the
-                next loop state, of the same shapes, and outputs, (1, …) each. `Value.on` imports values of
-                the enclosing graph.
+            turn: loop body: a function (graph, loop state, rows) -> (next loop state, outputs). It writes to
+                the graph that it gets, and imports values of the enclosing graph by `Value.on`. The next loop
+                state has the shapes of the loop state; each output is (1, …).
 
         Returns:
             Outputs of all iterations, (count, …) each.
@@ -183,7 +183,10 @@ class Value:
     kind: Kind
 
     def on(self, sheet: OnnxGraph) -> Value:
-        """Return this value, of the enclosing graph, for use in `sheet`, the graph of a loop body."""
+        """Return this value for use in a loop body.
+
+        The value belongs to the enclosing graph; `sheet` is the graph of the loop body.
+        """
         return Value(sheet, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic

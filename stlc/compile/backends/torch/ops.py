@@ -266,7 +266,7 @@ class TorchOps:
         return out
 
     def kind(self, like: Tensor) -> Hashable:
-        """Return dtype and device: arrays that agree in both can share constants."""
+        """Return the key of an array's constants: dtype and device."""
         return like.dtype, like.device
 
     def constant(self, value: float, like: Tensor) -> Tensor:
