@@ -33,7 +33,7 @@ class Streams:
     def of(cls, generator: torch.Generator, agents: int) -> Streams:
         """Streams for `agents` agents, from a seed that is drawn from `generator`.
 
-        With more agents, those of the first agents remain the same.
+        The stream of an agent does not depend on the number of agents.
         """
         base = int(torch.randint(2**62, (), generator=generator))
         made = [seeded(base, key) for key in range(agents + 1)]

@@ -154,7 +154,7 @@ class ModelWorld:
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Values of the first two states in planned states: (agents, k, n) -> (agents, k, 2)."""
+        """The first two components of planned states: (agents, k, n) -> (agents, k, 2)."""
         return states[..., [0, min(1, states.shape[2] - 1)]].numpy(force=True)
 
     @staticmethod

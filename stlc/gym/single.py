@@ -95,7 +95,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode. The same seed gives the same sequence of episodes from this one on.
+        """Begin an episode. A seed determines the random numbers of this episode and of all later ones.
 
         Args:
             seed: seed of all random numbers from this episode on; None: the random numbers continue.

@@ -30,9 +30,9 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     All episodes begin together, are as long as a plan, and *terminate* together. Observations, (N, k), and
     actions, (N, m), are those of `SpecEnv`. `info` holds `state`, (N, n) float64, and at the end of the
-    episodes `robustness` per requirement, `rho` of the whole specification, and `satisfied`, (N,) each; as in
-    gymnasium's own vector environments a boolean array under `_NAME` marks the environments for which the key
-    `NAME` has a value.
+    episodes `robustness` per requirement, `rho` of the whole specification, and `satisfied`, (N,) each. For
+    every key `NAME` there is a boolean array under the key `_NAME`. It marks the environments for which
+    `NAME` has a value, as in gymnasium's own vector environments.
 
     Args:
         task: specification and system.
@@ -86,7 +86,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._episodes.steps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, Info]:
-        """Begin all episodes. The same seed gives the same sequence of episodes from these on.
+        """Begin all episodes. A seed determines the random numbers of these and of all later episodes.
 
         Args:
             seed: seed of all random numbers from these episodes on, one number for all environments.

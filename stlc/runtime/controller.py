@@ -138,7 +138,7 @@ class Controller:
 
         Args:
             state: (n,), or (agents, n) for several agents, or values by state name; in the units of `facts`.
-                Ranges of states are nominal: states beyond them are evaluated, too.
+                Ranges of states are nominal: states beyond them are accepted.
             elapsed: number of steps since the previous decision.
 
         Returns:

@@ -1,9 +1,13 @@
 """Prefixes (first controls of a plan) for the backup policy: all of a grid, or a sample of a large grid.
 
-Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. A
-"lattice" is Richtmyer's sequence of low discrepancy: entry d of point k is k sqrt(p_d) mod 1 with the d-th
-prime, in fixed point (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS 84,
-1978). "random" is a hash of the index: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom number
+Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes.
+There are two ways to sample:
+
+"lattice" is Richtmyer's sequence of low discrepancy, in fixed point: entry d of point k is k sqrt(p_d) mod 1,
+where p_d is the d-th prime (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS
+84, 1978).
+
+"random" is a hash of the index: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom number
 generators", OOPSLA 2014).
 """
 

@@ -47,8 +47,8 @@ class Setting:
         steps: number of steps.
         replan: replanning period in steps.
         limit: time limit of a decision of the guard "full", in seconds per agent; None: no limit.
-        ceiling: number of visited states, over all seeds, whose feasibility is determined; from a state whose
-            followed plan fails, a search looks for a satisfying plan.
+        ceiling: number of visited states, over all seeds, whose feasibility is determined. Where the followed
+            plan fails, a search looks for a satisfying one.
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
         paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.

@@ -94,10 +94,10 @@ class Disturbance:
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
 
     def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:
-        """Add the scenario's disturbance to the states `x`, (rows, n), in which step number `step` has ended.
+        """Add the scenario's disturbance to the states `x`, (rows, n), after step number `step`.
 
-        The disturbance is evaluated in the states `before`, in which the step began, at time `(step - 1) dt`.
-        The result is clipped to the states' bounds (`clamp` in the system file).
+        The disturbance depends on the states `before` the step, and on the time `(step - 1) dt` at which the
+        step began. Returns the sum, clipped to the states' bounds (`clamp` in the system file).
         """
         if not self._pushes:
             return x
@@ -119,9 +119,10 @@ class Disturbance:
         return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
-        """Evaluate random assignments in the states `x` at step `step`: name -> values, (rows,).
+        """Evaluate expressions of the scenario, which may draw random numbers: name -> values, (rows,).
 
-        Each seed draws from its own generator.
+        The expressions read the states `x`, (rows, n), and the time at step number `step`. Each seed draws
+        from its own generator.
         """
         parts = []
         for rows, generator in zip(torch.split(x, self._agents), self._generators, strict=True):
@@ -144,9 +145,10 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Nonzero model, actuator and sensor errors of the system's scenario: name -> relative size.
+    """Errors of the system's scenario (model, actuators, sensors) that are not 0: name -> relative size.
 
-    If `parameters` is among them, the entry `numbers` lists the constants of the dynamics that it changes.
+    The entry `parameters` is the error of the constants in the dynamics. If it is present, there is a further
+    entry `numbers`: the list of these constants.
     """
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)

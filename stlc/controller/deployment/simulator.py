@@ -185,12 +185,12 @@ class _Pilot:
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
         """Indices of the rows (one per agent and seed) that replan at this step, (k,).
 
-        Every `replan` steps all rows replan. At other steps a row replans if an exogenous signal has changed
-        in its true state `x`, or if, with the guard "full", the rest of its plan violates a safety
-        requirement, as predicted by the model from the measured state `seen`. If a plan ends before the next
-        regular replanning, its last action is held in this prediction. The last sample of a plan is not
-        checked, because a `sweep` predicate, which covers the segment to the next sample, would extrapolate
-        beyond the plan.
+        All rows replan every `replan` steps. At other steps a row replans for one of two reasons: an
+        exogenous signal has changed in its true state `x`, or the rest of its plan violates a safety
+        requirement. The rest is checked only with the guard "full". The model predicts it from the measured
+        state `seen`. If a plan ends before the next regular replanning, its last action is held in this
+        prediction. The last sample of a plan is not checked: a `sweep` predicate covers the segment to the
+        next sample, which is beyond the plan.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -225,11 +225,11 @@ class _Pilot:
         return self.decision, action
 
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
-        """Remainders of the previous plans of the rows in `due`, for the measured states `seen` (rows, n).
+        """Remainders of the previous plans of the rows in `due`, from the measured states `seen`, (rows, n).
 
-        If `replan` > 1, the policy supplies the actions after the end of each plan. If instead the last
-        action were held for `replan` steps, the previous plan might violate the specification and would never
-        be retained. None at the first step.
+        None at the first step. If `replan` > 1, the policy supplies the actions after the end of each plan.
+        Repeating the last action instead might violate the specification; then no previous plan would ever be
+        retained.
         """
         if self.decision is None:
             return None

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 @contextmanager
 def blamed(world: object, method: str, what: str) -> Iterator[None]:
-    """Context that converts an exception of a world's code into error S207: it cannot do `what`.
+    """Context that converts an exception of a world's code into error S207, "the world cannot …".
 
     Args:
         world: the world, or its class if the constructor is called.
         method: name of the method that is called in the context.
-        what: verb phrase for the message.
+        what: end of the message, such as "give a snapshot".
     """
     try:
         yield

@@ -180,8 +180,8 @@ class _Known:
 
     Attributes:
         agents: number of agents per seed in further simulations.
-        found: (seed, agent) -> whether the run satisfies the mission, and whether its safety requirements
-            (None if there are none).
+        found: (seed, agent) -> two verdicts on the run: whether it satisfies the mission, and whether it
+            satisfies the safety requirements (None if there are none).
         seeds: number of simulated seeds.
         cost: measured seconds per seed; 0 before the first seed.
         given_up: True if the guard is not simulated any more, because a seed takes too long.
@@ -286,8 +286,9 @@ class _Trial:
     def _more(self, mode: Mode) -> None:
         """Simulate further seeds under the guard `mode` and store their results.
 
-        Their number is that of the seeds before (at least 1), reduced if the remaining time does not suffice.
-        If the first seed takes too long, the number of agents is reduced.
+        The first call simulates one seed. Each later call simulates as many seeds as all calls before, or
+        fewer if the remaining time does not suffice. If the first seed takes too long, the number of agents
+        is reduced.
         """
         known = self.known[mode]
         count = 1

@@ -185,8 +185,8 @@ def decided(recording: DeploymentRecording) -> dict[str, float]:
 def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
     """Measure the time of single-agent decisions in random visited states, for a few seconds at most.
 
-    As in a deployment, each decision is given a previous plan, which is made in the preceding state; the time
-    of making it is not counted.
+    As in a deployment, the guard gets the remainder of a previous plan with each state. That plan is made
+    beforehand, in the preceding state; only the decision itself is timed.
     """
     rows, steps = recording.actions.shape[:2]
     picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)

@@ -91,10 +91,9 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
     """Form of a requirement for trajectories that begin with the mission.
 
-    An absolute operator (`always@[a, b]`, whose interval counts from the start of the mission) is compiled so
-    that its interval counts from the first sample. The requirement is then judged only once per trajectory. A
-    requirement without such operators is returned unchanged; for planning windows, which may begin later,
-    they are compiled differently.
+    The interval of an absolute operator (`always@[a, b]`) counts from the start of the mission. In the
+    returned form it counts from the first sample, so the requirement is judged only once per trajectory. A
+    requirement without absolute operators is returned unchanged.
     """
     if not rule.absolute:
         return rule

@@ -50,9 +50,9 @@ class Score:
         accuracy: share of states whose plan satisfies the specification (rho >= -1e-6 in float64).
         interval: 95 % Wilson interval of the accuracy.
         requirements: share of states whose plan satisfies a requirement, for each requirement.
-        feasible: share of states with a known satisfying plan, the policy's or one found by search; if only a
-            random sample of the failing states was searched, its share of solved states is assumed for the
-            others.
+        feasible: share of states with a known satisfying plan, from the policy or from a search. If only a
+            random sample of the failing states was searched, the share solved in this sample is assumed for
+            the other failing states.
         states: the held-out states, (n, dim), float64.
         rho: robustness of each plan, (n,).
         each: robustness per requirement, (n, requirements).
@@ -101,10 +101,10 @@ def score(
     """Judge a policy on held-out states (initial states that the training does not use).
 
     If the specification has timers, the held-out states also come from later instants of simulated missions.
-    Of the states whose plan fails, at most `MOST_SEARCHED` are searched for a satisfying plan, in random
-    order. A search starts from the policy's plan; if it fails, another one is independent of the policy (only
-    in native code, because it is slow otherwise), so that the feasible share hardly depends on how well the
-    policy is trained.
+    Where the policy's plan fails, a search looks for a satisfying one, from at most `MOST_SEARCHED` random
+    states. It starts from the policy's plan. If it fails, a second search is made that ignores the policy:
+    the feasible share should hardly depend on how well the policy is trained. The second search is slow in
+    torch, so it needs native code.
 
     Args:
         task: specification and system.
@@ -196,9 +196,9 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """Estimated share of feasible states.
+    """Estimated share of the states from which a satisfying plan exists.
 
-    A failing state that was not searched counts with the share of successful searches in the others.
+    Only some failing states were searched. The share of these that were solved is assumed for the others.
     """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried

@@ -25,7 +25,10 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """Results of one seed as masks: of plans (agents, steps), of trajectories (starts, agents).
+    """Results of one seed as masks.
+
+    Masks of plans are (agents, steps). Masks of trajectories are (starts, agents), with an entry per start
+    instant.
 
     Attributes:
         followed: whether the followed plan satisfies the specification.

@@ -71,16 +71,16 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Loss of a run: the instant after which, as far as known, a broken rule could no longer be obeyed.
+    """Loss of a run: the time since which no plan is known that obeys the broken rule, and the cause.
 
-    "A plan is known" means: the followed plan satisfies the specification of the plans (only its requirements
-    tagged `@safety` if a safety rule was broken), or a search finds a plan that does.
+    A plan is known if the followed plan satisfies the specification of the plans, or if a search finds a plan
+    that does. If a safety rule was broken, only the requirements tagged `@safety` have to be satisfied.
 
     Attributes:
         why: `start`: no plan is known from the first instant on. `told`: a plan was known until an exogenous
-            event (an obstacle came into view); none is known since. `later`: a plan was known, and none is
-            since, without such an event: the horizon of plans was too short, or the model is wrong. `missed`:
-            a plan was known, but another one was followed.
+            event (an obstacle came into view). `later`: a plan was known until an instant without such an
+            event: the horizon of plans was too short, or the model is wrong. `missed`: a plan was known, but
+            another one was followed.
         time: instant since which no plan is known, in seconds from the start; for `missed`, the last instant
             at which one was known.
     """
@@ -117,9 +117,9 @@ class RunVerdicts:
     Attributes:
         rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the runs that broke a rule, in the order of their rows.
-        viable: (rows,), mask of the runs that, as far as known, could have obeyed the rules: those that did,
-            those that were lost neither from the start nor by a later exogenous event, and the inconclusive
-            ones with a known safe plan from the start.
+        viable: (rows,), mask of the runs that could have obeyed the rules, as far as is known. A run that
+            obeyed them counts. A run that broke a rule counts unless it was lost from the start or by an
+            exogenous event. An inconclusive run counts if a safe plan from the start is known.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -314,10 +314,11 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
 ) -> Lost | None:
-    """Instant and cause from which a run could no longer obey the rule that it broke first; see `Lost`.
+    """Time and cause of the loss of a run, for the rule that it broke first; see `Lost`.
 
-    Only rules tagged `@safety` are considered if one of them is broken. None if the followed plans were good
-    until then, or if the cause is unknown. `viable`: whether a safe plan from the first state is known.
+    If a rule tagged `@safety` is broken, only rules with this tag are considered. None if the followed plans
+    were good until the rule was broken, or if the cause is unknown. `viable`: whether a safe plan from the
+    first state is known.
     """
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
@@ -395,12 +396,12 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
     """Return the entry `drives` of a guard in `eval/simulate.json`.
 
-    `count`: number of runs. `obeyed`: runs that satisfy every rule. `undecided`: inconclusive runs. `lost`:
-    runs that could not obey the rules (see `RunVerdicts.viable`); of these, `told` were lost by an exogenous
-    event after the start, the rest from the start. `rules`: the numbers of obeyed, broken and undecided runs
-    for each rule. `broken`: the runs that broke rules, each with the times of its violations (`rules`:
-    seconds from the start, null if unknown) and their `cause`: the instant since which no plan is known, and
-    the reason (see `Lost`).
+    `count`: number of runs. `obeyed`: number of runs that satisfy every rule. `undecided`: number of
+    inconclusive runs. `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
+    `told`: number of the lost runs that were lost by an exogenous event after the start; the others were lost
+    from the start. `rules`: for each rule, the numbers of obeyed, broken and undecided runs. `broken`: one
+    entry per run that broke rules; its `rules` are the times of the violations in seconds from the start
+    (null if unknown), and its `cause` is the time and the reason of the loss (see `Lost`).
     """
     obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {

@@ -100,12 +100,12 @@ class Candidates:
         return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
 
     def put(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite the plans of the agents with indices `rows`, (k,), by those of `other`, (k, …)."""
+        """Replace the plans of the agents with indices `rows`, (k,), by those of `other`, (k, …)."""
         for name in _FIELDS:
             getattr(self, name)[rows] = getattr(other, name)
 
     def improve(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite the plans of the agents with indices `rows`, (k,), where `other`, (k,), ranks higher."""
+        """Replace the plans of agents `rows`, (k,), by those of `other`, (k,), where these rank higher."""
         better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
         self.put(rows[better], other.of(better))
 
@@ -131,10 +131,15 @@ _FIELDS = tuple(each.name for each in fields(Candidates))
 def rank(plans: Candidates) -> Tensor:
     """Rank of plans, (…); larger is better.
 
-    The order, from best to worst: plans that satisfy phi, by robustness; safe plans that the policy continues
-    after a sampled prefix (they return to states on which it was trained); other safe plans; plans with the
-    longest safe prefix; other plans, by the smaller of the robustness of phi and that of phi_safe; plans that
-    were not judged.
+    The order, from best to worst:
+
+    1. plans that satisfy phi, by robustness
+    2. safe plans that the policy continues after a sampled prefix: they return to states on which it was
+       trained
+    3. other safe plans
+    4. plans chosen for the longest safe prefix
+    5. other plans, by the smaller of the robustness of phi and that of phi_safe
+    6. plans that were not judged
     """
     good, safe = plans.satisfies, plans.is_safe
     within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
@@ -191,8 +196,9 @@ class Limits:
         seconds: time limit of the guard "full" per agent; the best plan found until then is taken. None: no
             limit.
         tries: number of plans that a local search in the guard "full" judges per starting plan.
-        prefixes: maximum number of prefixes of one length in the stage "prefix shooting" of the guard "full",
-            which skips longer prefixes if there are more; it is used if no other stage found a safe plan.
+        prefixes: maximum number of prefixes of one length in the stage "prefix shooting" of the guard "full";
+            lengths with more prefixes are skipped. The stage runs only if no stage before it found a safe
+            plan.
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
         places: number of best plans of sampled shooting from which local searches start.

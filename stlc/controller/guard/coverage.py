@@ -1,8 +1,10 @@
-"""Probability that the backup policy finds a satisfying plan: Theorem 1 of Meng and Fan (2023), and exactly.
+"""Probability that the backup policy finds a satisfying plan: the paper's lower bound, and the exact value.
 
-Assumption: a prefix u* of T0 actions is uniformly distributed over the control ranges, and every prefix
-within `radius` of u*, in every control at every step, leads to satisfaction. The backup policy finds such a
-prefix if a grid point lies within `radius` of u* in every control at every step.
+The lower bound is Theorem 1 of Meng and Fan (2023). A prefix is a sequence of T0 actions, the first of a
+plan. It is assumed that every prefix near a certain prefix u* leads to a satisfying plan. u* is unknown, and
+uniformly distributed over the control ranges. A prefix is near u* if each of its controls differs from that
+of u* by at most `radius` at every step. The backup policy tries the prefixes of a grid; it finds a satisfying
+plan if one of these is near u*.
 """
 
 from __future__ import annotations
@@ -56,16 +58,18 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """Probabilities that a tried prefix of one length works (leads to a satisfying plan).
+    """Probability that the backup policy finds a satisfying plan, with prefixes of one length.
+
+    The assumptions, and the prefix u*, are explained at the top of the module.
 
     Attributes:
-        radius: largest distance from the satisfying prefix u* at which a prefix works, as a share of each
+        radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
             control's range.
         length: number of actions of a prefix, T0.
         candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
-        theorem: the paper's bound, min{1, product over controls and steps}.
-        bound: the same, but with each control's factor limited to 1. In the paper's product a factor may
-            exceed 1, because overlapping intervals of a control are counted more than once, so that the
+        theorem: the paper's bound: the product of a factor per control and step, at most 1.
+        bound: the same product, but with each control's factor limited to 1. In the paper's product a factor
+            may exceed 1, because overlapping intervals of a control are counted more than once, so that the
             product may exceed the exact probability.
         exact: exact probability under the same assumptions; for a sample of the prefixes, a lower bound.
         sampled: whether only a sample of the prefixes is tried.
@@ -87,11 +91,19 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 
 
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
-    """Compute the probabilities for one prefix length and one radius, a share of each control's range.
+    """Compute the probability that the backup policy finds a satisfying plan with prefixes of one length.
 
-    If the grid has M > `samples` prefixes, `samples` of them are drawn with replacement, so that each is
-    tried with probability 1 - (1 - 1 / M)^samples. The probabilities are multiplied by this number; as
-    several prefixes may work, the product is a lower bound.
+    The assumptions, and the prefix u*, are explained at the top of the module. If the grid has M > `samples`
+    prefixes, a sample of them is drawn with replacement. A certain prefix is then tried with probability 1 -
+    (1 - 1 / M)^samples; `bound` and `exact` are multiplied by this number. Both are then lower bounds, since
+    several prefixes may lead to a satisfying plan.
+
+    Args:
+        axes: the controls with their grid values.
+        radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
+            control's range.
+        length: number of actions of a prefix, T0.
+        samples: maximum number of prefixes that are tried; None: all.
     """
     radii = [radius * (axis.high - axis.low) for axis in axes]
     bounds = [axis.bound(each) for axis, each in zip(axes, radii, strict=True)]
@@ -112,6 +124,9 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
 
 
 def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
-    """Probabilities for all radii (as shares of the control ranges) and all prefix lengths of the grid."""
+    """Probability that the backup policy finds a satisfying plan, for each prefix length and each radius.
+
+    The lengths are those of the grid. The radii are shares of the control ranges.
+    """
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

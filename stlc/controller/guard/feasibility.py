@@ -50,7 +50,8 @@ def solve(
         task: specification and system.
         x0: states, (B, n).
         start: starting plans, (B, T, m); the middle of every control range if None.
-        library: plans of which the search also inserts parts, (k, T, m); those of `extremes` if None.
+        library: plans for later passes, (k, T, m); the search also copies parts of them into other plans.
+            None: those of `extremes`.
         passes: maximum number of passes.
         tries: number of plans judged per pass and state.
         generator: random numbers of the search; a generator with seed 0 if None.

@@ -50,10 +50,10 @@ class GuardDecision:
     proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> GuardDecision:
-        """The decision for the instant `steps` steps later: the remainders of the plans.
+        """Decision for the instant `steps` steps later: the remainders of the plans.
 
-        `steps`: one number for all agents, or (agents,). The last action of a plan is held to its full
-        length.
+        `steps`: one number for all agents, or (agents,). A remainder is extended to T steps by repeating its
+        last action.
         """
         agents, length, controls = self.plan.shape
         ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)

@@ -1,10 +1,10 @@
 """Robustness margins of guards: requests on the command line, calibration, tightened tasks.
 
-A guard accepts a plan that is safe by the model. When it judges the plan again, the true dynamics and the
-true initial state have reduced the plan's robustness. If the margin was larger than this loss, the remainder
-of the plan is still safe by the model, so a safe plan exists. Calibration measures the loss: the policy's
-plans from training states are executed on the scenario's true dynamics until the guard judges again, and
-their rest on the model.
+A guard accepts a plan that is safe by the model. Until it judges the rest of the plan, the plan loses
+robustness, because the true dynamics and the true initial state differ from those of the model. If the margin
+is larger than this loss, the rest is still safe by the model, so a safe plan exists. Calibration measures the
+loss of the policy's plans from training states: the first steps of each plan, until the guard judges again,
+are simulated with the scenario's true dynamics, the other steps with the model.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
-    """The task with tightened safety requirements: the robustness of each is reduced by its margin.
+    """Task with tightened safety requirements: the robustness of each is reduced by its margin.
 
-    Predicates on time and constants, which decide truth but do not bound the robustness, are unchanged.
+    Predicates on time and constants are unchanged: they decide truth, but their values are never the
+    robustness.
     """
     if not any(margin.values()):
         return task

@@ -17,12 +17,11 @@ BEYOND = "#beyond"
 
 
 def open_ended(formula: ir.Formula) -> ir.Formula:
-    """The formula as an upper bound: predicates are true at samples where the column `BEYOND` is positive.
+    """Formula whose robustness is an upper bound over all continuations of the known samples.
 
-    `BEYOND` must be positive at all samples after the known ones. As the formula is in negation normal form,
-    a predicate that becomes true never decreases the robustness; so the result is the upper bound on the
-    robustness over all continuations of the known samples. It is negative exactly if the known samples
-    already violate the formula.
+    The column `BEYOND` must be positive at all samples after the known ones; there, every predicate is made
+    true. The formula must be in negation normal form, so that this never decreases the robustness. The bound
+    is negative exactly if the known samples already violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -30,10 +29,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """The formula in which predicates on the initial state decide truth but do not bound the robustness.
+    """Formula in which predicates on the initial state decide truth, but never give the robustness.
 
-    All plans have the same initial state. In `a -> always b`, where a depends on it alone, plans that violate
-    the formula are therefore compared by their violation of b, not by the robustness of a.
+    Example: in `a -> always b`, let `a` depend on the initial state alone. It is then the same for all plans.
+    So plans that violate the formula are compared by their violation of `b`, not by the robustness of `a`.
     """
     match formula:
         case ir.Predicate():

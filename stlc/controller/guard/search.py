@@ -78,8 +78,9 @@ class StagedSearch:
 class RelaxedSearch:
     """Search of the guard "full" with robustness margins of safety requirements.
 
-    If no plan has the margins, the safe plan with the largest margin is taken. It is better than a prefix
-    that has the full margin for some steps and is then unsafe: a rover beside a wall can stay there.
+    If no plan has the margins, the safe plan with the largest margin is taken. The alternative is a plan that
+    has the full margin for some steps and is then unsafe. It would be worse: a rover beside a wall can stay
+    there.
 
     Args:
         task: specification without margins, and system.
@@ -111,10 +112,9 @@ class RelaxedSearch:
             previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan per agent: the best plan of the stages, or if it lacks the margin, the safe plan with the
-            largest margin that was found. If the present state itself lacks the margin, so does every plan;
-            the stages then search without margin, and a search for the largest margin starts from their
-            plans.
+            One plan per agent. It is the best plan of the stages, if this has the margin, else the safe plan
+            with the largest margin found. If the present state itself lacks the margin, no plan has it: the
+            stages search without margin, and a search for the largest margin starts from their plans.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -136,9 +136,10 @@ class RelaxedSearch:
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """Plans of the stages without margins for the agents `lacking` the margin, moved towards the margin.
+        """Plans of the stages, run without margins, for agents whose present state lacks the margin.
 
-        The other agents get unjudged plans. `lacking`: (agents,).
+        A search for the largest margin then starts from those plans that are safe. All other agents get
+        unjudged plans. `lacking`: mask of the agents, (agents,).
         """
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]

@@ -87,8 +87,8 @@ class Validation:
             last search; None if no search has ended.
         failing: number of states from which the last search started; 0 without a search.
         repaired: number of states for which the last search found a satisfying plan.
-        explored: number of plans that exploration (search over plan prefixes) has found since the validation
-            before; remainders of a plan from states that it passes are counted too.
+        explored: number of plans that exploration (search over plan prefixes) has found since the previous
+            validation. The remainders of a plan, from states that it passes, count as further plans.
     """
 
     accuracy: float

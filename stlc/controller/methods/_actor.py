@@ -98,7 +98,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restore an optimiser from the tensors of `optimizer_tensors`, given under names without `prefix.`."""
+    """Restore an optimiser from what `optimizer_tensors` returned, with the prefix removed from the names."""
     layout = optimizer.state_dict()
     for key, value in tensors.items():
         index, name = key.split(".")

@@ -1,9 +1,9 @@
 """Ensemble of probabilistic networks: a model of one step of a system, learnt from observed transitions.
 
-Networks, their loss and their bounded variances are those of Chua, Calandra, McAllister and Levine, "Deep
+The networks, their loss and their bounded variances follow Chua, Calandra, McAllister and Levine, "Deep
 reinforcement learning in a handful of trials using probabilistic dynamics models" (NeurIPS 2018), Section 4
-and Appendix A.1; training until the error on validation data stops falling, and the selection of the best
-networks, those of Janner, Fu, Zhang and Levine, "When to trust your model" (NeurIPS 2019).
+and Appendix A.1. The training ends when the error on validation data stops falling, and then the best
+networks are selected; both follow Janner, Fu, Zhang and Levine, "When to trust your model" (NeurIPS 2019).
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from what `tensors` returned, given under names without `episodes.`."""
+        """Restore the episodes from what `tensors` returned, with `episodes.` removed from the names."""
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
             getattr(self, name)[: self.count] = tensors[name]

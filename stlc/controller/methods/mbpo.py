@@ -242,7 +242,10 @@ class MbpoLearner(ModelLearner):
         return earned
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly; no step uses the imagined transitions of another."""
+        """Tensors from which training resumes exactly.
+
+        Imagined transitions are not among them, because every training step imagines new ones.
+        """
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:

@@ -7,7 +7,7 @@ controls that are constant over a few steps.
 
 The settings of Meng and Fan (2023) for their comparison: `--reward task`, and the options `ahead=5 piece=1
 population=350 rounds=5 particles=20 model_lr=7.5e-4 model_decay=3e-5 model_held=0 model_epochs=25 growth=0
-environments=10`; at run time they reduce it to `ahead=3 particles=3`.
+environments=10`. For the deployment of the policy they use `ahead=3 particles=3`.
 """
 
 from __future__ import annotations
@@ -54,9 +54,10 @@ class PetsConfig(ModelConfig):
     """Options of PETS.
 
     Attributes:
-        ahead: number of steps that a search covers. 0: one search covers the whole plan, as always for
-            rewards other than `task`, which need a whole episode. Otherwise a search is made for every step
-            of the plan, and only the first control of its result is used.
+        ahead: number of steps that a search covers; 0: one search covers the whole plan. If it is positive, a
+            search is made for every step of the plan, and only the first control of its result is used. It
+            has no effect with rewards other than `task`: these need a whole episode, so one search covers the
+            whole plan.
         piece: number of steps over which a control is constant.
         population: number of control sequences in a round.
         rounds: number of rounds of the cross-entropy method.
@@ -112,8 +113,9 @@ class PetsPolicy(Policy):
     def sequence(self, x0: Tensor, generator: torch.Generator) -> Tensor:
         """Search for plans from states: (B, n) -> (B, T, m).
 
-        With `config.ahead` 0 one search finds the whole plan. Otherwise each step has its search, of which
-        the first control is used; the model of the system, not the learnt one, computes the next state.
+        If `config.ahead` is 0, one search finds the whole plan. Otherwise a search is made for each step, and
+        the first control of its result is used. The state after this step is computed by the model of the
+        system, not by the learnt one.
         """
         if not self._config.ahead or self._reward != "task":
             return self._optimised(x0, self.task.horizon, generator)
@@ -207,7 +209,7 @@ class PetsPolicy(Policy):
 
 
 class PetsLearner(ModelLearner):
-    """Training by PETS: the ensemble learns from episodes under the plans that a search with it finds."""
+    """Training by PETS: a search with the ensemble finds plans; the ensemble learns from their episodes."""
 
     config: PetsConfig
 

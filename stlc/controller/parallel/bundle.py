@@ -80,7 +80,10 @@ class JobBundle:
         return all(Path(path).exists() for path in seen)
 
     def close(self) -> None:
-        """Delete the probe file, which also asks a worker that shares the file system to save and stop."""
+        """Delete the probe file.
+
+        For a worker that shares the file system, this is the request to save and stop.
+        """
         with suppress(OSError):
             Path(self.probe).unlink(missing_ok=True)
 

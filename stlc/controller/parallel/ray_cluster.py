@@ -43,7 +43,7 @@ class RayExecutor:
         """Run jobs, store their runs in the jobs' folders, and yield the result of each when it ends.
 
         When the caller is interrupted or closes the iterator, running jobs are asked to save and stop, and
-        the runs that they save are stored, too.
+        the runs that they save are stored in the same way.
 
         Raises:
             MissingError: R301, Ray is not installed; R302, there is no such cluster.

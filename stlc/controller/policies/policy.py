@@ -61,7 +61,8 @@ class Policy(ABC):
     def continuation(self, x0: Tensor) -> Tensor:
         """Plans from the states at the ends of many prefixes (first actions of plans): (B, n) -> (B, T, m).
 
-        They are those of `plan`, or, if this is slow, plans that are cheaper to compute.
+        By default these are the plans of `plan`. A policy whose `plan` is slow returns plans that are cheaper
+        to compute.
         """
         return self.plan(x0)
 
@@ -140,8 +141,8 @@ class PlanNetwork(nn.Module):
     def normalise(self, x0: Tensor) -> None:
         """Set `centre` and `spread` to mean and standard deviation of the observations of states (n, dim).
 
-        For timers, both are computed from the range of the timer, because early in the training missions end
-        soon, and late times do not occur in the states.
+        For timers, both are computed from the range of the timer. The states would give too small values:
+        early in the training, missions end soon, so late times do not occur.
         """
         observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)

@@ -165,7 +165,7 @@ class NativeGradient:
         return None if library is None else cls(judge, Adjoint(library))
 
     def __call__(self, x0: Tensor, u: Tensor, *, slope: float) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """Robustness per requirement (B, R), and states name -> (T+1, B), differentiable by `u`.
+        """Robustness per requirement (B, R), and states name -> (T+1, B), differentiable with respect to `u`.
 
         Args:
             x0: initial states, (B, n), not differentiated.

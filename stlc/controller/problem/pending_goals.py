@@ -3,10 +3,10 @@
 A goal is a requirement `eventually@[a, b]`, whose times count from the start of the mission. It is pending
 while it is neither satisfied nor violated.
 
-A goal such as `eventually@[0 s, 18 s] [x, y] in b` is reached at the first sample that satisfies it, with
-almost no margin; from then on the guidance cost (distance to the next goal) draws plans away. Therefore plans
-that reach a pending goal are compared by their margin, up to gamma, and a previous plan that reaches it is
-retained while its margin increases.
+Example: the goal `eventually@[0 s, 18 s] [x, y] in b`. The first sample that satisfies it has almost no
+margin. From then on, the guidance cost (distance to the next goal) would draw plans away from the goal.
+Therefore plans that reach a pending goal are compared by their margin, up to gamma. A previous plan that
+reaches the goal is retained while its margin increases.
 """
 
 from __future__ import annotations
@@ -72,12 +72,13 @@ class PendingGoals:
         self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Sum over pending goals of gamma less the margin that a plan reaches, at least 0: (batch,).
+        """Margin that a plan lacks, summed over the goals that are pending at the first sample: (batch,).
 
-        The goals are those that are pending at the first sample.
+        At one goal, a plan lacks gamma minus the margin that it reaches, limited to values from 0 to gamma.
 
         Args:
-            columns: predicted states, name -> (time, batch); the result is differentiable by them.
+            columns: predicted states, name -> (time, batch); the result is differentiable with respect to
+                them.
         """
         clock = columns[self.clock]
         lack = torch.zeros_like(clock[0])

@@ -90,7 +90,7 @@ class Task:
     Attributes:
         compiled: the specification in discrete time, with the timers and parameters that it adds to the
             state.
-        plain: the system of the system file, without them.
+        plain: the system of the system file, without these timers and parameters.
         system: the system whose last states are the timers and parameters of the specification.
         graph: function that computes the robustness of the whole specification.
         safety: function that computes the robustness of phi_safe (the requirements tagged `@safety`).
@@ -194,7 +194,10 @@ class Task:
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
-        """Native kernel for robustness and states, differentiable by the plans; None: torch is used."""
+        """Native kernel for robustness and states, differentiable with respect to the plans.
+
+        None: torch is used.
+        """
         return NativeGradient.of(self.system, self.rules, self.native)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
@@ -273,9 +276,10 @@ class Task:
     def cost(self, judged: PlanVerdicts) -> Tensor:
         """Cost by which satisfying plans are compared, without gradient: (batch,).
 
-        It consists of the performance terms, and in a mission (a specification that adds timers to the state)
-        also of the amount by which robustness is below gamma. Otherwise the guidance cost (distance to the
-        next goal), one of the performance terms, would draw plans to the boundary of the constraints.
+        It is the sum of the performance terms. In a mission (a specification that adds timers to the state),
+        a term is added: the amount by which the robustness is below gamma, times a weight. Without it, the
+        guidance cost (distance to the next goal), one of the performance terms, would draw plans to the
+        boundary of the constraints.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)

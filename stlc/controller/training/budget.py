@@ -101,14 +101,14 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Budget of which the training may use what other work leaves, but at least half.
+        """Make the budget of a training; the training may use what other work leaves, but at least half.
 
         Args:
             now: function that reads the clock, in seconds.
             started: clock reading at the start.
             allowed: the user's budget in seconds; 0: unlimited.
-            late: function from the budget to the seconds by which the command as a whole is predicted to
-                exceed it, because of other work such as loading; None: by nothing.
+            late: function that predicts, for a budget, by how many seconds the whole command would exceed it,
+                because of other work such as loading. None: by 0 s.
         """
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))

@@ -95,9 +95,9 @@ class TrainConfig:
 class ResolvedConfig:
     """Resolved options of a run.
 
-    Fresh states are newly drawn initial states; hard states are those from which the policy's plans failed.
-    A search round (validation) judges the policy's plans from fresh states, and starts a search for plans
-    where they fail.
+    Fresh states are newly drawn initial states; hard states are those from which the policy's plans failed. A
+    search round (validation) judges the policy's plans from fresh states, and starts a search for plans where
+    they fail.
 
     Attributes:
         method: name of the method.
@@ -105,20 +105,21 @@ class ResolvedConfig:
         hidden: widths of the network's hidden layers.
         plans: number of plans that the network proposes per state.
         batch: number of fresh states per step.
-        hard: number of hard states per step, for which the search has found a plan; 0 until it has.
+        hard: number of hard states per step. Only states are used for which the search has found a plan;
+            there are none at first.
         lr: peak learning rate.
         warmup: share of the steps over which the learning rate rises if `hold` is 0.
-        hold: share of the steps at the peak learning rate; if it is positive, the learning rate rises over a
-            fixed number of steps before.
+        hold: share of the steps at the peak learning rate. If it is positive, the rise to the peak takes a
+            fixed number of steps.
         clip: bound on the norm of the gradient.
         average: decay of the moving average of the weights.
         pool: number of fresh states judged per search round.
         every: steps between search rounds.
         most: maximum number of hard states from which a search round searches.
         slope: slope, per unit, that replaces the derivative of jumps and conditions of the system.
-        imitation: weight in the loss of the distance to the plan that the search found.
-        share: weight in the loss of the mean loss of all plans of a state, added to that of its best plan.
-        performance: weight in the loss of the performance terms.
+        imitation: weight of the imitation loss, the distance to the plan that the search found.
+        share: weight of the mean loss of all plans of a state; it is added to the loss of the best plan.
+        performance: weight of the performance terms in the loss.
         held_out: number of initial states of the final evaluation, on which no policy is trained.
         threads: number of threads of torch, on which the rounding of sums depends; 0: not changed.
         samples: size of a fixed training set; 0: fresh states in every step.

@@ -4,9 +4,9 @@ It finds a declared mirror symmetry that the system lacks, a non-finite quantity
 requirement that no plan satisfies.
 
 A training step computes network -> plans -> states -> robustness of each requirement and performance terms ->
-gradient; the first of these that is not finite is reported. A search that finds no plan does not prove that
-there is none, but bounds do: interval arithmetic over all plans encloses the states that are reachable within
-the horizon, and so bounds the robustness of a requirement from above.
+gradient; the first of these that is not finite is reported. If a search finds no plan, this does not prove
+that there is none. Bounds can prove it: interval arithmetic over all plans encloses the states that are
+reachable within the horizon. From these states follows an upper bound on the robustness of a requirement.
 """
 
 from __future__ import annotations
@@ -185,7 +185,10 @@ def _cost(step: TrainingStep) -> StlcError | None:
 
 
 def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness per requirement (B, R), states name -> (T+1, B); differentiable by `u` as in training."""
+    """Robustness per requirement (B, R), and states name -> (T+1, B).
+
+    Both are differentiable with respect to `u`, in the same way as in training.
+    """
     native = native_rolled(step.task, step.objective, step.x0, u)
     if native is not None:
         return native
@@ -195,7 +198,7 @@ def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Values `value_of` of the plans, (B,), and their gradients by the plans, (B, T, m)."""
+    """Values `value_of` of the plans, (B,), and their gradients with respect to the plans, (B, T, m)."""
     u = step.u.detach().requires_grad_()
     value = value_of(u)
     if not value.requires_grad:
@@ -249,8 +252,9 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     """Diagnostic R404, which names requirements that no plan was found to satisfy together.
 
     If bounds prove for a requirement that no plan satisfies it, the first such requirement is named.
-    Otherwise each requirement is removed if no plan is found for the others either, until `enough` returns
-    True; those that remain are named.
+    Otherwise the requirements are tested in turn: a requirement is removed if no plan is found for the
+    remaining ones without it. Those that are left in the end are named. The tests end once `enough` returns
+    True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:

@@ -4,9 +4,9 @@ Local search changes whole plans; where many goals have to be reached in order, 
 more without losing others. Therefore plans are built from prefixes here. For every prefix, bounds over all
 continuations show which parts of the specification every continuation violates, which every continuation
 satisfies, and which are open. Prefixes with a violated part are dropped. The others form layers, one per
-length; a layer holds the best prefix per cell, a combination of satisfied parts and region of the state
-space. Advanced prefixes and those in rarely visited cells are extended first (Ecoffet et al. 2021, "First
-return, then explore").
+length. Two prefixes of a layer are in the same cell if they satisfy the same parts and end in the same region
+of the state space. A layer keeps only the best prefix of each cell. Advanced prefixes and those in rarely
+visited cells are extended first (Ecoffet et al. 2021, "First return, then explore").
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class Layer:
         states: predicted trajectories, (rows, steps + 1, n).
         plans: controls, (rows, steps, m).
         met: whether every continuation of a prefix satisfies a piece, (rows, pieces).
-        kind: for each prefix the satisfied pieces and the cells of the timers, as whole numbers,
-            (rows, entries); prefixes with equal rows are of the same kind.
+        kind: whole numbers that describe each prefix, (rows, entries): its satisfied pieces, and the rounded
+            values of its timers. Prefixes with equal rows are of the same kind.
         worth: sum of the lower bounds on the robustness of undecided pieces, (rows,).
         visits: number of times that each prefix was extended, (rows,).
     """
@@ -227,10 +227,10 @@ class Exploration:
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
     def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """The initial state with its plan, and states that it passes with the remainder of the plan.
+        """Initial states with plans: `x` with its plan, and states on the way with remainders of the plan.
 
-        Only states whose plan satisfies the specification are returned. Remainders are extended to T steps by
-        repeating their last control.
+        Only pairs are returned in which the plan satisfies the specification. Remainders are extended to T
+        steps by repeating their last control.
         """
         states, plans = [x], [plan]
         if self.task.compiled.timers:
@@ -318,8 +318,9 @@ class Exploration:
     def _drawn(self, plans: Numbers, more: int, random: np.random.Generator) -> Numbers:
         """Draw the controls of the next `more` steps after prefixes, (rows, more, m).
 
-        Each row is of one of four kinds: constant random levels, constant controls at the low end, middle or
-        high end of their ranges, the last control with a constant change, or independent random values.
+        Each row is of one of four kinds: constant random levels; constant controls at the low end, middle or
+        high end of their ranges; the last controls of the prefix plus a random constant; independent random
+        values.
         """
         rows, steps, controls = plans.shape
         span, shape = self._high - self._low, (rows, 1, controls)
@@ -334,9 +335,10 @@ class Exploration:
         return drawn
 
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Keep the prefix of greatest worth per cell, and of these at most `KEPT`.
+        """Keep the prefix of greatest worth in each cell, and of these at most `KEPT`.
 
-        If there are more, some are drawn at random, such that all kinds have about equal shares.
+        If there are more, `KEPT` of them are drawn at random, such that all kinds (see `Layer.kind`) have
+        about equal shares.
         """
         if not len(layer):
             return layer

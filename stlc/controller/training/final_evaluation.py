@@ -127,7 +127,10 @@ class FinalEvaluation:
 
     @property
     def _verdict_seconds(self) -> float:
-        """Seconds left for the evaluation on held-out states; without budget a share of the training time."""
+        """Seconds left for the evaluation on held-out states.
+
+        Without a budget, this is a share of the training time.
+        """
         spent = self.trained - self.time.started
         if not self.time.allowed:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)

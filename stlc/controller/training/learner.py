@@ -299,9 +299,11 @@ class Trainer(Learner):
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
-        """Weighted mean of squared distances from plans that a search found to the nearest proposed plans.
+        """Imitation loss of the states for which a search has found a plan, ().
 
-        States for which the network already proposes a satisfying plan count as 0.
+        The loss of a state is the squared distance from the plan found to the nearest proposed plan. It is 0
+        if the network already proposes a satisfying plan. The result is the mean over the states, times the
+        weight `config.imitation`.
 
         Args:
             plans: proposed plans, (k, plans, T, m).
@@ -313,10 +315,10 @@ class Trainer(Learner):
         return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
-        """Margin gamma of the loss that is within reach: a share of the median robustness of search results.
+        """Margin gamma for the loss, such that plans can reach it.
 
-        The search starts from random states; only satisfying plans count. The margin is within
-        `MARGIN_RANGE`.
+        A search looks for plans from random states. The margin is a share of the median robustness of those
+        that satisfy the specification, clipped to `MARGIN_RANGE`.
         """
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
@@ -423,7 +425,10 @@ class Trainer(Learner):
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """Tensors and numbers of a checkpoint for this rank, with its own entries in place of the first's."""
+        """Tensors and numbers of a checkpoint for this rank (process).
+
+        Some entries differ between the ranks. For these, the entries of this rank are returned.
+        """
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")

@@ -74,8 +74,8 @@ class Watch:
         stop: called after every step; True saves and ends the training.
         deferring: context manager around the steps, in which an interrupt is deferred until the step is
             finished and saved; outside of it an interrupt may be raised anywhere.
-        late: function from the budget of wall time to the seconds by which the command as a whole is
-            predicted to exceed it, because of other work such as loading.
+        late: function that predicts, for a budget of wall time, by how many seconds the whole command would
+            exceed it, because of other work such as loading.
         evaluating: called with the progress of the final evaluation, as a short text.
     """
 
@@ -367,7 +367,11 @@ class _Session:
         self.writer.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
     def _validate(self, began: float) -> None:
-        """Validate and write a row of `train.jsonl`; `began` is the clock reading before an exploration."""
+        """Validate and write a row of `train.jsonl`.
+
+        `began`: clock reading before the exploration that preceded the validation; the recorded duration
+        begins there.
+        """
         learner = self.learner
         found = learner.validate()
         self.pace.validated(learner.step, self.now() - began)
@@ -388,8 +392,8 @@ class _Session:
     def _hopeless(self) -> bool:
         """True if no satisfying plan was ever found, and further search is useless.
 
-        Search is useless if no plan exists, as bounds proved, or if exploration with the largest effort and
-        enough steps have found none.
+        Search is useless in two cases: bounds prove that no plan exists; or enough steps have been made, and
+        exploration with the largest effort has found none.
         """
         learner = self.learner
         enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
@@ -406,7 +410,10 @@ class _Session:
         )
 
     def _save(self) -> None:
-        """Write a checkpoint, which of a running search holds the inputs."""
+        """Write a checkpoint.
+
+        If a search is running, its inputs are saved, not its result.
+        """
         began = self.now()
         facts = {
             **self.learner.facts(),

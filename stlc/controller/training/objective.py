@@ -93,9 +93,10 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
 def native_rolled(
     task: Task, objective: Objective, x0: Tensor, u: Tensor
 ) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Robustness per requirement (B, R), and states name -> (T+1, B), computed in C, differentiable by `u`.
+    """Robustness per requirement (B, R), and states name -> (T+1, B), computed in C.
 
-    None if there is no native kernel for the objective (smooth robustness), the task or the device.
+    Both are differentiable with respect to `u`. None if there is no native kernel for the objective (smooth
+    robustness), the task or the device.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
@@ -105,7 +106,10 @@ def native_rolled(
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states name -> (T+1, B), differentiable by `u`; in C if possible, else torch."""
+    """Robustness (B,), and states name -> (T+1, B), computed in C if possible, else in torch.
+
+    Both are differentiable with respect to `u`.
+    """
     native = native_rolled(task, objective, x0, u)
     if native is not None:
         return task.graph.overall(native[0]), native[1]

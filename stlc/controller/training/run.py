@@ -62,7 +62,9 @@ class Run:
         overrides: Mapping[str, str] | None = None,
         scenario: str | None = None,
     ) -> Run:
-        """Load a run with its policy, which `overrides` and `scenario` do not change.
+        """Load a run with its policy.
+
+        `overrides` and `scenario` change the task, but not the policy.
 
         Args:
             where: folder, name or number of the run, or `latest`.
@@ -159,8 +161,8 @@ def load_task(
 
     Args:
         folder: folder of the run, whose own `--set` changes are applied first.
-        overrides: further changes, name -> text. A parameter that varied in training remains an entry of the
-            state, which the policy observes, with the value given here.
+        overrides: further changes, name -> text. A parameter that varied in training gets the given value. It
+            remains an entry of the state, because the policy observes it.
         scenario: name of a scenario of the system file to apply.
     """
     trained = folder.record().get("overrides") or {}
@@ -187,9 +189,10 @@ def system_hash(folder: RunDir) -> str:
 def trained_on(folder: RunDir) -> str:
     """Hash of the system file to compare with the one that a run's checkpoint holds.
 
-    It is the hash of the system file at the start of the training if the file in the run's folder was edited
-    since, but only in fields that do not affect what a policy learns (worlds, scenarios, backup). Otherwise
-    it is the hash of the present file; after any other edit the checkpoint is refused.
+    The file in the run's folder may have been edited since the start of the training. If the edits are only
+    in fields that do not affect what a policy learns (worlds, scenarios, backup), the hash at the start of
+    the training is returned, so that the checkpoint is accepted. After any other edit the hash of the present
+    file is returned, so that the checkpoint is refused.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")

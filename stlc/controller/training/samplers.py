@@ -2,9 +2,9 @@
 
 If a specification has memory (the time of the mission, satisfied goals, timers), only states that a mission
 reaches are useful for training, because the memory must fit the position. Therefore a pool of missions is
-simulated with the plans of the present policy, and the states on the way are returned. A new mission starts
-in place of one that is over, that can no longer satisfy the specification, or, often, at a state from which
-no satisfying plan is found. Early in training missions end soon; later they get further, and plans that
+simulated with the plans of the present policy, and the states on the way are returned. A mission is replaced
+by a new one if it is over or can no longer satisfy the specification, and often if no satisfying plan is
+found from its present state. Early in training missions end soon; later they get further, and plans that
 search found for failing states continue some of them.
 """
 
@@ -213,8 +213,8 @@ class Missions(Supply):
 def mission_steps(task: Task) -> int:
     """Number of steps for which a mission is simulated.
 
-    It ends one horizon after the last time that the specification names, or after four horizons if the
-    specification names none. If requirements recur forever, `ROUNDS` periods follow the last time instead.
+    If the specification names no times, it ends after four horizons. Otherwise it ends one horizon after the
+    last time named. If requirements recur forever, it ends `ROUNDS` periods after that time instead.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:

@@ -181,10 +181,10 @@ class GradientAscent:
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        """Scaled robustness per requirement, (rows, R), and a function for its gradient by the plans.
+        """Scaled robustness per requirement, (rows, R), and a function for its gradient.
 
         A robustness of NaN becomes -inf. The function maps weights (rows, R) to the gradient of the weighted
-        sum of the robustness values (vector-Jacobian product), (rows, T, m).
+        sum of the robustness values with respect to the plans (vector-Jacobian product), (rows, T, m).
         """
         if self._native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
@@ -225,9 +225,10 @@ class GradientAscent:
         return changed.reshape(agents, -1, *shape)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
-        """Random perturbations of plans, (count, T, m): constant or white over a random interval of time.
+        """Random perturbations of plans, (count, T, m).
 
-        The first perturbation is zero.
+        Each changes its plan in a random interval of time, either by a constant or by white noise. The first
+        perturbation is zero.
         """
         steps, controls = self.task.horizon, len(self._low)
         begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()

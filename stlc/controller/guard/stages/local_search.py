@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 class LocalSearch(GuardStage):
     """Guard stage: local search for a plan that satisfies the specification.
 
-    From an unsafe result, a second search is for the requirements tagged `@safety` alone.
+    If the result is unsafe, a second search starts from it, with the requirements tagged `@safety` as its
+    only specification.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"full": 20}
@@ -38,7 +39,10 @@ class LocalSearch(GuardStage):
         return best.rho < self.whole.enough
 
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
-        """The best of each agent's present plan and the results of local searches from all starting plans."""
+        """Return the best plan of each agent: its present plan, or the result of a local search.
+
+        One local search begins at each starting plan of the agent.
+        """
         x, found = rejected.x[rows], rejected.best.of(rows)
         every = torch.arange(len(rows), device=rows.device)
         found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 
 class LongestSafePrefix(GuardStage):
-    """Guard stage: the plan with the longest safe prefix; among equal ones, that of highest robustness.
+    """Guard stage: the plan with the longest safe prefix.
 
-    Equal robustness is decided by the latest violation.
+    Of plans with equally long safe prefixes, the one of highest robustness is taken. Of plans with equal
+    robustness, the one with the latest violation is taken.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}

@@ -1,10 +1,11 @@
 """Prefix shooting: sampled prefixes, continued by the policy (the paper, section "MPC-based Deployment").
 
-For T0 = 1, 2, … every sequence of T0 actions on a grid of L values per control, M = L^(m T0), or a random
-sample of them if these are too many, is applied from the present state, and the policy plans from its end.
-The first T0 with a plan that satisfies the specification, or else the requirements tagged `@safety`, is
-chosen. One addition to the paper (decision record 37 in `docs/decisions`): the remainder of the previous plan
-is a candidate too, so that a safe plan is not lost after its first action.
+The lengths T0 = 1, 2, … are tried in turn. The prefixes of a length are all sequences of T0 actions on a grid
+of L values per control; these are M = L^(m T0), or a random sample if M is too large. Each prefix is applied
+from the present state, and the policy plans from its end. The first T0 is chosen at which a plan satisfies
+the specification, or at least the requirements tagged `@safety`. One addition to the paper (decision record
+37 in `docs/decisions`): the remainder of the previous plan is a candidate too, so that a safe plan is not
+lost after its first action.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ HANDED_ON = 65_536
 class PrefixShooting(GuardStage):
     """Guard stage: the plan with the shortest prefix after which the policy can satisfy the specification.
 
-    If no prefix of a length leads to such a plan, a safe plan is accepted. Among the plans of the shortest
-    such length the order is by robustness, then by the performance cost of the objective (because robustness
-    does not differ where a deadline cannot be met), then by closeness to the policy's plan.
+    If no plan with a prefix of some length satisfies the specification, a safe plan with such a prefix is
+    accepted. Plans with prefixes of equal length are ordered by robustness, then by the performance cost of
+    the objective, then by closeness to the policy's plan. The cost matters where a deadline cannot be met:
+    there, all plans have the same robustness.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}

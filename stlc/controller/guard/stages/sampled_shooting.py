@@ -94,7 +94,10 @@ class SampledShooting(GuardStage):
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan per agent; instead of an unsafe one an unjudged one, which replaces nothing."""
+        """The best plan of each agent, if it is safe.
+
+        An agent without a safe plan gets an unjudged one, which does not replace its present plan.
+        """
         found = Candidates.unjudged(rejected.plan[rows])
         if deadline.over:
             return found

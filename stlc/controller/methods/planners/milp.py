@@ -48,8 +48,8 @@ class Milp:
     Attributes:
         gap: relative optimality gap at which the maximisation of robustness ends.
         prove: whether to solve the second program.
-        tries: number of plans that a local search tries for each initial state before; a program is solved
-            where these miss the target. 0: no search.
+        tries: number of plans that a local search tries first, for each initial state. A program is solved
+            only where these miss the target. 0: no local search.
     """
 
     gap: float = 1e-3
@@ -157,7 +157,8 @@ class _Goal:
 
     Attributes:
         target: this robustness; inf to maximise it.
-        known: robustness of a known plan, below which no plan is of interest when it is maximised.
+        known: robustness of a plan that is already known. If the robustness is maximised, only plans that
+            reach at least this value are of interest.
     """
 
     target: float
@@ -166,9 +167,10 @@ class _Goal:
 
 @dataclass(frozen=True, slots=True)
 class _Limit:
-    """Condition that ends a solve. HiGHS' own time limit is elapsed time, which depends on other programs.
+    """Condition that ends a solve: the budget of processor time is spent, or the whole search ends.
 
-    HiGHS does not ask within its sub-programs, so that a solve may end some tenths of a second late.
+    The time limit of HiGHS itself is not used: it is elapsed time, which depends on other programs. HiGHS
+    does not check the condition within its sub-programs, so a solve may end some tenths of a second late.
 
     Attributes:
         until: end of the budget on the clock of processor time.
@@ -213,8 +215,8 @@ def _encoded(
 ) -> tuple[Encoding, Affine]:
     """Program whose solutions are plans from a state with a robustness of at least `target`, and its cost.
 
-    If `target` is inf, the robustness is at least `known`, and the cost makes the solver maximise it. For
-    `tight`, see `Encoding`.
+    If `target` is inf, the robustness is at least `known`, and the cost to be minimised is the negative
+    robustness. Otherwise the cost is 0. For `tight`, see `Encoding`.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.

@@ -123,8 +123,8 @@ class Mpc:
     ) -> None:
         """Solve the program for one initial state from a guess (T, m), and offer the plan to the search.
 
-        If the program is nearly feasible, but the exact robustness of the plan misses the target, the program
-        is solved once more, with a margin that is larger by what was missing.
+        The program may be nearly feasible although the exact robustness of the plan misses the target. It is
+        then solved once more with a larger margin, which is increased by the missing robustness.
         """
         target = search.budget.target
         maximise = math.isinf(target)
