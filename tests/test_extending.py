@@ -69,8 +69,8 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_page_has_an_example_of_each_extension():
-    assert len(CHECKS) == 11
-    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 10
+    assert len(CHECKS) == 12
+    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 11
     operator = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
     assert len(operator) == 3  # an operator, a trace format and a function
 

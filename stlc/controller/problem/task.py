@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
@@ -103,6 +103,10 @@ class Task:
         self.system = system.augmented(*added) if any(added) else system
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
         self.safety = RobustnessGraph(compiled.safety, self.system.signature)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Return the task itself, which is immutable: a copied network belongs to the same task."""
+        return self
 
     @classmethod
     def of(

@@ -18,7 +18,7 @@ NEEDS = {"milp": "highspy", "mpc": "casadi", "cma": "cma"}
 SPECS = {"mpc": "ship_safe"}
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.1)
@@ -26,7 +26,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("method", [name for name in PLANNERS.names if name != "policy"])
-def test_every_planner_drives(home: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_planner_drives(method: str, capsys: pytest.CaptureFixture[str]) -> None:
     if method in NEEDS:
         pytest.importorskip(NEEDS[method])
     name = SPECS.get(method, "traffic")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import torch
 
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
@@ -43,3 +45,15 @@ def test_inputs_are_normalised(car_task: Task) -> None:
     observed = (car_task.system.observe(car_task.sample(500, seed=1)) - network.centre) / network.spread
     assert observed.mean(0).abs().max() < 1e-4
     assert (observed.std(0) <= 1.0 + 1e-4).all()
+
+
+def test_a_copied_network_has_weights_of_its_own(car_task: Task) -> None:
+    network = _policy(car_task, 2).network
+    copied = deepcopy(network)
+    with torch.no_grad():
+        for weight in copied.parameters():
+            weight += 1.0
+    x0 = car_task.sample(5, seed=4)
+    assert not torch.equal(network(x0), copied(x0))
+    assert torch.equal(network(x0), _policy(car_task, 2).network(x0))
+    assert torch.equal(copied.centre, network.centre)
