@@ -17,10 +17,11 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
+from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import usage
-from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation, task_of
+from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
 
 Reward: TypeAlias = Literal["robustness", "accuracy", "task", "dense"]
 """Name of a reward. `dense` rewards add up to the robustness of the episode less that of its first state."""
@@ -248,5 +249,5 @@ def make(
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
-    task = task_of(spec, system)
+    task = load_task(spec, system, hint="give `system`")
     return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time, world=world)

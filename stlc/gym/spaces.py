@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -16,9 +15,6 @@ from numpy.typing import NDArray
 from stlc.compile.analysis.ranges import bounds
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-from stlc.dynamics.model.system import System
-from stlc.files import find_spec, find_system, read_source
-from stlc.grammar.parse.parser import parse
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -115,19 +111,3 @@ def initial_state(task: Task, given: object, count: int) -> Tensor:
             f"give {width} numbers: {', '.join(task.system.names)}",
         )
     return x.expand(count, width).contiguous()
-
-
-def task_of(spec: Path | str, system: Path | str | None) -> Task:
-    """Task of a specification file and a system file (by default the one that the specification names).
-
-    Raises:
-        UsageError: there is no such file, or no system is named.
-        SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
-            together.
-    """
-    path = find_spec(spec)
-    parsed = parse(read_source(path))
-    named = system or parsed.system
-    if named is None:
-        raise usage(f"`{spec}` names no system", "give one")
-    return Task.of(parsed, System.load(find_system(str(named), None if system else path)))

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
+from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.diagnostics import usage
-from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation, task_of
+from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
 
 AHEAD = 1024
 """Least number of initial states that are drawn at a time."""
@@ -202,5 +203,5 @@ def make_vec(
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
-    task = task_of(spec, system)
+    task = load_task(spec, system, hint="give `system`")
     return SpecVectorEnv(task, num_envs, reward=reward, normalised=normalised, time=time, autoreset=autoreset)

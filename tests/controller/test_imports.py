@@ -11,7 +11,7 @@ import torch
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import load_task, spec_hash
+from stlc.controller.training.run import spec_hash, task_of_run
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
@@ -44,7 +44,7 @@ def test_a_run_stands_on_its_own(home: Path, tmp_path_factory: pytest.TempPathFa
     x = torch.randn(9, 6, 2)
     wanted = task.robustness(x)
     shutil.rmtree(home)
-    again = load_task(folder)
+    again = task_of_run(folder)
     torch.testing.assert_close(again.robustness(x), wanted)
     assert (folder.path / "lib/common/places.stl").is_file()
     before = spec_hash(folder)
@@ -52,4 +52,4 @@ def test_a_run_stands_on_its_own(home: Path, tmp_path_factory: pytest.TempPathFa
         "region post = circle([1, 1], 0.6)\n", encoding="utf-8"
     )
     assert spec_hash(folder) != before
-    assert not torch.equal(load_task(folder).robustness(x), wanted)
+    assert not torch.equal(task_of_run(folder).robustness(x), wanted)

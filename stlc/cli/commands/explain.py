@@ -223,11 +223,11 @@ def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[doc
     """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances
-    from stlc.controller.training.run import load_task
+    from stlc.controller.training.run import task_of_run
     from stlc.rundir import RunDir
 
     folder = RunDir.open(run, runs)
-    task = load_task(folder, overrides)
+    task = task_of_run(folder, overrides)
     grid = grid_of(task)
     axes, found = axes_of(task, grid), chances(task, grid)
     return Answer(

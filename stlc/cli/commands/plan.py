@@ -69,8 +69,7 @@ def plan(
     code is 1 if a plan violates the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named
-    from stlc.controller.planning.record import trace_of
-    from stlc.controller.planning.starts import starts_of
+    from stlc.controller.planning.traces import starts_of, trace_of
     from stlc.controller.problem.load import load_task
     from stlc.trace import check_writable, save_trace
 

@@ -243,26 +243,20 @@ def _rate(value: float) -> float:
 
 def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
     """Read and compile the specification, and print which system file is used."""
-    from stlc.controller.problem.task import Task
+    from stlc.controller.problem.load import load_task
     from stlc.dynamics.model.feedback import unstable
-    from stlc.dynamics.model.system import System
-    from stlc.files import find_spec, find_system, read_source
-    from stlc.grammar.parse.parser import parse
 
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
         raise usage("which specification is to be trained for?", example)
-    path = find_spec(*specs)
-    spec = parse(read_source(path))
-    wanted = system or spec.system
-    if wanted is None:
-        other = 'or a line `system "FILE"` in the specification'
-        raise usage(f"`{path}` names no system", "stlc train SPEC --system FILE", other)
-    found = find_system(wanted, path)
-    say(f"system {found}")
-    loaded = System.load(found, overrides)
-    task = Task.of(spec, loaded, overrides=overrides)
-    show_diagnostics([*task.compiled.warnings, *unstable(loaded.decl)])
+    task = load_task(
+        specs[0],
+        system or None,
+        overrides,
+        hint="stlc train SPEC --system FILE",
+        found=lambda path: say(f"system {path}"),
+    )
+    show_diagnostics([*task.compiled.warnings, *unstable(task.plain.decl)])
     return task
 
 

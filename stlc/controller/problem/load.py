@@ -6,17 +6,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.controller.problem.task import Task
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.model.system import System
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+
+HINT = "--system FILE"
+"""What to do if no system is named, on most command lines."""
 
 
 def load_task(
-    spec: Path | str, system: Path | str | None = None, overrides: Mapping[str, str] | None = None
+    spec: Path | str,
+    system: Path | str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    *,
+    hint: str = HINT,
+    found: Callable[[Path], None] | None = None,
 ) -> Task:
     """Load a specification and a system, and compile the specification for the system.
 
@@ -24,6 +32,8 @@ def load_task(
         spec: specification file, searched by `find_spec`.
         system: system file, searched by `find_system`; by default the one that the specification names.
         overrides: constants of the specification and keys of the system file to change, name -> text.
+        hint: what the user may do if no system is named.
+        found: function that is called with the path of the system file before it is read.
 
     Raises:
         UsageError: U101, no system is named; U102, there is no such file.
@@ -34,8 +44,9 @@ def load_task(
     parsed = parse(read_source(path))
     wanted = system if system is not None else parsed.system
     if wanted is None:
-        help_ = ("--system FILE", 'or a line `system "FILE"` in the specification')
-        raise UsageError(Diagnostic("U101", f"`{path}` names no system", help=help_))
+        raise usage(f"`{path}` names no system", hint, 'or a line `system "FILE"` in the specification')
+    there = find_system(str(wanted), path)
+    if found is not None:
+        found(there)
     changed = dict(overrides or {})
-    loaded = System.load(find_system(str(wanted), path), changed)
-    return Task.of(parsed, loaded, overrides=changed)
+    return Task.of(parsed, System.load(there, changed), overrides=changed)

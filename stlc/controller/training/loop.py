@@ -20,7 +20,7 @@ from stlc.controller.training.checkpoint import load_checkpoint, never_saved, re
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
-from stlc.controller.training.run import Run, RunWriter, load_config, load_task, spec_hash, system_hash
+from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
 from stlc.native import never
 from stlc.registry import METHODS
@@ -168,7 +168,7 @@ def resume(
     _require_as_many(config.ranks, ranks.size)
     now = clock_of(config.clock)
     started = now()
-    task = load_task(folder)
+    task = task_of_run(folder)
     method: Method = METHODS.get(config.method)
     watch, writer = watch or Watch(), RunWriter(folder, writes=ranks.first)
     if config.threads:

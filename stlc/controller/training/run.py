@@ -80,7 +80,7 @@ class Run:
             SpecError, SystemFileError: its specification or system is invalid.
         """
         folder = RunDir.open(where, root)
-        task = load_task(folder, overrides, scenario)
+        task = task_of_run(folder, overrides, scenario)
         config = load_config(folder)
         return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
 
@@ -154,7 +154,7 @@ class RunWriter:
             self.folder.finish(status, result)
 
 
-def load_task(
+def task_of_run(
     folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
 ) -> Task:
     """Compile the specification and the system in a run's folder.

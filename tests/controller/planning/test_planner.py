@@ -9,8 +9,7 @@ import torch
 
 import stlc
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
-from stlc.controller.planning.record import trace_of
-from stlc.controller.planning.starts import starts_of
+from stlc.controller.planning.traces import starts_of, trace_of
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.monitor.verdict import Monitor
