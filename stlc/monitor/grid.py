@@ -65,7 +65,10 @@ class Times:
 
 
 def _dividing(horizon: float, dt: float) -> str:
-    """Help text that proposes a time step (four digits, at most `dt`) that divides the horizon."""
+    """Help text that proposes a time step of which the horizon is a whole multiple.
+
+    `horizon` and `dt` are in seconds. The proposed step has four digits and is at most `dt`.
+    """
     least = math.ceil(horizon / dt)
     short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
     step = horizon / next(short, least)
@@ -88,7 +91,10 @@ def _declared(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
-    """Return the time step and horizon, and the signals and functions, that a system file declares.
+    """Return what the system file `name` declares: time step and horizon, and signals and functions.
+
+    `spec` is the specification; its location is used to find the file. `overrides` maps the names of
+    constants to their new values, as text.
 
     Raises:
         UsageError: U102, there is no such file.
@@ -101,7 +107,11 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
-    """Return time step and horizon of the system that `spec` names; None if no system or file is found."""
+    """Return time step and horizon of the system that the specification `spec` names.
+
+    None if it names no system, or if the system file is not found. `overrides` maps the names of constants to
+    their new values, as text.
+    """
     if spec.system is None:
         return None
     try:

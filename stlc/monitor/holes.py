@@ -49,7 +49,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
     """Return a formula whose value bounds that of `formula`, whatever values the unknown samples have.
 
     Args:
-        formula: in negation normal form.
+        formula: in negation normal form (negations occur only in predicates).
         holes: names of the signals with unknown values. A name that a `freeze` binds to such a signal is
             treated in the same way.
         least: True for the lower bound (least value), False for the upper bound (greatest value).

@@ -51,7 +51,11 @@ def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: 
 
 
 def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
-    """Samples from an instant to `end`, the end of its planning window; None if that number is not fixed."""
+    """Number of samples from an instant to `end`, the end of the planning window that begins there.
+
+    None if the formula does not mention `end`, or if the requirement is not evaluated for every planning
+    window.
+    """
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
@@ -60,7 +64,9 @@ def rule_bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest robustness at the instants `starts`, each `(count, batch)`.
 
-    Both are one and the same array if nothing is unknown.
+    Both are one and the same array if nothing is unknown. `horizon` is the length of a planning window in
+    steps. `ends` is the treatment of windows that extend beyond the trace: "open" computes bounds over the
+    missing samples, "truncate" clips the windows.
     """
     window = window_of(rule, horizon)
     if window is None:

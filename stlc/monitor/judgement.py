@@ -72,7 +72,8 @@ class Judgement:
 
     Attributes:
         rule: the requirement.
-        start: the first sample at which the requirement is evaluated; the others follow one by one.
+        start: the first sample at which the requirement is evaluated. Row i of `low` belongs to sample
+            `start` + i.
         low: least robustness over all continuations of the traces, (instants, traces).
         high: greatest robustness; the same array as `low` if nothing is unknown.
         holds: whether the requirement is certainly satisfied, (instants, traces).
@@ -80,7 +81,8 @@ class Judgement:
         shape: axes of the signals before their time axis; () for a single trace.
         scope: True for traces that satisfy the assumptions, (traces,); None: all do. Traces that violate the
             assumptions do not affect verdicts over all traces.
-        reported: `low` and `high` in the requested semantics; None if the exact semantics is requested.
+        reported: `low` and `high` in the semantics (definition of min and max) that the caller requested;
+            None if that is the exact one.
     """
 
     rule: CompiledRequirement
@@ -95,7 +97,10 @@ class Judgement:
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
-        """Least and greatest robustness in the requested semantics, each (instants, traces)."""
+        """Least and greatest robustness, each (instants, traces).
+
+        They are computed in the semantics (definition of min and max) that the caller requested.
+        """
         return (self.low, self.high) if self.reported is None else self.reported
 
     @property
@@ -173,7 +178,11 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Indices (trace, sample) of the least `high` if a trace is violated, else of the least `low`."""
+        """Pair (trace, sample) with the least robustness.
+
+        If the requirement is violated, the upper bounds `high` on the robustness are compared, otherwise the
+        lower bounds `low`.
+        """
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
@@ -230,7 +239,10 @@ class Verdict:
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return a copy that counts only traces that satisfy the assumptions: True in `scope` (traces,)."""
+        """Return a copy in which only the traces that satisfy the assumptions count.
+
+        These traces are True in `scope`, (traces,).
+        """
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
@@ -262,7 +274,7 @@ class Verdict:
     def share(self) -> float:
         """Share of the instants of all traces at which all requirements certainly hold.
 
-        The verdict of a requirement that is evaluated only once counts at every instant.
+        If a requirement is evaluated only once, its verdict counts at every instant.
         """
         most = self._most_instants
         return self._mean(np.logical_and.reduce([self._spread(j, j.holds, most) for j in self.requirements]))

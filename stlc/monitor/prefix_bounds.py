@@ -33,7 +33,9 @@ _UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
-    """The formula whose value bounds that of `formula`, at whichever later sample the trace ends.
+    """Return a formula whose value bounds that of `formula` on a trace that is still growing.
+
+    The bound holds for every sample, now or later, with which the trace may end.
 
     Args:
         formula: the formula to bound.
@@ -72,7 +74,7 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """Bound the body of a window, at whichever later sample the trace ends.
+        """Bound the body of a window on a trace that may end with any sample, now or later.
 
         If an early end of the trace is the worst case for the bound, only existing samples count.
 
@@ -85,17 +87,21 @@ class _PrefixBound:
         return self._seen(inner, 0) if cut and some is self.least else inner
 
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """Make the bound of an unbounded operator infinite if its window starts after the last sample.
+        """Make the bound on an unbounded operator infinite if its window starts after the last sample.
 
-        `some` is as in `_found`. The formula is returned unchanged if its value on an empty window is the
-        infinite bound anyway, or if the end of the trace clips all windows (`cut`).
+        `some` is True if the body must hold at one instant of the window, False if at every one. The formula
+        is returned unchanged if an empty window gives the infinite bound anyway, or if the end of the trace
+        clips all windows (`cut`).
         """
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """Make a bound infinite (no information) where the sample `later` steps ahead may not exist."""
+        """Make a bound infinite (no information) at instants k for which sample k + `later` may not exist.
+
+        `formula` is the formula whose value is the bound.
+        """
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
         return ir.BoolOp("and" if self.least else "or", (formula, then))
@@ -110,9 +116,9 @@ def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
 
 
 def own_span(node: ir.Formula) -> Reach:
-    """Return lookback and lookahead of an operator or predicate itself, without those of its operands.
+    """Return how far an operator or predicate itself reads back and ahead, in samples.
 
-    An unbounded window counts with its lower bound only.
+    What its operands read is not included. Of an unbounded window only the lower bound counts.
     """
     reads = [Reach(0, 0), *(farthest(num) for num in children(node) if not isinstance(num, ir.Formula))]
     past, future = (max(ends) for ends in zip(*reads, strict=True))
@@ -126,7 +132,7 @@ def own_span(node: ir.Formula) -> Reach:
 def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
     """Return the formula with every unbounded future window replaced by a long bounded one.
 
-    It is long enough: beyond its end, no value depends on any of the `samples` known samples.
+    The new windows are so long that no value after their end depends on the `samples` known samples.
     """
     length = samples + sum(sum(own_span(node)) for node in nodes(formula)) + 1
 

@@ -96,12 +96,13 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
 
 
 def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
-    """Return `requested` completed by the kinds and words of the signals that a specification declares.
+    """Add the kinds and words of the signals that a specification declares to `requested`.
 
     Args:
-        spec: the specification, which gives the kinds of the signals and the values of enum members.
-        requested: options of the user: names in the file, keyed by the name of a signal or of its column (the
-            text behind `from`), and the time grid.
+        spec: the specification. It gives the kinds of the signals (such as bool or enum), and the numbers
+            that words (members of an enum) stand for.
+        requested: options of the user: the time grid, and names of signals in the file. A name is given for a
+            signal, or for the text behind `from` in its declaration.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}

@@ -67,8 +67,9 @@ class Record:
     ) -> list[Array]:
         """Values of each formula at `instants`, `(instants, batch)`.
 
-        `end` is the treatment of instants after the last sample. `stop` is the number of samples that a
-        continuing trace will have in the end; unbounded windows end there (see `evaluate`).
+        `end` is the treatment of windows that extend beyond the last sample: "strict" gives NaN, "truncate"
+        clips them, "lower" and "upper" give a bound. If the trace continues, `stop` is the number of samples
+        that it will have in the end; unbounded windows then end with the last of these.
         """
         return evaluate(
             formulas,
@@ -87,8 +88,9 @@ def bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values at consecutive instants, each `(count, batch)`.
 
-    If nothing is unknown, both are one and the same array. `stop` is the number of samples that the trace
-    will have in the end, if that is more than the known ones.
+    If nothing is unknown, both are one and the same array. `ends` is the treatment of windows that extend
+    beyond the trace: "open" computes bounds, "truncate" clips the windows. `stop` is the number of samples
+    that the trace will have in the end, if that is more than the known ones.
     """
     if record.holes:
         least, most = (unsure(formula, record.holes, least=least) for least in (True, False))

@@ -164,7 +164,8 @@ class Monitor:
         """Robustness of the specification: the least `weight * robustness / scale` of all requirements.
 
         Args:
-            signals: as in `check`; (time,) or (…, time).
+            signals: signals by name, or a trace, or the path of a trace file; arrays are (time,) or (…,
+                time).
             end: "strict" gives NaN where a window is incomplete, "truncate" clips windows.
             at: sample at which to evaluate; None: at every sample.
             smoothing: scale k of log-sum-exp; giving it selects the log-sum-exp semantics.
@@ -192,7 +193,8 @@ class Monitor:
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest robustness of the specification over all continuations of the signals.
 
-        Missing samples make the predicates that read them unknown. Shapes as in `robustness`.
+        A predicate that reads a missing sample is unknown. The arrays have the shape of the signals; with
+        `at`, which is the sample at which to evaluate, they have no time axis.
         """
         ready = self._prepare(signals, ())
         return _least(ready, "lower", at), _least(ready, "upper", at)
@@ -205,7 +207,7 @@ class Monitor:
         like: Trace | None = None,
         dt: Seconds | None = None,
     ) -> Online:
-        """Return a monitor that takes samples one by one and gives bounds at once, verdicts once decided.
+        """Return a monitor that takes samples one by one, and gives bounds and decided verdicts after each.
 
         Args:
             how: instants at which to evaluate, treatment of the end of the stream, and tolerance.
@@ -314,7 +316,7 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """True for traces that satisfy the assumptions or for which this is undecided, (traces,)."""
+    """False for traces that certainly violate an assumption, else True; (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
@@ -338,8 +340,9 @@ def _judge(
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
     """A copy of the judgement whose `reported` bounds are in the semantics of `ready`.
 
-    In a semantics whose minimum and maximum are means, bounds over unknown samples are not valid. There, only
-    the sign of the exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or +inf.
+    In a semantics whose minimum and maximum are means, bounds over unknown samples are not valid. In this
+    case only the sign of the exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or
+    +inf.
     """
     starts = range(judgement.start, judgement.start + judgement.instants)
     ends: Ends = "truncate" if end == "truncate" else "open"

@@ -36,8 +36,8 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
     """Yield the trace of a file in chunks of `samples` samples, whose times continue from chunk to chunk.
 
     Raises:
-        TraceError: as `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its format
-            cannot be read in pieces.
+        TraceError: the errors of `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its
+            format cannot be read in pieces.
     """
     clock: _Clock | None = None
     for recording in _recordings(path, samples):
@@ -76,7 +76,7 @@ def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
 
 
 class _Clock:
-    """Converter of consecutive chunks of a trace to one time grid, that of the first chunk."""
+    """Converter of consecutive chunks of a trace; the first chunk determines the time grid of all."""
 
     def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples

@@ -330,14 +330,18 @@ class _Track:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """Return the values of the signal on a time grid, (points,); for `end` see `values_on`."""
+        """Return the values of the signal on a time grid, (points,).
+
+        `end` is the time in seconds up to which it is known that no further sample comes.
+        """
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
         """Time in seconds before which interpolated values can no longer change.
 
-        `now` is the time of the latest sample of the stream, `limit` the longest gap that is bridged.
+        `now` is the time of the latest sample of the stream, `limit` the longest gap between samples within
+        which values are interpolated, in seconds.
         """
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last

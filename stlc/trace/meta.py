@@ -34,7 +34,7 @@ class Carried:
         name: name of the specification; "" if unknown.
         path: path of its file.
         text: its whole text; "" if the trace does not contain it.
-        library: texts of the files that it imports, by key.
+        library: texts of the files that it imports: path relative to the folder of the specification -> text.
         overrides: constants that were overridden, with their values as texts.
     """
 
@@ -53,7 +53,8 @@ class TraceMeta:
         spec_name: name of the specification.
         spec_path: path of the specification as the user gave it.
         spec_text: whole text of the specification, so that `stlc check` needs no other file.
-        spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
+        spec_library: texts of the files that it imports: path relative to the folder of the specification ->
+            text.
         spec_set: constants that were overridden, with their values as texts.
         spec_hash: SHA-256 of these texts, hexadecimal.
         judge_path: path of a second specification, which evaluates closed-loop runs. `judge_text`,

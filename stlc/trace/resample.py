@@ -64,9 +64,10 @@ class Spacing:
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
         """Return the spacing with step `dt` that bridges gaps of at most `max_gap` seconds.
 
-        Without `max_gap`, gaps of three steps are bridged. Such a step is `dt`, or the usual time between the
-        samples at `times` if that is longer. Without `max_gap` but with `events`, all gaps are bridged: each
-        value of a discrete signal holds until the next sample.
+        Within a bridged gap, values are held or interpolated. If `max_gap` is None, gaps of up to three steps
+        are bridged. A step is `dt` or, if that is longer, the usual time between the samples at `times`. If
+        `max_gap` is None and `events` is True, all gaps are bridged: each value of a discrete signal holds
+        until the next sample.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)

@@ -161,7 +161,7 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
     """Convert the content of a trace file to a trace: signals renamed, and on one uniform grid.
 
     Raises:
-        TraceError: as `load_trace`.
+        TraceError: the errors of `load_trace`.
     """
     names = dict(reading.names)
     clock = names.pop(CLOCK, None)

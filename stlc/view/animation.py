@@ -49,8 +49,8 @@ class Animation:
             canvas.
         alt: description in words.
         moment: index of the instant shown in a still picture.
-        draws: whether the function that `begin` returns renders the canvas itself; otherwise it only updates
-            artists.
+        draws: True if the function that `begin` returns also renders the canvas. False if it only updates the
+            drawn objects (artists), so that the caller must render.
     """
 
     frames: int
@@ -76,8 +76,9 @@ class VectorAnimation:
 
     Attributes:
         width, height: size of the picture in dots.
-        commands: the distinct drawing commands: `["p", path, fill, stroke, width, dash, clip]`,
-            `["t", x, y, text, size, color, align, angle, bold]`, `["i", x, y, width, height, address]`.
+        commands: the distinct drawing commands. A path is `["p", path, fill, stroke, width, dash, clip]`, a
+            text `["t", x, y, text, size, color, align, angle, bold]`, an image `["i", x, y, width, height,
+            address]`.
         frames: for every frame, indices into `commands` in the order of drawing.
     """
 
@@ -108,9 +109,10 @@ class VectorAnimation:
 
 
 def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Return `dark`, the map from each colour to its replacement in the dark scheme, if it can be applied.
+    """Return `dark` if all animations can be shown with it, else an empty mapping.
 
-    Empty if an animation contains images, or colours that `dark` does not list.
+    `dark` maps each colour to the colour that replaces it in the dark scheme. It cannot be used if an
+    animation contains images, or colours that `dark` does not list.
     """
     known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}

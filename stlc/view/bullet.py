@@ -152,8 +152,9 @@ class Renderer:
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
 
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Render frame `index` as an RGB image (height, width, 3); `who` is as in `turn`.
+        """Render frame `index` as an RGB image (height, width, 3).
 
+        `who` (robots,) is the source of each robot's decision (0: the policy, else a stage of the guard).
         Transparent balls are blended here, not by PyBullet.
         """
         self.turn(index, who)
@@ -192,9 +193,9 @@ class Renderer:
         return int(self.client.createMultiBody(0, -1, shape))
 
     def _colour(self, robot: int, source: int) -> None:
-        """Colour a robot's disc by `source`, the source of its decision.
+        """Colour the disc of a robot by the source of its decision.
 
-        If the guard intervened, the robot gets the same colour, else white.
+        If the guard decided, the robot itself gets the same colour, otherwise white.
         """
         self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
         body = _WHITE if source == 0 else _rgba(DECIDED[source])
@@ -330,7 +331,7 @@ def _weigh(link: ElementTree.Element) -> None:
 
 
 def _rod(link: ElementTree.Element, end: tuple[float, float, float]) -> None:
-    """Add a rod from the link's origin to `end`, with a ball there."""
+    """Add a rod from the link's origin to `end`, with a ball at `end`."""
     length = math.hypot(*end)
     x, y, z = end
     if length > ROD / 2:

@@ -37,12 +37,12 @@ class RunContents:
         rows: lines of `train.jsonl`.
         requirements: name -> declaration, parsed from the run's specification.
         outside: whether the specification uses external functions of its system.
-        texts: file name -> text, for those of the files `TEXTS` that exist.
+        texts: file name -> text, for every file in the list `TEXTS` that exists.
         signature: names, units and labels of the system's states.
         held_out: held-out starts (initial states not used in training) and the robustness of the plans from
             them.
         simulation: content of `eval/simulate.json`, the results of the closed-loop runs.
-        units: requirement -> unit of its robustness; requirements without a unit are left out.
+        units: requirement -> unit of its robustness; it contains only requirements that have a unit.
         usual: default numbers of agents and steps of the system, under the scenario of the closed-loop runs.
         trace: trace recorded in the closed-loop runs.
     """

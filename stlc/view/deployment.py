@@ -53,7 +53,7 @@ def deployment_section(contents: RunContents) -> Section | None:
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
-    """Headed table of the given rows with one column per guard; None if there are no rows."""
+    """Table `rows` with one column per guard and the heading `title`; None if there are no rows."""
     if not rows:
         return None
     header = ["", *(guard_words(name).title for name in guards)]
@@ -74,9 +74,9 @@ def _setting(simulation: Record) -> str:
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
-    """Paragraph on the share of start instants from which the world behaved as the model predicts.
+    """Paragraph on the share of instants from which the world behaved as the model for a whole plan.
 
-    None if it always did.
+    None if it did so from all instants, or if the share is unknown.
     """
     consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if consistent is None or consistent >= 1.0:
@@ -95,10 +95,10 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows with the number of closed-loop runs that satisfy all rules, then each rule.
+    """Table rows with numbers of satisfying closed-loop runs: of all rules together, then of each rule.
 
-    If some runs are lost, a row in between leaves them out. A run is lost if no satisfying plan is known from
-    its start, or from its state after an exogenous event.
+    A run is lost if no satisfying plan is known from its start, or from its state after an exogenous event.
+    If there are lost runs, a further row, after the first, counts only the other runs.
     """
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
@@ -156,7 +156,10 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: share of start instants from which the executed trajectory satisfies each requirement."""
+    """Table rows with the share of instants from which the executed trajectory satisfies a requirement.
+
+    There is one row per requirement.
+    """
     names = [name for name in _names(guards) if name.startswith(HOLDS)]
     return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
 

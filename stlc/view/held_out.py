@@ -193,8 +193,8 @@ def _f_score(region: Mask, failing: Mask) -> float:
 class _Values:
     """Values that occur frequently in one column of the initial states.
 
-    A continuous state may have frequent values, too: a timer that starts at 0, a value that means "nothing
-    there".
+    A continuous state may also have frequent values: the 0 at which a timer starts, or a value that means
+    "nothing there".
 
     Attributes:
         common: the frequent values; of a column that is not continuous, all values.
@@ -215,7 +215,10 @@ class _Values:
 
 
 def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
-    """Conditions that may be added to a conjunction to narrow `region`, the region that it describes."""
+    """Conditions that may be added to a conjunction of conditions.
+
+    `region` is True for the starts, (starts,), that satisfy the conjunction so far.
+    """
     found: list[Condition] = []
     bad = x0[region & failing]
     for column, kinds in enumerate(values):
@@ -282,7 +285,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a failure region: share of failures among its starts, and its share of all failures."""
+    """Clause on a failure region: share of its starts that fail, and its share of all failing starts."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -322,7 +325,7 @@ def draw_failures(
     Args:
         held: starts and robustness of their plans.
         signature: names, units and labels of the system's states.
-        units: requirement -> unit of its robustness; requirements without a unit are left out.
+        units: requirement -> unit of its robustness; it contains only requirements that have a unit.
     """
     weakness = find_weakness(held)
     if weakness is None:

@@ -57,12 +57,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """Verdict on a training.
+    """Verdict on a training: how well the policy has learned, and what to do next.
 
     Attributes:
         level: `trained`, `partly trained`, `undertrained`, `no plan known` or `infeasible`.
-        share: share of the starts with a known satisfying plan that the policy solves; None if there are
-            none.
+        share: of the starts from which a satisfying plan is known, the share that the policy solves; None if
+            there is no such start.
         sentence: level and share as a sentence.
         advice: sentences of advice.
         command: the command to run next.
@@ -77,7 +77,7 @@ class Learning:
     worst: str = ""
 
     def summary(self) -> dict[str, object]:
-        """The verdict as a dictionary for JSON."""
+        """The verdict on the training as a dictionary for JSON."""
         return {
             "level": self.level,
             "share_of_feasible": self.share,
@@ -196,7 +196,11 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
 def learning_on_record(
     record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
 ) -> Learning | None:
-    """The verdict on a training from the contents of `run.json` and `train.jsonl`; None if not finished."""
+    """The verdict on a training from the contents of `run.json` and `train.jsonl`.
+
+    None if the training is not finished. `where` is a clause on the region in which the worst requirement
+    fails, or "".
+    """
     result = record.get("result")
     if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
         return None

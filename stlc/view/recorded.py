@@ -135,7 +135,10 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
 
 
 def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
-    """Text: the instant of the worst violation; without a violation, the start of the least robust window."""
+    """Text: the instant of the worst violation of a requirement.
+
+    If the requirement is not violated, the text names the instant from which it has the least robustness.
+    """
     moment, cause = verdict.subject.moment, causes.get(judgement.name)
     if cause is None:
         return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""

@@ -88,7 +88,7 @@ class RegionMap:
         return region.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
-        """Indices of at most `most` traces, those with violations first."""
+        """Indices of at most `most` traces; traces with violations come first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
@@ -216,7 +216,7 @@ def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]])
 
 
 def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
-    """Draw satisfying paths in ink and violating ones in red above them, with marks at start and end."""
+    """Draw satisfying paths in the text colour, violating ones above them in red; mark starts and ends."""
     across, up = region_map.paths
     chosen = region_map.first(MOST_PATHS)
     for violated, color, order in ((False, INK, 3), (True, RED, 4)):
@@ -309,7 +309,7 @@ class Use:
     Attributes:
         requirement: name of the requirement.
         negative: whether the region is to be avoided: it occurs under an odd number of negations.
-        visit: whether one visit is enough: the region occurs under an `eventually` or the like.
+        visit: whether one visit is enough: the region occurs under an `eventually`, `once` or `until`.
         window: (first, last) time at which the occurrence counts, in seconds since the start of the trace;
             None: always.
     """
@@ -481,7 +481,10 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 
 
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Yield every predicate of a requirement, with its polarity and the time interval in which it counts."""
+    """Yield every predicate of a requirement with its `Use`.
+
+    The `Use` tells whether the predicate is under a negation, and in which time interval it counts.
+    """
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()

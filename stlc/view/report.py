@@ -353,13 +353,16 @@ def _commands(contents: RunContents) -> list[str]:
 
 
 def _set(record: Mapping[str, Any]) -> list[str]:
-    """The `--set` options that repeat the overrides of a run."""
+    """The `--set` options that repeat the overridden constants of a run."""
     changed = record.get("overrides") or {}
     return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
 
 
 def _simulate(contents: RunContents) -> list[str]:
-    """Arguments of the command that repeats the latest closed-loop run; by default with the paper's guard."""
+    """Arguments of the command that repeats the latest closed-loop run.
+
+    If there was none, they simulate the run with the paper's guard.
+    """
     done = contents.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
     words = ["stlc", "simulate", contents.run.shown, *guard_words(guard).option.split()]

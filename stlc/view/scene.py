@@ -127,7 +127,7 @@ def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
 def _moment(scene: Scene, frames: int) -> int:
     """Index of the frame with most interventions of the guard, without the first and last sixth of frames.
 
-    Without interventions it is that of the middle frame.
+    Without interventions, the index of the middle frame is returned.
     """
     middle = frames // 2
     low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)
@@ -224,7 +224,10 @@ def _head(figure: Figure, plan: _Plan, title: str, keys: list[LegendKey]) -> Tex
 
 
 def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[FrameUpdate]:
-    """Draw the strip charts, with a heading above the first one; return the artists to update per frame."""
+    """Draw the strip charts, with a heading above the first one.
+
+    Returns the functions that update the charts to a given frame.
+    """
     if strip is None or not plan.rows:
         return []
     updates = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])

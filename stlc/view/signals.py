@@ -164,7 +164,7 @@ def draw_signals(
         trace: the recorded trace.
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
         choices: the traces to draw.
-        units: requirement -> unit of its robustness; requirements without a unit are left out.
+        units: requirement -> unit of its robustness; it contains only requirements that have a unit.
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
@@ -228,7 +228,7 @@ def _wrapped(title: str) -> str:
 
 
 def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, index: int) -> None:
-    """Draw one panel of trace `index`: signal, decisions or robustness, as `kind` says.
+    """Draw one panel of trace `index`; `kind` selects a signal, the decisions or a robustness.
 
     Interventions of the guard are shaded behind numeric signals and robustness.
     """
@@ -297,11 +297,11 @@ class Strip:
 
     Attributes:
         times: times of the frames in seconds, (frames,).
-        margins: requirement -> robustness from each instant on, the least of all agents, (frames,); NaN if
-            unknown.
+        margins: requirement -> least robustness of all agents, (frames,), if the requirement is evaluated
+            from the instant of each frame on; NaN if unknown.
         decisions: source of each decision, (frames, agents); None if not recorded.
         words: description of the margins, for a heading.
-        units: requirement -> unit of its margin; requirements without a unit are left out.
+        units: requirement -> unit of its margin; it contains only requirements that have a unit.
     """
 
     times: Floats

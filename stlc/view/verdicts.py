@@ -67,7 +67,7 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Fl
 
 
 def units_of(verdict: Verdict) -> dict[str, str]:
-    """Requirement -> unit of its robustness; requirements without a unit are left out."""
+    """Mapping from requirements to the units of their robustness; it omits requirements without a unit."""
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
@@ -140,7 +140,8 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins, and of the sources of decisions.
 
-    Where possible, the margins are those of agents for which the world behaves as the model.
+    The margins are those of agents for which the world behaves as the model, if enough of them are known;
+    otherwise they are those of all agents.
 
     Args:
         judged: verdicts on the agents.

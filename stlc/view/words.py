@@ -109,8 +109,9 @@ def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, An
 def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
     """Sentence `198 of 200 drives obeyed every rule; without the guard 150`, from `eval/simulate.json`.
 
-    A drive is the closed-loop run of one agent with one seed. Without a separate specification for drives, it
-    is evaluated by the specification of plans, from every start instant. "" for a file without drives.
+    A drive is the closed-loop run of one agent with one seed. A specification for drives may be given
+    separately. Otherwise the sentence tells how many drives satisfy, from every instant on, the specification
+    that controls were planned for. "" if the file contains no drives.
     """
     each = drives_of(simulation)
     if not each:
@@ -135,9 +136,10 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Sentence on lost drives, for which no satisfying plan was known, and on the other drives.
+    """Sentence with the number of lost drives, and with the number of other drives that obeyed every rule.
 
-    A drive is the closed-loop run of one agent with one seed. "" if no drive was lost.
+    A drive is the closed-loop run of one agent with one seed. It is lost if no satisfying plan is known from
+    its start, or after an exogenous event. "" if no drive was lost.
     """
     each = list(drives_of(simulation).values())
     if not each or not each[-1]["lost"]:

@@ -51,11 +51,11 @@ _MOST_LATER = 64
 
 @dataclass(frozen=True, slots=True)
 class CauseNode:
-    """Node of a cause tree: a sub-formula whose truth value is the opposite of the one that was wanted.
+    """Node of a tree of causes: a sub-formula that does not have the truth value that is needed.
 
     Attributes:
         formula: the sub-formula, type-checked.
-        holds: truth value of the sub-formula; the opposite value was wanted.
+        holds: truth value that the sub-formula has; the opposite value is needed.
         sample: the instant, as a sample number.
         rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
         until: last instant of the window, if the body of a temporal operator fails at every instant of it;
@@ -63,11 +63,11 @@ class CauseNode:
         reads: for a predicate, the signals that it reads, each with the offset in samples at which it reads
             it.
         parts: causes among the operands; empty for a predicate.
-        main: index in `parts` of the operand whose value is the robustness of the sub-formula.
+        main: index in `parts` of the operand whose value equals the robustness of the sub-formula.
         premise: whether the sub-formula is the left side of an implication.
-        moves: whether the deciding predicate value can change alone, and the robustness of the sub-formula
-            with it. False, for example, if a `freeze` binds a sample of a signal, and the predicate below
-            it reads the same sample.
+        moves: whether the value of the deciding predicate (`leaf`) can change alone, and then changes the
+            robustness of the sub-formula. False, for example, if a `freeze` binds a sample of a signal, and
+            the predicate inside the `freeze` reads the same sample.
     """
 
     formula: typed.Formula
@@ -98,7 +98,7 @@ class CauseNode:
 
     @property
     def leaf(self) -> CauseNode:
-        """Node of the predicate at the end of the main path, whose value decides."""
+        """Node of the deciding predicate, reached by following `parts[main]` from node to node."""
         return self.parts[self.main].leaf if self.parts else self
 
     @property
@@ -118,16 +118,16 @@ Spot: TypeAlias = tuple[ir.Formula, int]
 
 @dataclass(frozen=True, slots=True)
 class _Tied:
-    """Table of all predicate values on a trace, one of which may be replaced by the next larger float.
+    """Table of predicate values on a trace; one value may be replaced by the next larger float.
 
-    It is used to test whether one predicate value alone determines the robustness of a formula.
+    The replacement shows whether this single value determines the robustness of a formula.
 
     Attributes:
         record: the trace.
         names: predicate -> name of the column (time series) with its values.
         env: name of a column -> predicate values (samples, 1); `coded` adds the columns that are missing.
         raised: (predicate, sample) of the value to replace; None replaces no value.
-        stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
+        stop: number of samples that the complete trace would have, if the recording is shorter; else None.
     """
 
     record: Record
@@ -138,7 +138,7 @@ class _Tied:
 
     @property
     def columns(self) -> dict[str, Floats]:
-        """Predicate values by column name, the value `raised` replaced by the next larger float."""
+        """Predicate values by column name; the value at `raised` is replaced by the next larger float."""
         return self.env if self.raised is None else self._with(self.raised)
 
     def _with(self, spot: Spot) -> dict[str, Floats]:
@@ -156,10 +156,10 @@ class _Tied:
         return _over_columns(formula, self.names)
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
-        """Return the robustness of a formula at a sample.
+        """Return the robustness of `formula` at `sample`, with one predicate value slightly increased.
 
-        `raised` is a list of (predicate, sample). The predicate value of its first entry is replaced by the
-        next larger float; an empty list replaces nothing.
+        `raised[0]` is the (predicate, sample) pair whose value is increased, to the next larger float.
+        Further pairs are ignored. If `raised` is empty, no value is changed.
         """
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
@@ -189,10 +189,11 @@ class CauseFinder:
         grid: time step and horizon of the signals.
         cache: (formula, wanted) -> the lowered formula (intervals in samples, only basic operators), negated
             if `wanted` is False.
-        known: lowered formula -> ranges of evaluated instants, each with upper bounds on its robustness.
-        tied: table of predicate values, one of them slightly raised, to evaluate instead of the trace; None
-            evaluates the trace.
-        stop: number of samples that the trace will have in the end, if that is more than the recorded ones.
+        known: lowered formula -> list of pairs: a range of instants, and the upper bounds on the robustness
+            at these instants.
+        tied: table of predicate values, one of them slightly raised. If given, it is evaluated instead of the
+            trace.
+        stop: number of samples that the complete trace would have, if the recording is shorter; else None.
     """
 
     record: Record
@@ -205,11 +206,13 @@ class CauseFinder:
     # --------------------------------------------------------------------- ties
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
-        """Explain a truth value of `formula` at `sample` that is the opposite of `wanted`.
+        """Explain why `formula` does not have the truth value `wanted` at `sample`.
 
-        Returns the cause tree, and True if one predicate value decides: a change of this value alone changes
-        the robustness. Several predicate values may be equal to the robustness. The first `MOST_TIED` of them
-        are then tested, and the main path of the tree leads to one that decides, if there is one.
+        Returns:
+            The tree of causes, and a flag. The flag is True if one predicate value decides: a change of this
+            value alone changes the robustness. If several predicate values are equal to the robustness, the
+            first `MOST_TIED` of them are tested. The main path of the tree then leads to one that decides, if
+            there is one.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)
@@ -232,7 +235,10 @@ class CauseFinder:
         return tree, False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
-        """Pairs (predicate, instant) whose value equals the robustness `worth`, in order of time."""
+        """Pairs (predicate, instant), in order of time, whose predicate value is the robustness `worth`.
+
+        Only the predicates in the formula `lowered` are searched.
+        """
         wanted = _leaves_of(lowered)
         found = {
             (node, its.start + int(k)): None
@@ -244,10 +250,10 @@ class CauseFinder:
         return sorted(found, key=lambda spot: spot[1])
 
     def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
-        """Table of the values of all predicates on the trace.
+        """Table of the values of all predicates in `lowered`, at all samples of the trace.
 
-        It is None if one of the instants in `equal` lies after the last sample, or if there are too many
-        values.
+        None is returned if the table would be too large, or if a pair (predicate, instant) in `equal` lies
+        after the last sample.
         """
         leaves = list(_leaves_of(lowered))
         samples = self.record.samples
@@ -259,7 +265,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """Return the tree of causes of a truth value of `formula` at `sample` that is not `wanted`."""
+        """Return the causes for which `formula` does not have the truth value `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -331,7 +337,10 @@ class CauseFinder:
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
-        """Upper bound, per instant, on the margin by which `formula` has value `wanted`: (instants,)."""
+        """Upper bounds on the robustness of `formula`, or of its negation if `wanted` is False.
+
+        There is one value per instant in `instants`: (instants,).
+        """
         lowered = self._lowered(formula, wanted)
         if self.tied is not None:
             lowered = self.tied.coded(lowered)
@@ -348,11 +357,17 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """True if the trace ends too early to decide the formula, so that its margin has no upper bound."""
+        """True if the trace ends too early to decide the truth value of `formula` at `sample`.
+
+        The upper bound that `_margin` returns is then +inf.
+        """
         return self._margin(formula, sample, wanted) == math.inf
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
-        """Values (instants,) that an earlier evaluation stored in `known`; None if there are none."""
+        """Upper bounds, (instants,), on the robustness of `lowered`, if they were computed before.
+
+        They are stored in `known`; None if they are not there.
+        """
         for known, values in self.known.get(lowered, ()):
             if known.start <= instants.start and instants.stop <= known.stop:
                 rows = values[instants.start - known.start : instants.stop - known.start]
@@ -373,18 +388,18 @@ class CauseFinder:
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
     def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
-        """Offset in samples at which a predicate evaluated at `sample` reads a signal."""
+        """Offset from `sample`, at which a predicate is evaluated, to the sample of `leaf` that it reads."""
         if isinstance(leaf, ir.Signal):
             return 0
         there = sample + leaf.steps
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
-        """The (formula, sample, wanted) triple with the least margin."""
+        """Triple (formula, sample, wanted) in `parts` with the least `_margin`."""
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
 
     def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
-        """Upper bound, at one instant, on the margin by which the formula has the truth value `wanted`."""
+        """Upper bound on the robustness of `formula` at `sample`, or of its negation if `wanted` is False."""
         return float(self._margins(formula, wanted, range(sample, sample + 1))[0])
 
     # ---------------------------------------------------------------- connectives
@@ -417,11 +432,12 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """Return two (operand, sample, wanted) triples that explain a failed equivalence.
+        """Return two (operand, sample, wanted) triples that explain a violated equivalence.
 
-        There are two ways for an equivalence to have the value `wanted`: both sides true or both false, if
-        they should be equal; only the left or only the right side true, if they should differ. For each way,
-        the operand with the least margin is returned.
+        `formula` is `a <-> b` or `a xor b`. If both sides should be equal, there are two ways to achieve it:
+        both are true, or both are false. If they should differ, the two ways are: only the left side is true,
+        or only the right side. For each way, the operand that is farthest from its truth value in this way is
+        returned.
         """
         left, right = formula.items
         same = (formula.op == "<->") is wanted
@@ -444,7 +460,7 @@ class CauseFinder:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """Instants in the window of a temporal operator at which its operands are not wholly unknown."""
+        """Instants in the window of `formula` at `sample` at which something is known about its operands."""
         lowered = self._lowered(formula, wanted)
         match lowered:
             case ir.Windowed(window=window, back=False):
@@ -462,9 +478,11 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """The first instant from which on all operands of a formula are unknown.
+        """First instant from which on nothing is known about the operands of the operator `lowered`.
 
-        It lies after the last sample by the lookback of past operators (at most `_MOST_LATER` samples).
+        Without past operators, it is the instant after the last sample. Past operators in an operand still
+        read recorded samples at later instants. The instant is then later by their lookback, at most by
+        `_MOST_LATER` samples.
         """
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
@@ -524,7 +542,11 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """True if the window extends beyond the last instant at which an operand has a known value."""
+        """True if a bounded window extends beyond the instants at which its operands are known.
+
+        It is the window of `formula` at `sample`. The argument `wanted` is the truth value that `formula`
+        should have.
+        """
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
             return False
@@ -532,7 +554,11 @@ class CauseFinder:
         return not instants or instants[-1] < sample + lowered.window.hi
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
-        """Cause of a failed `unless`, rewritten as `always[0, b] left or left until[a, b] right`."""
+        """Causes for which the formula `left unless right` does not have the truth value `wanted`.
+
+        The interval of `unless` is [a, b]. The formula is rewritten as `always[0, b] left or left until[a, b]
+        right`.
+        """
         whole = replace(formula.interval, lo=typed.Time(), lo_open=False)
         held = typed.Temporal(formula.span, "always", whole, formula.left)
         met = typed.Until(formula.span, "until", formula.interval, formula.left, formula.right)
@@ -540,10 +566,12 @@ class CauseFinder:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """Offset in samples of the value that decides a failed `until`; True if it is a value of the left side.
+    """Find the value that decides a violated `until`: its offset, and True if it is one of the left side.
 
-    The robustness of `until` is the maximum, over the instants k of its window, of the minimum of the right
-    side at k and of the left side at all instants up to k.
+    `left` and `right` are robustness values of the two sides, one per instant. `left` begins at the instant
+    at which `until` is evaluated, and `right` at the beginning of its window. The offset counts samples from
+    the beginning of `left`. The robustness of `until` is the maximum, over the instants k of its window, of
+    the minimum of the right side at k and of the left side at all instants up to k.
     """
     skipped = len(left) - len(right)
     held = np.minimum.accumulate(left)[skipped:]
@@ -554,7 +582,11 @@ def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
 
 
 def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
-    """Offsets in samples of the left and right values that decide a failed `release`.
+    """Find the two values that decide a violated `release`.
+
+    `left` and `right` are robustness values of the two sides, one per instant. `left` begins at the instant
+    at which `release` is evaluated, and `right` at the beginning of its window. Offsets count samples from
+    the beginning of `left`.
 
     Returns:
         The offset at which the right side fails, the offset of the greatest left value up to there, and the

@@ -51,11 +51,12 @@ class Cause:
         predicate: text of the deciding predicate.
         span: source location of the deciding predicate.
         readings: values of the signals that the predicate reads at `sample`.
-        place: the part of the requirement to underline first, and its label.
-        labels: the other parts to underline.
+        place: the part of the requirement to underline first, and the text beside it.
+        labels: the other parts to underline, and their texts.
         because: the cause in words, on one line.
         tree: tree of the sub-formulas that explain the violation, down to predicates.
-        alone: whether raising the margin of `predicate` at `sample` alone raises the robustness.
+        alone: whether a larger margin of `predicate` at `sample` suffices to raise the robustness of the
+            requirement.
     """
 
     judgement: Judgement
@@ -181,7 +182,7 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """Labels of the source parts to underline, beginning with the one of the deciding predicate."""
+        """Source locations to underline, each with its text; that of the deciding predicate comes first."""
         found: dict[Span, str] = {}
         for node in _labelled(tree):
             found.setdefault(self.site(node.span), self.label(node))
@@ -190,7 +191,10 @@ class _Words:
         return [Label(span, found[span]) for span in spans]
 
     def label(self, node: CauseNode) -> str:
-        """Label of a node: truth value and instant; signal values for the left side of an implication."""
+        """Text beside the underlined source of `node`: its truth value, and the instant.
+
+        For the left side of an implication, the values of the signals that it reads are added.
+        """
         moment = self.subject.moment(node.sample)
         if node.until is not None:
             window = f"from {moment} to {self.subject.moment(node.until)}"
@@ -228,7 +232,11 @@ class _Words:
         return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
-        """Chain of names that leads from `expr` to the definition containing `span`; None without one."""
+        """Names of the definitions through which the source expression `expr` refers to location `span`.
+
+        Example: `expr` names the definition `a`, and `a` names `b`, whose text contains `span`: the names are
+        `a` and `b`. Empty if `span` lies in `expr` itself; None if no name leads to it.
+        """
         if _within(span, expr.span):
             return ()
         for name in names_in(expr):
@@ -240,7 +248,10 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """Pairs (signal, sample) of a predicate in the order of its text, signals of named definitions last."""
+    """Pairs (signal, offset in samples) that a predicate reads, in the order of the signals in its text.
+
+    Signals that the predicate reads only through a named definition come last.
+    """
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
     return sorted(
@@ -249,7 +260,11 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 
 
 def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
-    """Nodes that get a label: left sides of implications, bodies that never hold in a window, predicates."""
+    """Yield the nodes of a tree of causes whose source is underlined.
+
+    These are left sides of implications, bodies of temporal operators that hold nowhere in the window, and
+    predicates. Nothing inside an underlined part is underlined again.
+    """
     if tree.premise or tree.until is not None or not tree.parts:
         yield _body(tree)
         return
@@ -258,12 +273,19 @@ def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
 
 
 def _deciding(tree: CauseNode) -> CauseNode:
-    """The labelled node that contains the deciding predicate."""
+    """Node whose source is underlined first: it contains the predicate that decides the violation.
+
+    It is the body of a temporal operator if this body holds nowhere in the window. Otherwise it is the
+    predicate itself.
+    """
     return _body(tree) if tree.until is not None or not tree.parts else _deciding(tree.parts[tree.main])
 
 
 def _closest(tree: CauseNode) -> bool:
-    """True if the deciding predicate fails in a whole window; its instant closest to truth is then shown."""
+    """True if the deciding predicate fails at every instant of a window.
+
+    The explanation then shows the instant at which it comes closest to being true.
+    """
     if not tree.parts:
         return False
     part = tree.parts[tree.main]

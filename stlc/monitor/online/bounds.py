@@ -47,7 +47,13 @@ class Tracker(Protocol):
         """Number of samples received."""
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples; the arguments are those of `Side.grow`."""
+        """Add new samples.
+
+        Args:
+            signals: signal name -> stored samples (stored, traces), up to the newest sample.
+            first: index in the trace of the first stored sample.
+            samples: number of samples that the trace now has.
+        """
 
     @property
     def settled(self) -> int:
@@ -57,7 +63,10 @@ class Tracker(Protocol):
         """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at instants `starts` after the trace has ended; unbounded windows are clipped at its end."""
+        """Bounds at the instants `starts` after the trace has ended.
+
+        Windows to the end of the trace end with the last sample.
+        """
 
     def drop(self, start: int) -> int:
         """Free the memory of instants before `start`; returns the index of the first sample still needed."""

@@ -55,11 +55,11 @@ class ColumnReader:
 
     Args:
         formulas: formulas; each predicate is the value of a column.
-        end: value of rows after the last one: "lower" -inf, "upper" +inf, "both" the two side by side;
-            "truncate" clips windows at the last row.
+        end: value of columns after their last row: "lower" -inf, "upper" +inf, "both" these two side by side.
+            With "truncate", windows are clipped at the last row.
         going_on: whether the trace continues after the last row.
-        back: lookback of the formulas in rows. Rows further back than this before the first requested row
-            are not read; unknown values (NaN) in them do not matter.
+        back: number of rows before the first requested row that the formulas read. Unknown values (NaN) in
+            earlier rows have no effect.
     """
 
     def __init__(
@@ -111,7 +111,10 @@ class ColumnReader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
-        """The evaluator of the lower (`least`) or upper bounds if the columns `holes` have unknown values."""
+        """Evaluator of the lower (`least`) or upper bounds on all formulas.
+
+        It takes the values of the columns `holes` as partly unknown.
+        """
         key = (holes, least)
         if key not in self._unsure:
             formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
@@ -121,15 +124,16 @@ class ColumnReader:
 
 @dataclass(slots=True)
 class Side:
-    """Columns (time series of predicates and past operators) of a formula, evaluated for one or both bounds.
+    """Columns of a formula (time series of its predicates and past operators), for bounds on its robustness.
 
     Attributes:
         plan: the columns to compute.
         end: value of predicates after the last sample: "lower" -inf, "upper" +inf, "both" the two side by
             side as (rows, 2); "truncate" clips windows at the last sample.
-        beyond: number of rows after the last sample that the formula reads.
+        beyond: number of instants after the last sample at which the formula reads its columns.
         truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
-        least: bound of predicates that read unknown samples (NaN): True lower, False upper, None both.
+        least: bound that replaces a predicate if it reads unknown samples (NaN): True lower, False upper,
+            None both.
         rows: column name -> view of its stored rows, the first of which is sample `base`.
         history: storage of the rows.
     """
@@ -166,7 +170,10 @@ class Side:
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
 
     def _farthest(self) -> int:
-        """Number of rows to store after the last sample: the formula or other columns read them."""
+        """Number of instants after the last sample for which the columns must have a value.
+
+        It is the farthest that the formula or another column reads ahead; 0 if windows are clipped.
+        """
         if self.end == "truncate":
             return 0
         pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
@@ -217,9 +224,9 @@ class Side:
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
-        """Return the columns for a trace that ends with the last sample, at which windows are clipped.
+        """Return a copy that treats the last sample as the end of the trace, at which windows are clipped.
 
-        If no column looks ahead, the end makes no difference, and `self` is returned.
+        If no column reads later samples, the end makes no difference, and `self` is returned.
         """
         if self._last is None or all(stream.ahead == 0 for stream in self.plan.streams):
             return self
@@ -229,11 +236,11 @@ class Side:
         return last
 
     def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
-        """Return values (count, traces) of the formulas of `reader` at `count` samples from `start` on."""
+        """Return the values (count, traces) of the formulas in `reader` at `count` samples, from `start`."""
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
-        """Free the rows before sample `first`, except those that the recursion of a past operator reads."""
+        """Free the rows before sample `first`; keep rows that an unbounded past operator still needs."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
         if (base := min([first, *needs])) > self.base:
             self.history.forget(base)
@@ -259,8 +266,8 @@ def _of_the_present(stream: DerivedColumn) -> bool:
 def shareable(plans: ColumnPlans) -> bool:
     """True if one formula gives the lower and the upper bound, so that both are computed together.
 
-    This is so if the formulas in `plans` are equal, every predicate reads the signals at its own sample only,
-    and unbounded past operators have no operand that looks ahead.
+    `plans` contains a formula for each bound. The result is True if these formulas are equal, every predicate
+    reads the signals at its own sample only, and unbounded past operators have no operand that looks ahead.
     """
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(

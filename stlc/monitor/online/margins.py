@@ -28,11 +28,12 @@ class Margin:
     """Bounds on the robustness margin of a requirement at the latest sample, (traces,) each.
 
     Attributes:
-        low: least robustness over all continuations of the trace; for a requirement that is evaluated at
-            every sample, the minimum over the windows that contain the latest sample.
+        low: least robustness over all continuations of the trace. If the requirement is evaluated at every
+            sample, this is the minimum over the windows that contain the latest sample.
         high: greatest robustness over all continuations; the same minimum over windows is taken.
-        violated: number of window starts at which the requirement is violated, whatever samples follow.
-        open: whether at some window start the requirement is still undecided.
+        violated: number of window starts (samples at which the requirement is evaluated) at which it is
+            violated, whatever samples follow.
+        open: whether the requirement is still undecided at some window start.
     """
 
     low: Floats
@@ -41,7 +42,11 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Status of a trace: violated if violated at any window start, satisfied if at every one."""
+        """Status of one trace: `violated`, `satisfied` or `inconclusive`.
+
+        It is violated if the requirement is violated at any window start, and satisfied if it is satisfied at
+        every one.
+        """
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -49,13 +54,15 @@ class Margin:
 
 @dataclass(slots=True)
 class _Watched:
-    """A requirement with its running counts; window starts before `next` are settled (their value is final).
+    """A requirement, and its counts over window starts (the samples at which it is evaluated).
+
+    A window start is settled if its value can no longer change with later samples.
 
     Attributes:
         rule: the requirement.
         horizon: horizon `T` of the planning window in steps; None if unknown.
         whole: evaluator of the bounds over all continuations of the traces.
-        next: the first window start that is not settled.
+        next: the first window start that is not settled; all earlier ones are.
         violated: number of settled window starts that are violated, (traces,).
         last: margins at the latest sample; None before the first evaluation.
     """
@@ -93,7 +100,7 @@ class _Watched:
         return max(self.next - history(self.rule.formula), 0)
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """Margin at the latest sample, which has index `samples` - 1; updates the counts.
+        """Margin of the requirement at the latest sample, which has index `samples` - 1; updates the counts.
 
         `env` contains the stored samples of each signal, (stored, traces), beginning with sample `first`.
         """
@@ -123,14 +130,17 @@ class _Watched:
         return self.last
 
     def _settled(self, samples: int) -> int:
-        """The first window start whose value may still change."""
+        """The first window start whose value may still change after `samples` samples."""
         if self.ahead is None:
             return 0
         whole = max(samples - self.ahead, 0)
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Number of unsettled window starts to leave out: their windows end before the latest sample."""
+        """Number of window starts, from `next` on, to leave out of the margin at the latest sample.
+
+        Their windows end before that sample; `samples` is the number of samples received.
+        """
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)
@@ -139,9 +149,8 @@ class _Watched:
 class Margins:
     """Robustness margins of every requirement on many traces that grow together.
 
-    Memory is bounded by the windows of the requirements; requirements that read the whole trace are the
-    exception. `push` only stores a sample; `evaluate` processes all samples since the previous call, for all
-    traces, at once.
+    Memory is bounded by the windows of the requirements, except for requirements that read the whole trace.
+    `push` only stores a sample. `evaluate` processes all samples stored since its previous call.
 
     Args:
         rules: compiled requirements.

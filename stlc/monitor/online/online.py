@@ -88,8 +88,9 @@ class Watched:
         everywhere: whether the requirement is evaluated at every sample or only at one.
         values: evaluator of the robustness.
         truths: evaluator of truth values, +inf or -inf; None if the tolerance is not 0.
-        tolerance: as in `How`.
-        tally: summary of the counted instants, those whose verdict is final.
+        tolerance: the requirement is satisfied if its robustness is at least minus this value; with 0, the
+            truth values of the predicates decide.
+        tally: summary of the instants whose verdict is final; these instants are called counted.
         decided: True for instants after the counted ones that already have a verdict, (instants,).
     """
 
@@ -138,7 +139,10 @@ class Watched:
         return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Free the memory of settled instants; returns the index of the first sample still needed."""
+        """Free the memory of instants whose value is final.
+
+        Returns the index of the first sample that is still needed.
+        """
         return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
 
 
@@ -208,12 +212,12 @@ class Online:
         return tuple(found)
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> None:
-        """Add many samples at once: arrays (time,) by signal name, or a piece of a trace.
+        """Add many samples at once: arrays (time,) by signal name, or a trace or a part of it.
 
         Verdicts are counted, but not returned one by one.
 
         Raises:
-            TraceError: as `push`.
+            TraceError: the errors of `push`.
         """
         laid = arrange(signals, self._needs, plain=True)
         columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
@@ -226,7 +230,10 @@ class Online:
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
-        """Add the NaN in a signal's next values (samples,) to `gaps`. Raises TraceError (E604) for inf."""
+        """Count the unknown samples (NaN) among the next `values` (samples,) of the signal `need` in `gaps`.
+
+        Raises TraceError (E604) if a value is infinite.
+        """
         if np.isinf(values).any():
             first = int(np.argmax(np.isinf(values)))
             moment = f"sample {self.samples + first}"
@@ -258,12 +265,15 @@ class Online:
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
-        """Range (start, stop) of the received instants that are not yet counted in the tally."""
+        """Range (start, stop) of the received instants that are not yet part of the summary `tally`."""
         start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
         return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Append to `found` the verdicts that the latest sample decides, and count settled instants."""
+        """Append to `found` the verdicts that the latest sample decides.
+
+        Instants whose value can no longer change are added to the summary `tally`.
+        """
         start, stop = self._pending(watched)
         judged = watched.judged(start, stop)
         known = judged.holds | judged.fails
@@ -280,20 +290,26 @@ class Online:
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
 
     def _countable(self, watched: Watched) -> int:
-        """The first instant that cannot be counted yet: its value may change, or its window is incomplete."""
+        """The first instant that cannot yet be added to the summary of final verdicts.
+
+        Its value may still change, or its window is incomplete.
+        """
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Add the settled instants of `judged` (their value is final) to the tally; returns their number."""
+        """Add the instants of `judged` whose value is final to the summary `tally`; return their number."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count
 
     def _count_settled(self, requirements: Sequence[Watched]) -> None:
-        """Pass the latest samples to the requirements' evaluators, and count newly settled instants."""
+        """Pass the latest samples to the evaluators of `requirements`.
+
+        Instants whose value can no longer change are then added to the summary of each requirement.
+        """
         for watched in requirements:
             if watched.due(self.samples):
                 watched.grow(self._history)
@@ -331,7 +347,11 @@ class Online:
         return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Triples (window start, least, greatest robustness) for all starts whose value may still change."""
+        """Triples (sample, least robustness, greatest robustness) of the requirement `name`.
+
+        There is one triple for each sample at which the requirement has been evaluated and its value may
+        still change.
+        """
         watched = self._find(name)
         if watched.over or not self.samples:
             return []
@@ -341,9 +361,10 @@ class Online:
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
     def standing(self, name: str) -> Tally:
-        """Summary of a requirement over all instants at which it has been evaluated up to now.
+        """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
 
-        At an instant whose robustness may still change, its lower and upper bound are counted.
+        At a sample where the robustness may still change, the summary uses the lower and the upper bound on
+        it.
         """
         return self._standing(self._find(name))
 
@@ -356,7 +377,7 @@ class Online:
 
     @property
     def in_scope(self) -> bool | None:
-        """True or False if the assumptions hold or fail at the first sample, None if that is undecided."""
+        """True if the assumptions hold at the first sample, False if they fail, None if that is undecided."""
         if not self.samples:
             return None if self._scope else True
         found = {self._standing(watched).status for watched in self._scope}
@@ -405,7 +426,8 @@ class Online:
 
         None is returned if the monitor was made without option `reasons`, if the requirement is not violated,
         or if the samples that show the cause were dropped. The monitor stores the latest two to four million
-        numbers; before it drops samples, it stores the causes of the worst violations in them.
+        numbers. Before it drops samples, it finds and stores the causes of the worst violations that these
+        samples show.
         """
         watched = self._find(name)
         worst = None if self._buffer is None else self._worst(watched)
@@ -419,7 +441,7 @@ class Online:
 
 
 def _number(sample: Sample, need: Need) -> float:
-    """Value of a signal in a sample; `q[0]` may also be given as a component of the vector `q`."""
+    """Value of the signal `need` in a sample; `q[0]` may also be given as a component of the vector `q`."""
     value = sample.get(need.column.name)
     if isinstance(value, float):
         return value

@@ -47,7 +47,8 @@ _FROZEN = 500
 def span(formula: ir.Formula) -> Reach:
     """Return the lookback and lookahead of a formula in samples, each summed over nested operators.
 
-    Among several operands the greatest value counts; an unbounded window counts with its lower bound only.
+    If an operator has several operands, the greatest value counts. Of an unbounded window only the lower
+    bound counts.
     """
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
@@ -60,8 +61,8 @@ class PacedWork:
 
     Attributes:
         rows: number of all rows.
-        own: number of rows that are computed for one instant only, such as those inside a `freeze`; other
-            instants cannot use them.
+        own: number of rows that are of use at one evaluated instant only, such as those inside a `freeze`.
+            Other rows are shared by several instants.
         heaviest: the subformula to which most of the rows in `own` belong.
     """
 
@@ -104,12 +105,13 @@ def _unbounded(formula: ir.Formula) -> bool:
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Return a formula with shorter windows and, for streams of at most `samples` samples, the same value.
+    """Shorten a formula's windows so that its value on streams of at most `samples` samples stays the same.
 
-    At instants far after the last sample nothing is known, and each sub-formula has the same value at all of
-    them. A future window therefore need not contain more than one of these instants. A past window need not
-    reach back beyond the first sample. Future windows are shortened only if past windows are narrow, and past
-    windows only if future windows are narrow. If both are wide, the formula is unchanged.
+    Returns the new formula. At instants far after the last sample nothing is known, and each sub-formula has
+    the same value at all of them. A future window therefore need not contain more than one of these instants.
+    A past window need not reach back beyond the first sample. Future windows are shortened only if past
+    windows are narrow, and past windows only if future windows are narrow. If both are wide, the formula is
+    unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))
@@ -162,7 +164,7 @@ class PacedTracker:
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of one evaluation of `formula` on a piece of the trace with `spanned` samples.
+        """Return the work of one evaluation of `formula` on `spanned` consecutive samples of the trace.
 
         `formula` is the formula of the requirement, or this formula with shorter windows.
         """
@@ -176,7 +178,10 @@ class PacedTracker:
         return samples - self.samples >= self._pace
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples, evaluate, and choose after how many samples to evaluate next."""
+        """Add new samples, evaluate, and choose after how many samples to evaluate next.
+
+        `signals` contains the stored samples, from sample `first` to sample `samples` - 1.
+        """
         if self._most is not None and samples > self._most:
             most = max(samples, _SHORT) * _GROWN
             formula = cut(self.rule.formula, most)

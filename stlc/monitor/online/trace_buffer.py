@@ -71,13 +71,19 @@ class TraceBuffer:
         self._history.forget(self._history.samples - _MOST // self._width)
 
     def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Find and store the cause of a violation, so that the samples that show it can be dropped."""
+        """Find and store the cause of the violation `worst`.
+
+        The samples that show the violation can then be dropped.
+        """
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """Return the cause of a violation; None if its samples were dropped before `remember` was called."""
+        """Return the cause of the violation `worst` of the requirement `rule`.
+
+        None if the samples that show the violation were dropped before `remember` was called.
+        """
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
             return known[1]
@@ -102,11 +108,12 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """Excerpt of the buffer that suffices to explain a violation; None if its samples were dropped.
+        """Excerpt of the buffer that suffices to explain the violation `worst` of the requirement `rule`.
 
         Returns:
-            Index of the first sample of the excerpt, offset in samples from it to the instant at which to
-            explain the violation, and arrays (samples, 1) by signal name.
+            The index in the trace of the first sample of the excerpt; the index in the excerpt of the instant
+            at which to explain the violation; and arrays (samples, 1) by signal name. None if needed samples
+            were dropped.
         """
         history = self._history
         formula, horizon = rule.lowered, self.compiled.grid.horizon
@@ -130,7 +137,11 @@ class TraceBuffer:
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """True if the requirement is an `always` over an unbounded window, with a body of bounded windows."""
+    """True if `formula` is an `always` over an unbounded window, and its body has only bounded windows.
+
+    `formula` is that of the requirement `rule`. False if the requirement is evaluated for every planning
+    window.
+    """
     return (
         isinstance(formula, ir.Temporal)
         and formula.op == "always"
@@ -141,7 +152,11 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Numbers of samples before and after an instant on which its value depends; None if unbounded."""
+    """Numbers of samples before and after an instant that determine the value of `formula` at the instant.
+
+    `formula` is that of the requirement `rule`; `horizon` is the length of a planning window in steps. None
+    if a number is unbounded.
+    """
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None

@@ -38,7 +38,9 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """Return a formula whose value bounds that of `formula`, at whichever later sample the trace ends.
+    """Return a formula whose value bounds that of `formula` on a trace that is still growing.
+
+    The bound holds for every sample, now or later, with which the trace may end.
 
     Args:
         formula: the formula to bound.
@@ -52,10 +54,12 @@ def worst(
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """Return the columns (time series of subformulas) for the lower bound and for the upper bound.
+    """Return the columns (time series of subformulas) for two bounds: the lower and the upper one.
 
-    If windows are clipped at the end of the trace, the columns for the lower and upper bound of the formula
-    with clipped windows follow; these bounds differ only where samples are unknown (NaN).
+    If windows are clipped at the end of the trace, the list has two more entries: the columns of the formula
+    with clipped windows, for its lower and its upper bound. These two bounds differ only where samples are
+    unknown (NaN). `beyond` is the number of instants after the last sample at which the formulas read
+    columns.
     """
     sides = [
         Side(plans["lower"], "lower", beyond, options.truth),
@@ -68,7 +72,10 @@ def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[
 
 
 def first_needed(planned: ColumnPlan, samples: int) -> int:
-    """Return the index of the first sample that later evaluations of the predicates in `planned` read."""
+    """Return the index of the first sample that is still needed after `samples` samples.
+
+    Later evaluations of the predicates in `planned` read no sample before it.
+    """
     predicates = [stream for stream in planned.streams if isinstance(stream, PredicateColumn)]
     return max(min((samples - each.ahead - each.back for each in predicates), default=samples), 0)
 
@@ -79,8 +86,9 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 class _CutTracker(ABC):
     """Base of evaluators for requirements whose windows may be clipped at the end of the trace.
 
-    With clipped windows, the value at a settled instant (one that no later sample affects) is computed on the
-    clipped formula. Bounds at other instants are computed on the whole formula, with later samples unknown.
+    An instant is settled if no later sample can change its value. If windows are clipped, the values at
+    settled instants are computed with clipped windows. At the other instants, the bounds are computed with
+    whole windows, and later samples are unknown.
     """
 
     __slots__ = ()
@@ -97,17 +105,23 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def certain(self, starts: range) -> Bounds:
-        """Return bounds at settled instants, with windows clipped at the end of the trace."""
+        """Return bounds at the instants `starts`, with windows clipped at the last sample.
+
+        The method is called for instants that no later sample can change, and after the trace has ended.
+        """
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Return bounds at instants `start` to `stop` (exclusive); samples outside the trace are unknown."""
+        """Return bounds at the instants from `start` to `stop` (exclusive), without clipping windows.
+
+        Samples outside the trace are unknown.
+        """
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Return bounds over all continuations of the trace at instants `start` to `stop` (exclusive).
+        """Return bounds over all continuations of the trace at the instants `start` to `stop` (exclusive).
 
-        A predicate that reads a signal before the first sample is unknown. If windows are clipped at the end
-        of the trace, such a predicate counts as false.
+        A predicate that reads a signal before the first sample is false if windows are clipped at the end of
+        the trace, and unknown otherwise.
         """
         middle = min(max(self.settled, start), stop)
         if not self.cuts or middle <= start:
@@ -124,11 +138,12 @@ class _CutTracker(ABC):
 class _ColumnTracker(_CutTracker):
     """Evaluator of a formula over columns (time series of its predicates and past operators).
 
-    The columns are evaluated for both bounds, and twice more if windows are clipped at the end of the trace.
+    There is one set of columns for the lower and one for the upper bound. If windows are clipped at the end
+    of the trace, two more sets belong to the bounds with clipped windows.
 
     Attributes:
-        plans: decompositions into columns: "lower" of the lower bound, "upper" of the upper bound, "truncate"
-            of the formula itself.
+        plans: decompositions into columns: under "lower" that of the formula for the lower bound, under
+            "upper" that for the upper bound, under "truncate" that of the formula itself.
         options: options of the evaluation.
         samples: number of samples received.
     """
@@ -162,7 +177,10 @@ class _ColumnTracker(_CutTracker):
 
     @abstractmethod
     def _values(self, which: int, start: int, stop: int) -> Floats:
-        """Values (instants,) of one bound: `which` is 0 lower, 1 upper; 2 and 3 with clipped windows."""
+        """Values (instants,) of one bound at the instants from `start` to `stop` (exclusive).
+
+        `which` is 0 for the lower and 1 for the upper bound; with clipped windows it is 2 and 3.
+        """
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
@@ -192,7 +210,7 @@ class BoundedTracker(_ColumnTracker):
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples."""
+        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
@@ -210,7 +228,9 @@ class BoundedTracker(_ColumnTracker):
 
 @dataclass(slots=True)
 class IntervalColumns:
-    """Evaluator of several formulas with bounded windows whose instants become settled at the same time.
+    """Evaluator of several formulas with bounded windows and a common delay.
+
+    The delay is the number of later samples after which the value at an instant is final.
 
     The formulas share columns (time series of their predicates and past operators), (rows, 2), which hold the
     least and the greatest value over all continuations of the trace. One evaluation gives both bounds of all
@@ -237,7 +257,13 @@ class IntervalColumns:
         return IntervalTracker(self, len(self._starts) - 1, reach(formula).future)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples; the arguments are those of `Side.grow`."""
+        """Add new samples to all formulas.
+
+        Args:
+            signals: signal name -> stored samples (stored, traces), up to the newest sample.
+            first: index in the trace of the first stored sample.
+            samples: number of samples that the trace now has.
+        """
         if samples == self.samples:
             return
         if not self.samples:
@@ -251,13 +277,19 @@ class IntervalColumns:
         self.samples, self._found = samples, None
 
     def values(self, which: int, start: int, stop: int) -> Floats:
-        """Return both bounds of formula number `which` at consecutive instants, (instants, 2)."""
+        """Return the lower and the upper bound of formula number `which`, (instants, 2).
+
+        The instants are those from `start` to `stop` (exclusive).
+        """
         if self._found is None or self._found[0] != (start, stop):
             self._found = (start, stop), self.side.values(self._reader, start, stop - start)
         return self._found[1][which]
 
     def drop(self, which: int, start: int) -> None:
-        """Drop the rows that no formula needs, now that number `which` needs no instant before `start`."""
+        """Drop the rows that no formula needs any more.
+
+        Formula number `which` needs no instant before `start` from now on.
+        """
         self._starts[which] = start
         self.side.drop(min(self._starts) - self._back)
 
@@ -287,7 +319,7 @@ class IntervalTracker:
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples."""
+        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> Bounds:
@@ -310,10 +342,10 @@ class IntervalTracker:
 class PlanningWindowTracker(_ColumnTracker):
     """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
 
-    The planning window of instant k ends with sample k + `window`; the value at k depends on the samples up
-    to there. An interval of the formula may extend beyond that end. A past operator that is evaluated there
-    still reads samples before the end; it is computed with unknown predicates beyond the end. In this case
-    samples are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
+    The planning window of instant k ends with sample k + `window`. The value at k depends on the samples up
+    to there. An interval of the formula may extend beyond this end. A past operator that is evaluated beyond
+    the end still reads samples before it, while predicates beyond the end are unknown. In this case samples
+    are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
 
     Attributes:
         window: samples from an instant to the end of its planning window.
@@ -337,7 +369,7 @@ class PlanningWindowTracker(_ColumnTracker):
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples."""
+        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -373,7 +405,10 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Values (instants,) at `starts` if the formula reads past operators after its planning window."""
+        """Values (instants,) at `starts`, for a formula with past operators after its planning window.
+
+        `record` contains the columns (time series of subformulas) of `side`.
+        """
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
         ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
@@ -386,7 +421,10 @@ class PlanningWindowTracker(_ColumnTracker):
 
 
 def _remembers(planned: ColumnPlan) -> bool:
-    """True if a past operator or a lookback gives a column known values after the last sample."""
+    """True if a column (time series of a subformula) has known values after the last sample.
+
+    This is possible for a past operator, a predicate that reads earlier samples, and a `freeze`.
+    """
     return any(
         isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
@@ -421,7 +459,7 @@ class UnboundedTracker:
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples."""
+        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
@@ -442,7 +480,7 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Free the samples that the state of the recursion (`UnboundedState`) already accounts for.
+        """Free the samples that the coefficients in `UnboundedState` already account for.
 
         Returns the index of the first sample that is still needed.
         """
@@ -484,7 +522,7 @@ class RecomputeTracker(_CutTracker):
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Add new samples."""
+        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
         self._signals, self.samples = signals, samples
 
     @property
@@ -502,7 +540,10 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Return least and greatest values over all continuations of the traces, each (instants, traces)."""
+        """Return least and greatest robustness at `starts`, each (instants, traces).
+
+        The bounds hold for all continuations of the traces.
+        """
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
@@ -536,7 +577,8 @@ class RecomputeTracker(_CutTracker):
 class Trackers:
     """Factory of incremental evaluators (trackers).
 
-    Requirements whose values become final the same number of samples after an instant share one evaluation.
+    Requirements with the same delay may share one evaluation. The delay is the number of later samples after
+    which the value at an instant is final.
 
     Attributes:
         horizon: horizon `T` of the planning window in steps; None if unknown.
@@ -599,10 +641,11 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with windows to `end` bounded by `window` samples, the planning window's length.
+    """Return the formula with bounded windows in place of windows up to `end`.
 
-    None is returned if `end` occurs inside another temporal operator or in the function `sweep` (motion
-    between samples), or if a bounded window extends beyond `end`: the bounded formula would then differ.
+    `window` is the number of samples from an instant to `end`, the end of its planning window. None is
+    returned if a bounded formula would have another value: `end` occurs inside another temporal operator or
+    in the function `sweep` (motion between samples), or a bounded window extends beyond `end`.
     """
     moved = _ended(formula, window)
     return None if endless(moved) or uses_end(moved) or reach(moved).future > window else moved

@@ -49,7 +49,7 @@ class UnboundedOperators:
 
     Columns (time series) `$0`, `$1`, … replace the subformulas without unbounded operators. Columns `!0`,
     `!1`, … stand for the values of the unbounded operators on the samples that are not received yet.
-    Operators are rewritten such that their windows begin at 0.
+    Operators are rewritten so that their windows begin at 0.
 
     Attributes:
         root: the formula over columns.
@@ -70,7 +70,10 @@ class UnboundedOperators:
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
-        """Number of unknown samples to append for the bounds: more of them would not change the values."""
+        """Number of unknown samples to append to the known ones when bounds are computed.
+
+        More of them would not change the bounds. `plan` contains the columns (time series of subformulas).
+        """
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
 
@@ -95,7 +98,10 @@ def skeleton(formula: ir.Formula) -> UnboundedOperators:
 
 
 def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """The formula `steps` samples after an instant, over columns; new columns are added to `found`."""
+    """Rewrite `formula`, evaluated `steps` samples after an instant, as a formula over columns.
+
+    A column is the time series of a subformula; missing columns are added to `found`.
+    """
     if not endless(formula):
         return _part(formula, steps, found)
     match formula:
@@ -131,7 +137,7 @@ def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
 
 
 def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
-    """Name of the column of a formula; the column is added if there is none."""
+    """Name of the column in `columns` that belongs to `formula`; a missing column is added."""
     for name, known in columns.items():
         if known == formula:
             return name
@@ -140,7 +146,9 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Rewrite an unbounded `until` over the samples received and the column of its value on later samples.
+    """Rewrite an unbounded `until` as a formula over samples received and its unknown value on later ones.
+
+    This later value is a column (time series) of its own.
 
     An `until` holds in two cases: it is satisfied on the samples received, or its left side is true at all of
     them and it is satisfied later. `release` is the same with `and` and `or` exchanged.
@@ -205,7 +213,10 @@ class UnboundedState:
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
-        """Update the coefficients of the polynomial so that they account for the samples before `settled`."""
+        """Move the frontier `at` to sample `settled`.
+
+        The coefficients of the polynomial then account for all samples before `settled`.
+        """
         count = settled - self.at
         if count <= 0:
             return
@@ -220,7 +231,10 @@ class UnboundedState:
         self.at = settled
 
     def value(self, samples: int) -> Floats:
-        """The bound (traces,) while the trace continues; unknown samples are appended to the known ones."""
+        """The bound (traces,) after `samples` samples, while the trace continues.
+
+        It is computed with unknown samples appended to the known ones.
+        """
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
             env[name] = np.full(env[NOTHING].shape, _neutral(origin))
@@ -236,7 +250,7 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at sample `at` of all unbounded operators, one row each.
+        """Values at sample `at` of all unbounded operators, one row each; `env` contains the columns.
 
         Before the first `advance`, the only row is the value of the whole formula.
         """
@@ -262,7 +276,9 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Evaluate the polynomial; `rests` are values of the operators, (operators, points, traces).
+        """Evaluate the polynomial at several points; a point is one value for every unbounded operator.
+
+        `rests` contains the points, (operators, points, traces).
 
         Returns:
             Values of the formula, (points, traces).

@@ -55,7 +55,11 @@ class _Topic:
 
     @staticmethod
     def of(log: Log, name: str, definition: str, form: Form) -> _Topic:
-        """Return the topic with its decoder; if `definition` is invalid, store the reason in `log.unread`."""
+        """Return the topic with the decoder of its messages.
+
+        `definition` is the text of the message definition, `form` the encoding: "ros1" or "cdr" (ROS 2). If
+        the definition is invalid, the decoder is None, and the reason is stored in `log.unread`.
+        """
         try:
             return _Topic(name, decoder(definition, form))
         except DamageError as error:

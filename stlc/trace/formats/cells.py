@@ -89,7 +89,10 @@ def _loaded(body: str, delimiter: str, columns: Sequence[int] | None) -> Array |
 
 @dataclass(frozen=True, slots=True)
 class _Repair:
-    """Patterns of cells that NumPy's reader refuses and that `_mended` rewrites."""
+    """Patterns of cells that NumPy's reader refuses, such as empty or quoted ones.
+
+    The function `_mended` uses them to rewrite these cells.
+    """
 
     empty: re.Pattern[str]
     quoted: re.Pattern[str]

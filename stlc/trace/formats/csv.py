@@ -60,7 +60,7 @@ class _Sheet:
 
 
 def read(path: Path) -> Recording:
-    """Return the content of a `.csv` file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
+    """Return the content of a `.csv` file. Raises the errors of `read_csv` and of `of_table`."""
     return of_table(path, read_csv(path))
 
 
@@ -70,7 +70,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` lines. Raises as `read`."""
+    """Yield the trace of a file in chunks of `samples` lines. Raises the errors of `read`."""
     with path.open("rb") as file:
         header = next((line for line in file if line.strip()), b"")
         while lines := list(islice(file, samples)):
@@ -92,7 +92,10 @@ def read_csv(path: Path) -> Table:
 
 
 def table_of_text(path: Path, data: bytes) -> Table:
-    """Return the columns of file content `data`; `path` is for messages. Raises TraceError as `read_csv`."""
+    """Return the columns of file content `data`; `path` is for messages.
+
+    Raises TraceError in the same cases as `read_csv`.
+    """
     if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
         return table
     sheet = _sheet(path, data)
@@ -110,7 +113,7 @@ def _read(path: Path) -> bytes:
 
 
 def _read_large(path: Path, data: bytes) -> Table | None:
-    """Read the columns of a large file of numbers at once; None if only the slower reader can read it."""
+    """Read the columns of a large file of numbers in one step; None if only the slower reader can read it."""
     try:
         sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
         names, units = _read_header(sheet)
@@ -317,7 +320,8 @@ def write(path: Path | str, trace: Trace) -> None:
     """Write the signals of a trace, one line per sample; if there are several traces, a column numbers them.
 
     Raises:
-        TraceError: E605, a signal is called `trace` or `agent`, or as `write_csv`.
+        TraceError: E605, a signal is called `trace` or `agent`, or has a name that would be read back
+            differently.
         MissingError: R201, no space left or no permission.
     """
     if grouped := [name for name in trace.data if name in GROUPS]:

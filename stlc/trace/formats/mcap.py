@@ -256,7 +256,7 @@ def _schema(trace: Trace) -> dict[str, object]:
 
 
 def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
-    """Restore the trace that stlc wrote to a file from its messages and the metadata `ours`.
+    """Return the trace that stlc wrote to a file, given its messages (`log`) and its metadata (`ours`).
 
     None is returned if the messages no longer fit together, because the file was changed afterwards.
     """

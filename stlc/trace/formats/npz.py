@@ -215,7 +215,7 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
 
 
 def read(path: Path) -> Recording:
-    """Return the content of a trace file. Raises as `read_npz`, and TraceError (E603) for a bad `meta`."""
+    """Return the content of a trace file. Raises the errors of `read_npz`, and E603 for a bad `meta`."""
     arrays = read_npz(path)
     meta, columns = read_meta(path, arrays.pop("meta", None))
     return replace(of_arrays(path, arrays, meta), columns=columns)
@@ -233,7 +233,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` samples. Raises TraceError as `read`."""
+    """Yield the trace of a file in chunks of `samples` samples. Raises the errors of `read`."""
     with ExitStack() as stack, damage(path):
         archive = stack.enter_context(zipfile.ZipFile(path))
         members = {name: ArchiveMember(path, archive, i, stack) for name, i in _infos(path, archive).items()}
@@ -254,7 +254,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write a trace with its extras and metadata. Raises as `write_npz`."""
+    """Write a trace with its extras and metadata. Raises the errors of `write_npz`."""
     arrays: dict[str, Array] = {"t": trace.times, **trace.data}
     arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
     arrays["meta"] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)

@@ -62,7 +62,7 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` rows. Raises as `read`."""
+    """Yield the trace of a file in chunks of `samples` rows. Raises the errors of `read`."""
     file = open_parquet(path, whole=False)
     with damage(path):
         batches = file.iter_batches(batch_size=samples, columns=_names(file))

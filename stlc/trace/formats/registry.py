@@ -1,4 +1,4 @@
-"""Formats of trace files: one table, and helper functions that their readers share.
+"""Formats of trace files: the table `FORMATS`, and helper functions that the readers of files share.
 
 A format is a module of this package and an entry of `FORMATS`. The module contains
 
@@ -7,7 +7,7 @@ A format is a module of this package and an entry of `FORMATS`. The module conta
 - if the format has `chunked` set: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in
   chunks), and `chunks(path, samples) -> Iterator[Recording]`.
 
-It imports optional libraries with `needed`.
+The module imports optional libraries with `needed`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _PACKAGES = {"google": "protobuf"}
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file by its suffix; the first format of the table if the suffix is unknown."""
+    """The format of a file by its suffix; the first format of `FORMATS` if the suffix is unknown."""
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
@@ -94,7 +94,10 @@ def needed(module: str) -> Any:
 
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
-    """Return the error E603: the file cannot be read, or is not safe to read."""
+    """Return the error E603: the file cannot be read, or is not safe to read.
+
+    `why` is the reason, and `advice` the help text; "" if there is no help.
+    """
     return TraceError(
         Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
     )

@@ -211,7 +211,10 @@ class _Cursor:
             yield from _kept(self.value(f"{name}[{i}]", each, depth + 1), wanted)
 
     def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
-        """Yield the numbers of an array if `wanted`; else (images, point clouds) only move past the array."""
+        """Yield the numbers of an array if `wanted`, and move past the array.
+
+        Large arrays such as images and point clouds are not wanted: they are only skipped.
+        """
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
             self.align(size)

@@ -96,7 +96,9 @@ def clock_scale(trace: str, name: str, unit: str) -> float:
 
 
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
-    """Reshape columns (lines,) to (traces, samples); `keys` is the trace of each line.
+    """Reshape columns (lines,) to (traces, samples).
+
+    `keys` tells to which trace each line belongs; `group` is the name of this column.
 
     Raises:
         TraceError: E605, traces differ in length.
