@@ -1,6 +1,7 @@
-"""The search of the paper's guard, on the graphs of an exported controller, without torch.
+"""Search for a plan in place of one that violates the specification, without torch.
 
-In torch, `prefix_shooting` and `longest_safe_prefix` of `stlc.controller.guard.stages` do the same.
+This is the search of the paper's guard, on the ONNX graphs of an exported controller. In torch,
+`prefix_shooting` and `longest_safe_prefix` of `stlc.controller.guard.stages` do the same.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
         graphs: graphs of the controller.
         x: state, (n,).
         plan: plan of the policy, (T, m); entries that are not finite are replaced.
-        rest: remainder of the previous plan, (T, m).
+        rest: rest of the previous plan, extended to (T, m); None if there is no previous plan.
 
     Returns:
         The plan found, as one row.
@@ -87,9 +88,10 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
 
 
 def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
-    """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
+    """Index of the plan that keeps the safety requirements for the longest time.
 
-    Among equal plans the one of highest robustness is taken, then the one with the latest violation.
+    Among plans that keep them equally long, the one of highest robustness is taken, then the one with the
+    least violation (mean over the samples), then the one of least cost. `x` is the state, (n,).
     """
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
     falls = np.concatenate(
@@ -106,7 +108,8 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
     """Index of the best of the allowed choices, by the `keys`, (choices,) each, where larger is better.
 
-    A later key decides between choices that are equal in all earlier ones. NaN is the smallest value.
+    A later key decides between choices that are equal in all earlier ones, up to `TOLERANCE`. NaN is the
+    smallest value.
     """
     for key in keys:
         value = np.where(allowed & ~np.isnan(key), key, -np.inf)

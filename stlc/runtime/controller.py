@@ -241,7 +241,11 @@ class Controller:
     # ------------------------------------------------------------------------ plans
 
     def _followed(self, x: Numbers, elapsed: int) -> tuple[_ChosenPlans, Mapping[str, Numbers]]:
-        """Choose between the policy's plans and the rests of the previous plans, in states (agents, n).
+        """Choose, for each agent, between the policy's plan and the rest of the agent's previous plan.
+
+        Args:
+            x: states, (agents, n).
+            elapsed: number of steps since the previous decision.
 
         Returns:
             The chosen plans, and all outputs of the ONNX graph that chose them.

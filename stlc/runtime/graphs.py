@@ -63,26 +63,32 @@ class Graphs:
         self._decide, self._follow = self._session(DECIDE), self._session(FOLLOW)
 
     def prepare(self) -> None:
-        """Load the graphs of the backup policy now, so that its first decision does not wait for this."""
+        """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
         _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Return the best of the policy's plans in states `x` with verdicts, and the outputs of the graph."""
+        """Return the best of the policy's plans in each state of `x`, and all outputs of the graph.
+
+        The plans are returned with their verdicts, one per row.
+        """
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Choose, in states `x`, between the policy's plans and `begun`, the remaining previous plans.
+        """Choose, in each state of `x`, between the policy's plan and `begun`, the rest of the previous plan.
 
         Returns:
-            The chosen plans with their verdicts, and all outputs of the graph; `kept`, (rows,), marks
-            previous plans.
+            The chosen plans with their verdicts, and all outputs of the graph. The output `kept`, (rows,), is
+                true where the previous plan was chosen.
         """
         found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Return verdicts on plans, and all outputs of the graph, among them `states` (rows, T + 1, n)."""
+        """Return the verdicts on plans that start in the states `x`, and all outputs of the graph.
+
+        The output `states`, (rows, T + 1, n), contains the predicted states.
+        """
         found = _run(self._judge, {"state": x, "plan": plans})
         return _judged(plans, found), found
 

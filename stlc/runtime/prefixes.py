@@ -1,4 +1,4 @@
-"""Prefixes (first controls of a plan) for the backup policy: all of a grid, or a sample of a large grid.
+"""Prefixes (first controls of a plan) that the backup policy tries: all of a grid, or a sample.
 
 Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes.
 There are two ways to sample:
@@ -34,7 +34,7 @@ class PrefixGrid:
     """Grid of prefixes: sequences of the first T0 controls of a plan, each control from a set of values.
 
     Attributes:
-        values: values of each control.
+        values: values that each control takes in the prefixes.
         lengths: lengths T0 of the prefixes, in the order in which they are tried.
         batch: number of trajectories evaluated at a time.
         samples: greatest number of prefixes of one length that are tried.
@@ -52,11 +52,14 @@ class PrefixGrid:
         return int(prod(len(values) for values in self.values) ** length)
 
     def count(self, length: int) -> int:
-        """Number of prefixes of one length that are tried: all of the grid, but at most `samples`."""
+        """Number of prefixes of `length` steps that are tried.
+
+        These are all combinations of the values of the controls, but at most `samples`.
+        """
         return min(self.size(length), self.samples)
 
     def prefixes(self, length: int) -> NDArray[np.float64]:
-        """Return the prefixes of one length that are tried, (count, length, m)."""
+        """Return the prefixes of `length` steps that are tried, (count, length, m)."""
         if self.size(length) > self.samples:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)

@@ -16,9 +16,9 @@ _DEVIATIONS = 3.0
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
     """Return the range that contains nearly all values of a number drawn at random; None if unknown.
 
-    The number is a constant or a sampler such as `uniform` with constant arguments; a constant may be added
-    to the sampler or multiplied by it, as unit conversions do. For `normal` the range is the mean plus or
-    minus three standard deviations.
+    The number is a constant, or a sampler such as `uniform(0, 1)` with constant arguments. The sampler may be
+    scaled and shifted by constants, as in `2 * uniform(0, 1) + 5`; unit conversions do this. For `normal` the
+    range is the mean plus or minus three standard deviations.
     """
     match num:
         case ir.Const(value):

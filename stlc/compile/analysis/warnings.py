@@ -1,4 +1,4 @@
-"""Warnings about requirements: contradictions, vacuous requirements, and discontinuities of a modulo."""
+"""Warnings about requirements: contradictions, vacuous requirements, and jumps of the modulo operator."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """Bounds that predicates impose on a linear form.
+    """Range that the predicates of a conjunction leave for one linear combination of signals.
 
-    `low` is the greatest lower bound and `high` the least upper bound; `low_at` and `high_at` are the
-    predicates that impose them.
+    `low` is the greatest lower bound and `high` the least upper bound. `low_at` and `high_at` are the
+    predicates that set these bounds.
     """
 
     low: float = -math.inf
@@ -118,11 +118,11 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W403 for each predicate with a modulo that is discontinuous within its signals' ranges.
+    """Yield W403 for each predicate with a modulo that jumps within the ranges of its signals.
 
     Args:
         formula: formula whose names and units are resolved.
-        ranges: ranges of signals, declared or never left, each in the unit in which its signal is stored.
+        ranges: ranges of the signals by name, each in the unit in which the signal is stored.
     """
     for node in nodes(formula):
         if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
@@ -152,10 +152,11 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W503 for each implication whose left side is never true.
+    """Yield W503 for each implication in a formula whose left side is never true.
 
-    If there is none, W503 is yielded for a formula that is itself never false. Only ranges that signals never
-    leave (`facts`) are used, since a signal may leave its nominal range.
+    If there is no such implication, W503 is yielded if the formula as a whole is never false. `facts`
+    contains the ranges that signals never leave; other declared ranges are not used, since a signal may leave
+    them. `signature` gives the units for the messages.
     """
     found = False
     for left in _antecedents(formula):
@@ -223,7 +224,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
     """Return a text such as ": `x` is in [0, 5]", the ranges in `facts` of the signals in a formula.
 
-    The text is empty if `facts` contains none of the signals.
+    The text is empty if `facts` contains none of the signals. `signature` gives the units of the signals.
     """
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
@@ -239,7 +240,10 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
 
 
 def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
-    """Return W502 for a `@safety` requirement that no finite prefix of a trace violates, else None."""
+    """Return W502 for a `@safety` requirement that no finite prefix of a trace violates, else None.
+
+    The message points to `tag`, the tag `@safety`, if it is given.
+    """
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):
         return None
@@ -258,7 +262,7 @@ def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -
 
 
 def _constrains(formula: typed.Formula) -> bool:
-    """True if some prefix of a trace, shorter than the horizon, violates the formula.
+    """True if a trace can violate the formula within a prefix that is shorter than the planning horizon.
 
     The formula is in negation normal form.
     """

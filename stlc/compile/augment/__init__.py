@@ -1,1 +1,1 @@
-"""State augmentation: added states (timers, latches, statuses) that carry the mission's past into a plan."""
+"""State augmentation: states added to the system so that a plan knows the past of the mission."""

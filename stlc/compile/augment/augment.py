@@ -53,10 +53,10 @@ def augment(
     """Rewrite the formula of a requirement for training; add the states that it needs to `table`.
 
     Absolute operators (`always@[a, b]` and its like) have an interval that counts from the start of the
-    mission. Findings are appended to `sink`: E307 for an absolute operator that cannot be moved out of the
-    operators around it, E309 for a past operator that no timer represents, E310 for an absolute operator
-    whose operands look too far into the future, E311 for an unknown horizon, E312 for `eventually@` or
-    `until@` without a deadline.
+    mission. `grid` is the time step and the horizon. Findings are appended to `sink`: E307 for an absolute
+    operator that cannot be moved out of the operators around it, E309 for a past operator that no timer
+    represents, E310 for an absolute operator whose operands look too far into the future, E311 for an unknown
+    horizon, E312 for `eventually@` or `until@` without a deadline.
     """
     formula = requirement.formula
     always = typed.Truth(formula.span, True)
@@ -95,7 +95,8 @@ class _Goals:
     def of(self, node: typed.Formula) -> Goal:
         """Return the goal of a formula that is evaluated at the start of the mission.
 
-        The formula has no past operators. Relative operators become absolute ones: at the first sample,
+        The goal consists of absolute formulas (`always@[a, b] p`), joined by `and` and `or`. The formula
+        `node` has no past operators. Its relative operators become absolute ones: at the first sample,
         relative time and mission time are equal. E310 or E312 is appended to `sink` for a formula that is not
         supported.
         """

@@ -1,8 +1,10 @@
-"""Guidance cost: a performance term that drives plans towards deadlines beyond their horizon.
+"""Guidance cost: a term of the plan's cost that drives plans towards deadlines beyond their horizon.
 
-Robustness covers only the horizon. Therefore the open (undecided) goal with the earliest deadline adds the
-violation of its formula, `max(-margin, 0)`, to the cost at every sample, so that plans that approach the goal
-sooner cost less. Once this goal is met, the goal with the next deadline takes over.
+A goal is a formula such as `eventually@[a, b] p`, whose interval counts from the start of the mission. The
+robustness of a plan covers only the horizon of the plan. Therefore the open (undecided) goal with the
+earliest deadline adds its violation to the cost at every sample. The violation is `max(-margin, 0)`, where
+the margin is the robustness of p. So plans that approach the goal sooner cost less. Once this goal is met,
+the goal with the next deadline takes over.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ _ZERO = ir.Const(0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Guidance:
-    """Violation of a goal, and the time left for the goal.
+    """Violation of a goal such as `eventually@[a, b] p`, and the time left for the goal.
 
-    The guidance cost is computed from these values.
+    The guidance cost, a term of the plan's cost, is computed from these values.
 
     Attributes:
-        gap: violation of the goal, `max(-margin, 0)`.
+        gap: violation of the goal, `max(-margin, 0)`, where the margin is the robustness of p.
         left: steps until its deadline; `_DONE` if it is already met, `_LOST` if it can no longer be met.
     """
 
@@ -39,7 +41,9 @@ class _Guidance:
 def guidance_cost(goals: Sequence[Goal]) -> ir.Num | None:
     """Return the guidance cost at one sample: the violation of the goal with the earliest deadline.
 
-    The result is None if no goal has a deadline.
+    A goal is a formula such as `eventually@[a, b] p`, whose interval counts from the start of the mission.
+    Its violation is `max(-margin, 0)`, where the margin is the robustness of p. The result is None if no goal
+    has a deadline.
     """
     costs = [cost for goal in goals if (cost := _guidance(goal)) is not None]
     if not costs:
@@ -65,10 +69,12 @@ def _guidance(goal: Goal) -> _Guidance | None:
 
 
 def _leaf(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the guidance of an absolute formula, or None if it needs none.
+    """Return the violation of one goal and the time left for it; None if it has no deadline to come.
 
-    The formulas that need guidance are `eventually` and `until` while they are open (undecided), `always`
-    before its window begins, and recurring goals (`always@[a, end] once[0, c] p`).
+    The goal is an absolute formula: its interval counts from the start of the mission. The deadline of
+    `eventually@` and `until@` is the end of the interval, that of `always@` is its start. The violation is 0
+    once the formula is true or false, or once the interval of `always@` has begun. Recurring goals
+    (`always@[a, end] once[0, c] p`) have a deadline of their own, see `_recurring`.
     """
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
@@ -90,9 +96,10 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the guidance of a recurring goal, `always@[a, end] once[0, c] p`; None for any other goal.
+    """Return the violation of a recurring goal and the time left for it; None for any other goal.
 
-    The deadline of a recurring goal is c after the last sample at which p held.
+    A recurring goal is `always@[a, end] once[0, c] p`. Its deadline is c after the last sample at which p
+    held.
     """
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
@@ -101,10 +108,11 @@ def _recurring(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
-    """Return the guidance of one part of a recurring goal, or None if the part has another form.
+    """Return the violation of one part of a recurring goal and the time left for it.
 
-    The past operator in the goal was rewritten before: `once[0, c] p` is now `p or c - since >= 0`, where the
-    timer `since` counts the steps since p last held.
+    A recurring goal is `always@[a, end] once[0, c] p`. Its past operator was rewritten before: `once[0, c] p`
+    is now `p or c - since >= 0`, where the timer `since` counts the steps since p last held. The result is
+    None if `part` does not have this form.
     """
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
@@ -122,9 +130,10 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
-    """Return the guidance of a conjunction of goals.
+    """Return the violation and the time left of a conjunction of goals; `costs` are those of each goal.
 
-    The violation is the sum of the violations of the goals with the earliest deadline.
+    The violation is the sum of the violations of the goals with the earliest deadline. The time left is the
+    time until this deadline.
     """
     if len(costs) == 1:
         return costs[0]
@@ -134,9 +143,10 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
-    """Return the guidance of a disjunction of two goals: that of the goal with the smaller violation.
+    """Return the violation and the time left of a disjunction of two goals.
 
-    A goal that can no longer be met is left out; a goal that is already met has no violation.
+    They are those of the goal with the smaller violation. A goal that can no longer be met is left out; a
+    goal that is already met has no violation.
     """
     first = ir.BoolOp(
         "or",
@@ -157,9 +167,9 @@ def _not_lost(left: ir.Num) -> ir.Formula:
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:
-    """Return the robustness of a state formula as a number, without its tests of the clock and of timers.
+    """Return the robustness of a state formula as a number, without its predicates on the clock and timers.
 
-    The result is None if the formula consists of such tests alone.
+    The result is None if the formula has no other predicates.
     """
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():

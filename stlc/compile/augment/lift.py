@@ -18,7 +18,7 @@ from stlc.diagnostics import Diagnostic, tell
 def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
     """Move absolute operators (`always@[a, b]`) out of other temporal operators.
 
-    The formula is in negation normal form; E307 is appended to `sink` where this is impossible.
+    The formula is in negation normal form. If an operator cannot be moved out, E307 is appended to `sink`.
     """
     if not absolute(formula):
         return formula

@@ -42,8 +42,8 @@ class Absolute:
             `eventually`.
         right: right operand of `until` and `release`, or the operand of `always` and `eventually`, a typed
             formula.
-        left_now: `left` as a condition on the current state, in which ties count as satisfied.
-        right_now: `right` as a condition on the current state, in which ties count as satisfied.
+        left_now: `left` as a condition on the current state; a predicate at its threshold counts as true.
+        right_now: `right` as a condition on the current state; a predicate at its threshold counts as true.
         margin: `right` as a formula of the IR, for its robustness.
     """
 
@@ -87,12 +87,15 @@ Goal: TypeAlias = GoalLeaf | GoalBranch
 
 
 def last_step(formula: Absolute) -> int:
-    """Return the last step of the mission that bounds the window: its end, or its start if it has no end."""
+    """Return the mission step at which the window of a formula ends; if it has no end, that of its start."""
     return formula.window.lo if formula.window.hi is None else formula.window.hi
 
 
 def mission_steps(goal: Goal) -> int:
-    """Return the last step of the mission that bounds the window of any formula of the goal."""
+    """Return the mission step at which the last window in a goal ends.
+
+    For a window without end, its start counts.
+    """
     if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
     return max(map(mission_steps, goal.items))
@@ -109,16 +112,21 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """Return the update of a status: the function from its signal to its value one step later.
+    """Return the function from the signal of a formula's status to the value of the status one step later.
 
-    An open status is decided by the current sample; a status that is true or false stays so.
+    The status is open (undecided), true or false. An open status is decided by the current sample; a status
+    that is true or false stays so. `clock` is the mission clock (steps since the start of the mission).
     """
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Return the next status of an open formula: true or false if the current sample decides it."""
+    """Return the next status of a formula whose status is open.
+
+    It is true or false if the current sample decides the formula, else open. `clock` is the mission clock
+    (steps since the start of the mission).
+    """
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -137,7 +145,7 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
 
 
 def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return a formula that holds if the current step of the mission is within `window`."""
+    """Return a formula that holds while the mission clock (steps since the start) is within `window`."""
     started = at_least(clock, ir.Const(float(window.lo)))
     if window.hi is None:
         return started
@@ -146,7 +154,7 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return a formula that holds if the current step of the mission is at or after the end of `window`."""
+    """Return a formula that holds once the mission clock (steps since the start) reaches `window`'s end."""
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
@@ -156,7 +164,9 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 def progress(goal: Goal, horizon: int) -> typed.Formula:
     """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal.
 
-    The formula is evaluated over the `horizon` steps of the plan; the statuses stand for the time before.
+    The goal consists of absolute formulas (`always@[a, b] p`), joined by `and` and `or`. The result is
+    evaluated over the `horizon` steps of the plan. The status of each absolute formula (open, true or false)
+    stands for the time before the plan.
     """
     match goal:
         case GoalBranch(op, items, span):
@@ -168,7 +178,10 @@ def progress(goal: Goal, horizon: int) -> typed.Formula:
 
 
 def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula:
-    """Return the formula that a plan must satisfy in order not to falsify one absolute formula."""
+    """Return the formula that a plan must satisfy in order not to falsify the absolute formula `formula`.
+
+    `leaf` contains the states that are added for this formula. `horizon` is the length of the plan in steps.
+    """
     span, left, right = formula.span, formula.left, formula.right
     known = time_test(leaf.status, _KNOWN, span)
     alive = possible(leaf)
@@ -195,7 +208,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """Return a formula over the current state that holds unless the mission up to now falsified the goal."""
+    """Return a formula over the current state that is false once the mission has falsified the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -206,7 +219,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Return a formula over the mission clock that holds if the current step is within `window`."""
+    """Return a formula that holds while the mission clock (steps since the start) is within `window`."""
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started
@@ -215,7 +228,10 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
-    """Return a formula over the mission clock that holds if the window ends beyond the end of the plan."""
+    """Return a formula on the mission clock that holds while the window of `formula` ends after the plan.
+
+    `clock` counts the steps since the start of the mission. `horizon` is the length of the plan in steps.
+    """
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)

@@ -105,9 +105,10 @@ def in_past_form(
 def _on_grid(
     formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, negated: bool = False
 ) -> typed.Formula:
-    """Return a formula with its bounds in whole samples, rounded conservatively for each operator.
+    """Return a formula with the bounds of its intervals in whole samples.
 
-    `negated`: whether the formula is the operand of a `not`, which reverses the rounding of `since`.
+    A bound between two samples is rounded so that the result implies the formula as written. `negated`:
+    whether the formula is the operand of a `not`, which reverses the rounding of `since`.
     """
     match formula:
         case typed.Logic(_, _, items):
@@ -182,18 +183,19 @@ class _Writer:
     Args:
         table: table of added states, which provides the mission clock (steps since the start of the mission).
         span: source location of the absolute operator.
-        soon: whether the rewritten formula becomes false as soon as a violation is certain, by the left side
-            of an `until@`, rather than only at the deadline.
+        soon: if True, the rewritten formula is an `until@`, whose left side becomes false as soon as a
+            violation is certain; if False, a violation is detected only at the deadline.
     """
 
     def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
         self._table, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
-        """Return `eventually@[window] (when and what)` with only past operators below the absolute operator.
+        """Return `eventually@[window] (when and what)`, rewritten with past operators only.
 
-        The window of the result contains the samples at which `what` is decided. `when` are past formulas,
-        all of which must hold at the sample at which `what` holds.
+        All formulas in `when` must hold at the sample at which `what` holds; they look only into the past.
+        The operands of the result look only into the past, too: they refer to the sample at which `what` is
+        decided. The window of the result is shifted to these samples.
         """
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))
@@ -218,16 +220,21 @@ class _Writer:
                 raise TooFarError(what.span, "not something that the past can tell")
 
     def until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """Return `left until@[window] right` with only past operators below the absolute operator.
+        """Return `left until@[window] right`, rewritten with past operators only.
 
-        Both operands and the window are shifted to the sample at which both operands are decided.
+        The window counts from the start of the mission (`@`). Both operands are delayed to the sample at
+        which both are decided, and the window is shifted by the same number of samples.
         """
         late = max(_ahead(left), _ahead(right))
         known = self._or(self._until_step(late - 1), self.delayed(left, late))
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
 
     def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
-        """Return what `met` returns if `what` is the conjunction of `items`."""
+        """Return `eventually@[window] (when and items)`, rewritten with past operators only.
+
+        All formulas in `when` and in `items` must hold at the same sample. Those in `when` look only into the
+        past.
+        """
         later = [item for item in items if looks_ahead(item)]
         known = (*when, *(item for item in items if not looks_ahead(item)))
         if len(later) == 1:
@@ -239,7 +246,10 @@ class _Writer:
     def _lasting(
         self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula
     ) -> typed.Formula:
-        """Return what `met` returns for the formula `always[what] body`."""
+        """Return `eventually@[window] (when and always[what] body)`, rewritten with past operators only.
+
+        All formulas in `when` must hold; they look only into the past.
+        """
         lo, hi = what.lo, what.hi or 0
         late = _ahead(body)
         body = self.delayed(body, late)
@@ -262,7 +272,10 @@ class _Writer:
     def _reached(
         self, window: ir.Window, when: Formulas, inner: ir.Window, left: typed.Formula, right: typed.Formula
     ) -> typed.Formula:
-        """Return what `met` returns for the formula `left until[inner] right`."""
+        """Rewrite `eventually@[window] (when and left until[inner] right)` with past operators only.
+
+        All formulas in `when` must hold; they look only into the past.
+        """
         late = max(_ahead(left), _ahead(right))
         left, right = self.delayed(left, late), self.delayed(right, late)
         begun = self._ago(self._begun(window, when), late) if when else None
@@ -282,8 +295,8 @@ class _Writer:
     def _freed(self, node: typed.Until, left: typed.Formula, right: typed.Formula) -> typed.Formula:
         """Rewrite `left release[l, u] right` as a disjunction of three cases.
 
-        `right` throughout the window; or `left` at some sample up to l; or, from l on, `right` until `left`,
-        within the window.
+        First case: `right` holds throughout the window. Second case: `left` holds at some sample up to l.
+        Third case: `right` holds from l on, until `left` holds at a sample of the window.
         """
         window, span = _window(node), node.span
         hi = _end(node)
@@ -300,7 +313,7 @@ class _Writer:
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
         """Return a past formula with the truth that `formula` had `steps` samples ago.
 
-        The lookahead of `formula` is at most `steps`, so that this truth is decided by now.
+        `formula` looks at most `steps` samples ahead, so the samples up to now decide this truth.
         """
         if not looks_ahead(formula):
             return self._ago(formula, steps)
@@ -350,14 +363,17 @@ class _Writer:
         return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
 
     def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
-        """Return a formula that holds if all of `when` hold and the current mission step is in `window`."""
+        """Return a formula that holds if all of `when` hold and the mission clock is within `window`.
+
+        The mission clock counts the steps since the start of the mission.
+        """
         if window == ir.Window(0, None):
             return self._and(*when)
         clock = self._table.clock((window.lo if window.hi is None else window.hi) + 1)
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """Return a formula that holds if the current step of the mission is at most `step`; true for None."""
+        """Return a formula that holds up to step `step` of the mission; always, if `step` is None."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._table.clock(step + 1), self._span)

@@ -6,7 +6,8 @@ number of samples since p last held. Windows of the past are cut at the start of
 
 At a single instant, timers decide truth but have no gradient. Along a plan, the operator is therefore
 evaluated on the samples of the plan. For the samples before the plan, the timer's value at the first sample
-of the plan is used: at step k of the plan, `historically[0, c] p` still lacks `c - held - k` steps.
+of the plan is used. At step k of the plan, for example, `held` has grown to `held + k` if p has held since.
+`historically[0, c] p` is then false while `held + k` is less than c.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class _Test:
         left: the timer or the constant.
         right: the constant or the timer.
         span: source location of the past operator.
-        later: increment of the timer per step while it is not reset: 1 for a count, 0 for a truth value.
+        later: growth of the timer per step of a plan: 1 for a count of steps, 0 for a truth value.
     """
 
     left: ir.Num
@@ -59,7 +60,7 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test in the form for an operand of `or`.
+        """Return the test in the form in which it can be an operand of `or`.
 
         Its robustness is +inf where the test holds and -inf where it fails.
         """
@@ -68,7 +69,7 @@ class _Test:
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test in the form for an operand of `and`.
+        """Return the test in the form in which it can be an operand of `and`.
 
         Where the test fails, its robustness is negative and finite: it is proportional to the number of
         missing steps.
@@ -79,7 +80,7 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides of the test at a later sample of a plan, from the timer's value at the first sample."""
+        """Both sides of the test at any sample of a plan, from the timer's value at the first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -154,9 +155,10 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Add a timer, and return the test that `body` held at some of the previous `most` samples.
+        """Add a timer, and return the test that `body` held at one or more of the previous `most` samples.
 
-        If `most` is None, all earlier samples count.
+        If `most` is None, all earlier samples count. `body` is the operand of `node`, with its own past
+        operators rewritten.
         """
         condition = self._condition(body)
         if most is None:
@@ -171,7 +173,8 @@ class Past:
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
         """Add a timer, and return the test that `body` held at each of the previous `most` samples.
 
-        If `most` is None, all earlier samples count.
+        If `most` is None, all earlier samples count. `body` is the operand of `node`, with its own past
+        operators rewritten.
         """
         condition = self._condition(body)
         if most is None:
@@ -221,8 +224,9 @@ class Past:
     ) -> typed.Recalled:
         """Add a timer; return the test that q held earlier and p from then to the previous sample.
 
-        The sample of q is at most `most` samples ago (None: any earlier sample). If not `positive`, return
-        the test of the negation, for which `left` and `right` are the negations of p and q.
+        p and q are the operands of `node`, `p since q`. The sample at which q held is at most `most` samples
+        ago; if `most` is None, it may be any earlier sample. If `positive` is False, the test is negated, and
+        `left` and `right` are the negations of p and q.
         """
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
@@ -263,10 +267,10 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Add a state per sample, and return the truth that `body` had `steps` samples ago.
+        """Return the truth that `body` had `steps` samples ago; one state is added per sample of delay.
 
-        Before the start of the mission the truth is `before`. E309 is appended to `sink` if more than
-        `REGISTER` states are needed.
+        Before the start of the mission the truth is `before`. `body` belongs to the operator `node`. E309 is
+        appended to `sink` if more than `REGISTER` states are needed.
         """
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
@@ -290,9 +294,10 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """Rewrite `p since[a, b] q` with a > 0, or its negation if not `positive`, to windows that end now.
+        """Rewrite `p since[a, b] q`, with a > 0, in terms of windows that end now.
 
-        The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q` held a ago.
+        If `positive` is False, its negation is rewritten. The operator holds if `historically[0, a] p` holds
+        now, and `p since[0, b - a] q` held a ago.
         """
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
@@ -304,10 +309,10 @@ class Past:
     def _lasting(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
-        """Rewrite `p since[a, end] q` with a > 0, or its negation if not `positive`, with a timer.
+        """Rewrite `p since[a, end] q`, with a > 0, by means of a timer.
 
-        The timer starts at a sample at which p and q hold. It counts steps while p holds, and is reset when p
-        fails.
+        If `positive` is False, its negation is rewritten. `least` is a in samples. The timer starts at a
+        sample at which p and q hold. It counts steps while p holds, and is reset when p fails.
         """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
@@ -352,9 +357,9 @@ class Past:
         return tolerant(condition(timer_form(body), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
-        """Return the operand of a past operator with its own past operators rewritten.
+        """Return `body`, the operand of a past operator, with the past operators inside it rewritten.
 
-        The result is None, with E309 in `sink`, if the operand looks into the future.
+        The result is None, with E309 in `sink`, if `body` looks into the future.
         """
         rewritten = self.rewrite(body)
         if is_state(rewritten, augmented=True):
@@ -397,9 +402,10 @@ def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "no
 def _since_inside(
     node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
 ) -> typed.Formula:
-    """Return `left since[window] right` over the plan's samples; if not `positive`, its dual.
+    """Return `left since[window] right`, evaluated on the samples of the plan alone.
 
-    The dual is the negation of `(not left) since[window] (not right)`.
+    If `positive` is False, return the negation of `(not left) since[window] (not right)` instead. `node` is
+    the operator in the source.
     """
     interval = in_steps(window, node.span)
     if positive:

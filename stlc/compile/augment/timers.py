@@ -31,7 +31,9 @@ MISSING = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """State that the compiler adds to those of the system; called a timer whatever its kind.
+    """State that the compiler adds to those of the system.
+
+    It is called a timer, whatever its kind.
 
     Attributes:
         name: name of the state.
@@ -53,7 +55,7 @@ class Timer:
 
     @property
     def column(self) -> Column:
-        """Column (name, type and range) of this state in the state signature."""
+        """Description of this state as a column of the state vector: name, type and range."""
         return Column(self.name, kind="int", role="timer", low=self.low, high=self.high, fact=True)
 
 
@@ -67,7 +69,7 @@ class TimerTable:
     """Added states of a specification, collected over its requirements; equal states are shared."""
 
     def __init__(self, taken: frozenset[str]) -> None:
-        """Create an empty table, in which no added state has a name in `taken`."""
+        """Create an empty table. No state that is added later gets a name in `taken`."""
         self._taken = set(taken)
         self._known: dict[tuple[object, ...], Timer] = {}
         self._clock: str | None = None
@@ -80,14 +82,14 @@ class TimerTable:
         return (*clocks, *self._known.values())
 
     def clock(self, latest: int) -> ir.Signal:
-        """Return the signal of the mission clock (steps since the start), counting to `latest` at least."""
+        """Return the signal of the mission clock (steps since the start); it counts to `latest` at least."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")
         return ir.Signal(self._clock)
 
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
-        """Return the signal of the state described by `draft`, after adding it unless there is an equal one.
+        """Return the signal of the state described by `draft`; add the state unless there is an equal one.
 
         `update` is the function from the signal of the state to its value one step later.
         """
@@ -118,7 +120,7 @@ def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
 def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
     """Return the predicate `left >= right` between added states (clock, timer, status) and constants.
 
-    Its robustness is +inf or -inf, so it decides truth but is never the margin of an enclosing formula.
+    Its robustness is +inf or -inf. So it decides whether an enclosing formula holds, but not by how much.
     """
     return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
@@ -127,8 +129,9 @@ def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
     """Return a formula that holds if `left >= right`, with finite robustness where it fails.
 
     The robustness is +inf where the formula holds. Where it fails, it is `-MISSING` times the number of
-    missing steps. This is less than the robustness of any predicate, so that a maximum prefers instants that
-    the plan can influence. It is finite, so that plans that all fail can still be ranked.
+    missing steps. This is less than the robustness of any other predicate. The maximum of an `or` or
+    `eventually` is therefore that of an operand that the plan can influence. The robustness is finite, so
+    that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
@@ -142,9 +145,9 @@ def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 
 
 def tolerant(formula: ir.Formula) -> ir.Formula:
-    """Return a state formula that holds where the monitor reports `formula` as satisfied.
+    """Return a state formula that holds wherever the monitor reports `formula` as satisfied.
 
-    Predicates may miss their threshold by `TOLERANCE`.
+    The monitor accepts a predicate that misses its threshold by at most `TOLERANCE`.
     """
     if isinstance(formula, ir.Predicate) and not formula.guard:
         return ir.Predicate(ir.Op("add", (formula.num, ir.Const(formula.sign * TOLERANCE))), formula.sign)

@@ -52,7 +52,7 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
     Raises:
         Failed: units do not agree (E203), a divisor is zero (E401), or the function has no value for its
-            constant arguments (E205). The error is in the scope already.
+            constant arguments (E205). The error has been added to `scope`.
     """
     function = FUNCTIONS[name]
     for arg in args:
@@ -82,8 +82,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         scope: receives findings.
 
     Returns:
-        The converted numbers, and a template: a number of the common unit, whose other fields the caller
-            replaces.
+        The converted numbers, and a number with the common unit, whose value the caller sets.
 
     Raises:
         Failed: the units do not agree (E203).
@@ -147,6 +146,8 @@ def absolute(number: Number) -> Number:
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
     """Return the same quantity in `unit`, a unit of the same dimensions.
 
+    `place` is the source location for the error.
+
     Raises:
         Failed: `number` is a temperature difference, and `unit` has an offset, such as degC (E203).
     """
@@ -156,7 +157,10 @@ def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Nu
 
 
 def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
-    """Return the error E203 for a temperature difference where a temperature in `unit` is needed."""
+    """Return the error E203 for a temperature difference where a temperature in `unit` is needed.
+
+    `place` is the source location for the error.
+    """
     message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
     help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
     return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
@@ -204,8 +208,8 @@ def _units(
 ) -> tuple[tuple[Number, ...], Number]:
     """Convert the arguments as the unit rule of the function (`Function.rule`) requires.
 
-    The result is the converted arguments, and a template: a number with the unit of the function's result,
-    whose other fields the caller replaces.
+    The result is the converted arguments, and a number with the unit of the function's result, whose value
+    the caller sets.
     """
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
@@ -241,7 +245,11 @@ Agreed = tuple[tuple[Number, ...], Number]
 
 
 def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """Apply the unit rule `same`: convert all arguments to one unit."""
+    """Convert all arguments of a function to one unit (unit rule `same`).
+
+    The result is the converted arguments, and a number with the unit of the function's result, whose value
+    the caller sets.
+    """
     name, verb = function.name, _verb(function)
     if name in ("normal", "truncnorm"):
         return _spread(function, args, span, scope)
@@ -298,7 +306,7 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
     The common unit is kelvin if one of the numbers is a temperature difference. Otherwise it is the unit of
     the numbers that are not constant; if these have different units, or if all numbers are constant, it is
-    degC.
+    degC. The result is the converted numbers, and a number with the common unit, whose value the caller sets.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -322,7 +330,11 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
 
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
-    """Apply the unit rule of a sum or difference in which a temperature in degC takes part."""
+    """Convert the operands of a sum or difference in which a temperature in degC takes part.
+
+    The result is the converted arguments, and a number with the unit of the function's result, whose value
+    the caller sets.
+    """
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
     point, other = (left, right) if first else (right, left)
@@ -344,10 +356,11 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 
 
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
-    """Apply the unit rule of `left - right` where `right` is a temperature in degC.
+    """Convert the operands of `left - right`, where `right` is a temperature in degC.
 
-    The result is a difference. If `right` may itself be a difference (`Number.sense` is `open`), the result
-    may be a temperature too.
+    The value is a difference. If `right` may itself be a difference (`Number.sense` is `open`), it may be a
+    temperature too. The result is the converted arguments, and a number with the unit of the function's
+    result, whose value the caller sets.
     """
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
@@ -359,9 +372,10 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
 
 
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """Apply the unit rule of `normal` and `truncnorm`.
+    """Convert the arguments of `normal` and `truncnorm` to one unit.
 
-    Mean and bounds may be temperatures; the standard deviation is a difference.
+    Mean and bounds may be temperatures; the standard deviation is a difference. The result is the converted
+    arguments, and a number with the unit of the function's result, whose value the caller sets.
     """
     middle, deviation, *ends = args
     places = [middle, *ends]
@@ -424,7 +438,10 @@ def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
 
 
 def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 for a difference compared with a temperature: `abs(temp - 21 degC) <= 0.5 degC`."""
+    """Return E203 for a difference compared with a temperature: `abs(temp - 21 degC) <= 0.5 degC`.
+
+    `what` names the operator or function for the message.
+    """
     unit = point.unit
     text = (point.span or span).text
     if point.constant is not None:
@@ -571,7 +588,8 @@ def _fold(function: Function, args: Sequence[Number], template: Number, scope: S
 def _whole(function: Function, args: Sequence[Number], template: Number) -> bool:
     """True if the result of a function is an integer for all values of these arguments.
 
-    `floor` and other roundings act on SI values, which need not be integers in the unit of the result.
+    `template` has the unit of the result. `floor` and other roundings act on SI values, which need not be
+    integers in this unit.
     """
     if function.integral:
         return template.unit.ratio == 1

@@ -237,9 +237,9 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Return one component of a vector, shifted in time by `delay`.
+    """Return `number`, one component of a vector, shifted in time by `delay`.
 
-    If the component has a formula of its own (`Number.formula`), the formula is shifted too.
+    If the component is a choice between bools, its formula (`Number.formula`) is shifted too.
     """
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
@@ -354,7 +354,10 @@ def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
 
 
 def count_arguments(name: str, call: ast.Call, least: int, most: int | None, scope: Scope) -> None:
-    """Raise Failed (E105) for a wrong number of arguments."""
+    """Raise Failed (E105) if a call has fewer than `least` or more than `most` arguments.
+
+    If `most` is None, there may be any number of arguments from `least` on.
+    """
     given = len(call.args)
     if least <= given and (most is None or given <= most):
         return
@@ -369,7 +372,7 @@ def count_arguments(name: str, call: ast.Call, least: int, most: int | None, sco
 
 
 def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
-    """Raise Failed (E105) if an argument of a call is named."""
+    """Raise Failed (E105) if an argument of a call is named; `help_` are hints for the message."""
     for arg in call.args:
         if arg.name is not None:
             message = f"`{name}` has no argument called `{arg.name}`"
@@ -377,10 +380,10 @@ def _positional(name: str, call: ast.Call, scope: Scope, *help_: str) -> None:
 
 
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """Return the value of a function in `FUNCTIONS`.
+    """Return the value of a call of a function in the table `FUNCTIONS`.
 
-    A function of any number of arguments is applied to all components together, any other function component
-    by component.
+    A function that takes any number of arguments, such as `min`, is applied once, to the components of all
+    arguments together. Any other function is applied component by component.
     """
     items: list[Number | VectorValue] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):

@@ -74,7 +74,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
 
 
 def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """Return a value as a formula; a bool signal holds where it is at least 1/2.
+    """Return a value as a formula; a bool signal becomes the formula that it is >= 1/2.
 
     Raises:
         Failed: the value is neither a formula nor a bool (E201).

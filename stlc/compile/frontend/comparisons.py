@@ -106,7 +106,11 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Return the unit in which a comparison is reported: that of a side that is not constant, if any."""
+    """Return the unit in which the robustness of a comparison is reported.
+
+    It is the unit of the first side that is not constant. If all sides are constant, it is that of the first
+    side. Sides without a unit are passed over if another side has one.
+    """
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 
@@ -123,7 +127,7 @@ def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> Non
 def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
     """Return `left == right` for integers, bools or enums, with margin 1/2 - |left - right|.
 
-    Between formulas `==` means `<->`, with the margins of these formulas.
+    Between formulas `==` means `<->`, and the margin is that of `<->`.
 
     Raises:
         Failed: a side is real (E204) or has another type (E205).

@@ -51,7 +51,7 @@ def check_names(entry: Definition, scope: Scope) -> None:
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
     """Yield (name, whether it is called) of each free name in an expression.
 
-    Names in `bound`, and those that a quantifier or a `freeze` in the expression binds, are left out.
+    A name is not free if it is in `bound`, or if a quantifier or a `freeze` in the expression binds it.
     """
     if isinstance(node, ast.Name):
         if node.name not in bound:
@@ -86,7 +86,7 @@ _EXTERN_KINDS: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
 def external(item: ast.Extern, interface: Interface | None, about: str, scope: Scope) -> External:
-    """Return the function that an `extern fn` declares.
+    """Return the function that an `extern fn` declares; `about` describes it in messages.
 
     Raises:
         Failed: an invalid type (E101) or vector size (E005), or a function that the system lacks (E107).
@@ -187,8 +187,8 @@ def columns_of(
 ) -> tuple[Column, ...]:
     """Return the columns (name, unit, type, role) of a signal or parameter, one per component.
 
-    If there is a system, unit and range are those of its column of the same name. The declared range is not
-    read here, but in `ranged`.
+    If there is a system, unit and range are those of its column of the same name. The declared range is added
+    later, by `ranged`.
 
     Raises:
         Failed: the type is unknown (E101), or the system lacks the signal (E103) or declares it with another
@@ -428,9 +428,10 @@ def _check_twice(spec: ast.Spec, scope: Scope) -> None:
 
 
 def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]], scope: Scope) -> None:
-    """Record the declaration of a name; report E102 if the name is already declared.
+    """Record the declaration of `name` in `space`; report E102 if the name is already there.
 
-    Different enums may have members of the same name.
+    `enum` is the enum of which the name is a member, "" for any other name. Different enums may have members
+    of the same name.
     """
     if name not in space:
         space[name] = (span, enum)

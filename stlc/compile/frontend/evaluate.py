@@ -121,7 +121,10 @@ def _choice_of_formulas(
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
-    """Return the number `if cond then yes else no`; between two bools the result has `Number.formula` too."""
+    """Return the number `if cond then yes else no`.
+
+    Between two bools the number also has a formula, the choice between both as formulas (`Number.formula`).
+    """
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
     yes = loose_number(branches[0], expr.yes, need, scope)
@@ -393,7 +396,9 @@ def _attr(expr: ast.Attr, scope: Scope) -> Value:
 
 
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Return the value of a name that the file of `home` declares, for use in an expression in `scope`.
+    """Return the value of a name that is declared in the file whose names are in `home`.
+
+    `scope` is that of the expression that uses the name; it receives the errors.
 
     Raises:
         Failed: the name is not declared (E101), or stands for a function with arguments (E105).
@@ -421,8 +426,8 @@ def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
 def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
     """Return the value of a definition without arguments.
 
-    The value is computed once; the size of the definition counts at every use towards the limit on expanded
-    expressions.
+    The value is computed once. At every use, at the source location `place`, the size of the definition
+    counts towards the limit on the size of expanded expressions.
     """
     if entry.name not in scope.cache:
         if entry.name in scope.open:
@@ -448,7 +453,10 @@ def _measured_value(expr: ast.Expr, scope: Scope) -> tuple[Value, Cost]:
 
 
 def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
-    """Return the value of a macro, declared in the file of `home`, for the arguments of a call."""
+    """Return the value of a macro for the arguments of a call.
+
+    The macro is declared in the file whose names are in `home`. The arguments are evaluated in `scope`.
+    """
     if home.cache.get(entry.name, entry) is None:
         raise Failed
     if entry.name in home.open:
@@ -511,7 +519,10 @@ def _call(expr: ast.Call, scope: Scope) -> Value:
 
 
 def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Return the value of a call of a name that the file of `home` declares, or of a built-in function."""
+    """Return the value of a call of the function `name`.
+
+    The function is a built-in one, or it is declared in the file whose names are in `home`.
+    """
     entry = home.entries.get(name.name)
     if isinstance(entry, Definition) and entry.formals:
         return _expanded(entry, expr, scope, home)
@@ -571,9 +582,10 @@ def _timed(
     place: Span,
     scope: Scope,
 ) -> typed.Formula:
-    """Return the formula of a temporal operator.
+    """Return the formula of a temporal operator, which stands at the source location `place`.
 
-    Its operands and its interval are both evaluated, even if one of them fails.
+    The operands and the interval are all evaluated, even if one of them fails, so that all errors are
+    reported.
     """
     if not scope.temporal:
         scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
@@ -630,7 +642,11 @@ def _timed_node(
 
 
 def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
-    """Return the source location of a prefix operator, without its operand."""
+    """Return the source location of a prefix operator, without its operand.
+
+    The operator begins at the start of `span` and ends before its operand `inner`. If `length` is given, the
+    location has at most `length` characters.
+    """
     end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
     text = span.source.text[span.start : end].rstrip(" \t\n(")
     return span.source.span(span.start, span.start + max(1, len(text)))
@@ -673,9 +689,10 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 
 
 def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """Return the frozen value of a number that `freeze` binds; append (unique name, number) to `bindings`.
+    """Return the frozen value of `number`, which a `freeze` binds to `name`.
 
-    A constant is returned unchanged, without an entry in `bindings`.
+    The pair (unique name, number) is appended to `bindings`. A constant is returned unchanged, and nothing is
+    appended.
     """
     if number.constant is not None:
         return number

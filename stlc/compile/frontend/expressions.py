@@ -146,10 +146,10 @@ def stored(number: Number, unit: Unit) -> ir.Num:
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
-    """Convert a value to the number that a column stores.
+    """Convert a value to the number that `column` stores.
 
-    Without a column, the result is the value as a number in any unit. For a bool column, a formula becomes
-    the number 1 where it holds, else 0.
+    If `column` is None, the value becomes a number in any unit. For a bool column, a formula becomes the
+    number 1 where it holds, else 0.
 
     Raises:
         Failed: the value has a type (E202, E205, S203) or unit (E203) that does not fit the column.

@@ -68,7 +68,10 @@ def spec_sha256(text: str, library: Mapping[str, str]) -> str:
 
 
 def file_of(key: str) -> str:
-    """Return the relative path at which the text of an imported file is stored; it has no `..`."""
+    """Return the relative path at which the text of an imported file is stored.
+
+    Each `..` in `key` is replaced by `__`, so that the path stays below its folder.
+    """
     return "/".join("__" if part == ".." else part for part in key.split("/") if part) + (
         ".stl" if key == STD else ""
     )
@@ -93,7 +96,8 @@ class _Loader:
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
         """Return the modules that one file imports.
 
-        `around` is the chain of the keys of the files that import this file. Each file is read once.
+        `key` is the path of this file relative to the folder of the main specification, or `@std` for the
+        library. `around` is the chain of the keys of the files that import this file. Each file is read once.
 
         Raises:
             SpecError: a file cannot be read or imports itself (E106), or has syntax errors.

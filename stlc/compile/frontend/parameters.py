@@ -114,7 +114,10 @@ def _text(decl: ast.Param) -> str:
 def _even(
     decl: ast.Param, values: Sequence[float | None], columns: Sequence[Column], scope: Scope
 ) -> tuple[ir.Num, ...]:
-    """Return the uniform distribution over the declared range or set, for each column."""
+    """Return, for each column of a parameter, the uniform distribution over its declared range or set.
+
+    `values` are the two ends of the range or the members of the set.
+    """
     if any(value is None for value in values):
         message = f"`{decl.name}` is drawn for every trajectory: its range must have both ends"
         help_ = ("give it a finite range, or a distribution: `param r ~ normal(1, 0.1)`",)
@@ -129,7 +132,8 @@ def _even(
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
     """Return the distribution of each column, in the unit of the column.
 
-    If the expression is a single number, each column is drawn from its distribution independently.
+    If `expr` is a single number, such as `uniform(0, 1)`, it is drawn anew for each column. If it is a
+    vector, each component is the distribution of one column.
 
     Raises:
         Failed: the unit is not that of the column (E203), or the distribution depends on a signal (E205).
@@ -193,7 +197,7 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
 
 
 def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
-    """Return the parameters, with a constant in place of the distribution of those named in `values`.
+    """Return the parameters; those named in `values` get a constant in place of their distribution.
 
     A constant may be outside the declared range.
 
@@ -214,7 +218,7 @@ def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> t
 
 
 def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed.Parameter]:
-    """Return the components of one parameter, fixed to the value in `text`.
+    """Return the components of one parameter (`group`), fixed to the value in `text`.
 
     Raises:
         UsageError: U101, the value is not valid for the parameter.

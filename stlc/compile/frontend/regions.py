@@ -35,7 +35,10 @@ T = TypeVar("T")
 
 
 def points(corners: Sequence[VectorValue]) -> tuple[PlanePoint, ...] | None:
-    """Return the corners as floats in SI units, or None unless all are constant points of the plane."""
+    """Return the corners as floats in SI units.
+
+    The result is None if a corner varies or is not a point of the plane.
+    """
     found: list[PlanePoint] = []
     for corner in corners:
         values = [item.constant for item in corner.items]
@@ -168,7 +171,8 @@ def composed(
         opposite: function that returns the signed distance to the region of which a complement is taken; the
             sign is reversed afterwards. If `inner` returns the least distance along a segment, `opposite`
             returns the greatest, and vice versa.
-        margin: function that returns the margin of a dilation.
+        margin: function from the margin by which a dilation grows its region to the number that is added to
+            the distance.
         span: source location of the expression.
         scope: receives findings.
     """

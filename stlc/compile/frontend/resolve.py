@@ -124,7 +124,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
 
 
 def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """Return a file with `facts` as the ranges that signals never leave, in its scope and in its imports."""
+    """Return a file with `facts`, the ranges that signals never leave, in its scope and in its imports."""
     files = tuple(with_facts(part, facts) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
@@ -208,7 +208,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 def _system_hints(interface: Interface | None) -> dict[str, str]:
-    """Return the advice for an undeclared name that only the system has, by name."""
+    """Return name -> hint to declare it, for each state and constant of the system."""
     if interface is None:
         return {}
     found = {}

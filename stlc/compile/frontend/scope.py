@@ -71,9 +71,10 @@ class Meter:
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Context that measures the size of the expressions evaluated in a block, without counting them.
+        """Context that measures the size of the expressions evaluated in it.
 
-        The yielded `Cost` is set when the block ends.
+        These expressions do not count towards the size limit. The yielded `Cost` is set when the context
+        ends.
         """
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
@@ -86,7 +87,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Context in which the count of expressions starts again at zero.
+        """Context in which the counted size of expressions starts again at zero.
 
         It is entered for each declaration, since the size limit holds per declaration. The previous count is
         restored at the end.
@@ -226,7 +227,10 @@ class Scope:
         return "E205" if self.in_spec else "S203"
 
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
-        """Return the scope with further names; `samplers` sets whether random draws are allowed."""
+        """Return the scope with the further names `entries`.
+
+        `samplers` sets whether random draws are allowed; None leaves this as it is.
+        """
         return replace(
             self,
             entries={**self.entries, **entries},
@@ -235,7 +239,10 @@ class Scope:
         )
 
     def as_products(self) -> Scope:
-        """Return the scope for requirements with `@product`, in which definitions are evaluated anew."""
+        """Return the scope for a requirement with the tag `@product`.
+
+        In this scope definitions are evaluated anew, since `x in [lo, hi]` has another robustness there.
+        """
         broken = dict.fromkeys(name for name, value in self.cache.items() if value is None)
         modules = {alias: module.as_products() for alias, module in self.modules.items()}
         return replace(self, product=True, cache=broken, modules=modules)
@@ -274,7 +281,7 @@ class Scope:
 def column_value(column: Column, origin: Origin | None = None) -> Number:
     """Return the value of a column as a number in SI units.
 
-    The number is counted from the zero of its unit: 20 degC is 20.
+    The number is counted from the zero of its unit: 20 degC is 20. `origin` is the declaration of the column.
     """
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
@@ -301,9 +308,9 @@ def column_entries(
 
 
 def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, Known]:
-    """Return the name-table entries of enum members.
+    """Return the name-table entries of the members of `enums`.
 
-    A name may be a member of several enums; the other operand of a comparison then decides which is meant.
+    If several enums have a member of the same name, the other operand of a comparison decides which is meant.
     """
     options: dict[str, list[tuple[tuple[str, float], ...]]] = {}
     for labels in dict.fromkeys(enums):
@@ -313,7 +320,10 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
-    """Return a constant given in SI units; without a unit, it takes the unit that its place requires."""
+    """Return the constant `value`, given in SI units, as a number in `unit`.
+
+    A constant without a unit takes the unit that its place in an expression requires.
+    """
     bare = not unit.text
     exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"

@@ -76,7 +76,8 @@ class _Sweep:
     def extreme(self, region: Region, which: Literal["min", "max"]) -> Number:
         """Return the least or greatest (`which`) signed distance to a region along the segment.
 
-        The signed distance to a convex region is concave along the segment, so it is least at an end.
+        The distance is positive inside the region. The signed distance to a convex region is concave along
+        the segment, so it is least at an end.
         """
         match region:
             case Combined() | Dilated() | Complement():
@@ -126,11 +127,12 @@ class _Sweep:
         return self._over(faces, (*self.at_ends(box), *outside))
 
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
-        """Return the greatest signed distance of the segment to a convex region.
+        """Return the greatest signed distance of the segment to a convex region, positive inside.
 
-        If the segment enters the region, this is its greatest depth below the faces (`_depth`). Otherwise it
-        is the greatest of `outside`. These are signed distances of points of the segment; the point nearest
-        to the region must be among them.
+        `faces` are the signed distances of the start and the end of the segment to each face, positive
+        inside. If the segment enters the region, the result is its greatest depth below the faces (`_depth`).
+        Otherwise it is the greatest number in `outside`. These are signed distances of points of the segment;
+        the point nearest to the region must be among the points.
         """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
@@ -139,9 +141,10 @@ class _Sweep:
     def _depth(self, faces: Sequence[Pair]) -> Number:
         """Return the greatest depth of the segment in a convex region, negative if the segment stays outside.
 
-        The depth of a point is its least distance to a face, positive inside. By duality of linear programs,
-        the greatest depth is the least of two kinds of values. For each face: the greater of its distances to
-        the two ends of the segment. For each pair of faces whose distances have opposite slopes along the
+        `faces` are the signed distances of the start and the end of the segment to each face, positive
+        inside. The depth of a point is its least distance to a face. By duality of linear programs, the
+        greatest depth is the least of two kinds of values. For each face: the greater of its distances to the
+        two ends of the segment. For each pair of faces whose distances have opposite slopes along the
         segment: the distance at the point where the two distances are equal.
         """
         best = [self.apply("max", *face) for face in faces]
@@ -161,11 +164,12 @@ class _Sweep:
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
-        """Return minus the distance to a box at each point of the segment that may be closest to the box.
+        """Return the negated distance to a box at each point of the segment that may be closest to the box.
 
-        The squared distance is convex and piecewise quadratic along the segment, and its minimum is the
-        minimum of one of the pieces. A piece begins at the start of the segment or where the segment crosses
-        a face.
+        `faces` are the signed distances of the start and the end of the segment to each face, positive
+        inside. The squared distance is convex and piecewise quadratic along the segment, and its minimum is
+        the minimum of one of the pieces. A piece begins at the start of the segment or where the segment
+        crosses a face.
         """
         slopes = [self.apply("sub", after, before) for before, after in faces]
         starts = [literal(0, self.span), *(self._passing(face) for face in faces)]
@@ -190,7 +194,8 @@ class _Sweep:
     def _passing(self, face: Pair) -> Number:
         """Return the position in [0, 1] along the segment where the segment crosses a face.
 
-        If the segment crosses no face, the position is arbitrary.
+        `face` contains the signed distances of the start and the end of the segment to the face. If the
+        segment crosses no face, the position is arbitrary.
         """
         before, after = face
         slope = self.apply("sub", after, before)
@@ -203,7 +208,10 @@ class _Sweep:
     # ------------------------------------------------------------------------ polygons
 
     def _edges(self, corners: Sequence[VectorValue]) -> list[Pair]:
-        """Return the signed distances of both ends of the segment to every edge, positive on its left."""
+        """Return, for each edge of a polygon, the signed distances of the start and the end of the segment.
+
+        A distance is positive to the left of the edge, which runs from one of the `corners` to the next.
+        """
         found = []
         for start, stop in edges(corners):
             length = norm(minus(stop, start, self.span, self.scope), self.span, self.scope)
@@ -214,10 +222,10 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Return the distance of the segment to every edge of a polygon; negative where they cross.
+        """Return the distance of the segment to every edge of a polygon, negative if it crosses the edge.
 
-        Where they cross, the magnitude is the least of the distances from the ends of the segment to the edge
-        and from the ends of the edge to the segment.
+        The magnitude is the least of the distances from the ends of the segment to the edge and from the ends
+        of the edge to the segment.
         """
         now, then = self.ends
         past = edges([self.past(corner) for corner in corners])

@@ -33,9 +33,10 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of the margins of a formula's predicates.
+    """Return the greatest magnitude that the margin of any predicate in a formula can have.
 
-    The margins are computed over the ranges of the signals by interval arithmetic.
+    The margins are computed over the ranges of the signals by interval arithmetic. `place` is the source
+    location for the error.
 
     Raises:
         Failed: the range of a signal is unknown, or no predicate varies (E205).
@@ -48,7 +49,9 @@ def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, s
 
 
 def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """Return the greatest magnitude of a number, over the ranges of its signals.
+    """Return the greatest magnitude that a number can have within the ranges of its signals.
+
+    `place` is the source location for the error.
 
     Raises:
         Failed: the range of a signal is unknown (E205).

@@ -42,7 +42,8 @@ class _Definedness(Analysis[Defined]):
     def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
         """Return, per sample, whether the operands are defined at every instant at which they are read.
 
-        If the window of the operator is empty, no operand is read, and the result is True.
+        `parts` are the masks of the operands; operand i is read at `offsets[i]`. If the window of the
+        operator is empty, no operand is read, and the result is True.
         """
         if all(each == ir.NOW for each in offsets):
             return reduce(np.logical_and, parts)

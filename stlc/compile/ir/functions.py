@@ -213,10 +213,10 @@ def _function(
 
 
 def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
-    """Return the entry of an operator.
+    """Return the entry of an operator; `symbol` is the sign with which it is written.
 
-    If the operator has no kernel (`numpy`), the array back ends append it to a tape. They call the method of
-    the tape that has the operator's name.
+    If no NumPy function is given for the operator (`numpy`), the array back ends keep their own list of
+    operations, the tape. They call the method of the tape that has the operator's name.
     """
     flags = {"kind": "operator", "exact": True, "whole": True, **flags}
     if "numpy" not in flags:
@@ -225,7 +225,10 @@ def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) 
 
 
 def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """Return the entry of a step function with whole values, such as `floor`; its slope is 0."""
+    """Return the entry of a step function with whole values, such as `floor`; its slope is 0.
+
+    `kernel` is the name of the function in NumPy.
+    """
     flags: dict[str, Any] = {"numpy": kernel, "torch": name, "exact": True, "whole": True, "integral": True}
     return _function(name, doc, rule, fold, c, ("0.0",), **flags)
 
@@ -233,7 +236,8 @@ def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, ru
 def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
     """Return the entry of a smooth function of one argument.
 
-    `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`.
+    `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`. `kernel` is the
+    name of the function in NumPy, if it differs from `name`.
     """
     fold, c = getattr(math, name), f"{name}({{0}})"
     return _function(name, doc, "plain", fold, c, (slope,), bounds, numpy=kernel or name, torch=name)

@@ -154,7 +154,7 @@ class Operator:
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets at which each operand is read, in field order.
+        """Offsets at which the operands are read, relative to now: one entry per operand, in field order.
 
         The last operand is read over the window; if the window is empty, no operand is read.
         """
@@ -192,7 +192,7 @@ class Windowed(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operand, which is read over the window."""
+        """Offsets at which the operand is read: those of the window."""
         return (self.window_offsets,)
 
 
@@ -212,8 +212,8 @@ class Predicate:
     """Predicate with robustness `sign * num`; true iff the robustness is > 0 (`strict`) or >= 0.
 
     Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a predicate on
-    clocks and timers: its robustness is +inf or -inf, so it decides truth but is never the margin of an
-    enclosing formula.
+    clocks and timers: its robustness is +inf or -inf, so it decides whether an enclosing formula holds, but
+    not by how much.
     """
 
     num: Num
@@ -309,8 +309,8 @@ class Shift(Operator):
         outside: truth where that sample lies outside the trace. None: undefined, like a window that leaves
             the trace. False: used by `rise` and `fall` at the first sample.
         span: source location.
-        weak: whether the node results from a negation. If so, an undefined value counts as true where windows
-            are cut at the end of the trace (`truncate`), otherwise as false.
+        weak: whether the node results from a negation. Where windows are cut at the end of the trace
+            (`truncate`), an undefined value counts as true if `weak` is True, and as false if it is False.
     """
 
     steps: int

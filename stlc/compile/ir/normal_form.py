@@ -27,8 +27,8 @@ def flip(sign: Sign) -> Sign:
 def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
     """Return `formula` if `sign` is 1, or its negation if -1, in terms of `and`, `or` and temporal operators.
 
-    `not` remains before predicates, `since`, `rise`, `fall`, `prev`, `next`, and `Recalled` nodes (past
-    operators rewritten with timers).
+    The result has a `not` only before predicates, `since`, `rise`, `fall`, `prev`, `next`, and `Recalled`
+    nodes (past operators rewritten with timers).
     """
     op = getattr(formula, "op", "")
     match formula:

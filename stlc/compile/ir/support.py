@@ -1,8 +1,9 @@
-"""The support of a formula: lookback, lookahead and signals.
+"""The support of a formula: the samples that it reads (lookback, lookahead), and its signals.
 
-`fold` evaluates an `Analysis` bottom-up: the value of a node follows from those of its operands and from the
-offsets at which the node reads them (`ir.Operator.offsets`). Windows of the past are cut at the start of the
-trace, so they never require missing samples; a window "to the end" requires only its start.
+`fold` computes the value of an `Analysis` from the leaves upwards: the value of a node follows from those of
+its operands and from the offsets at which the node reads them (`ir.Operator.offsets`). Windows of the past
+are cut at the start of the trace, so they never require missing samples; a window "to the end" requires only
+its start.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ class Analysis(ABC, Generic[V]):
 
     @abstractmethod
     def over(self, parts: Sequence[V], offsets: Sequence[ir.Offsets]) -> V:
-        """Value of an operator that reads operand i at `offsets[i]`; the last offsets are its window."""
+        """Value of an operator whose operands have the values `parts`.
+
+        Operand i is read at `offsets[i]`; the last offsets are the window of the operator.
+        """
 
     @abstractmethod
     def at_start(self, body: V) -> V:
@@ -135,9 +139,10 @@ class _Required(Analysis[_Needs]):
         return 0, 0, 0
 
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
-        """Return how many samples an operator requires: those of its operands, plus the offsets of the reads.
+        """Return the lookback, lookahead, and lookahead from the first sample that an operator requires.
 
-        A window without end requires only the sample nearest to now.
+        They are those of its operands (`parts`), moved by the offsets at which the operands are read. A
+        window without end requires only the sample nearest to now.
         """
         past = future = clocked = 0
         for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):
@@ -195,9 +200,10 @@ def depends_on_ends(num: ir.Num) -> bool:
 
 
 def uses_end(formula: ir.Formula) -> bool:
-    """True if a future window extends to the end of the trace, or a number repeats the last sample beyond it.
+    """True if a formula depends on where the trace ends.
 
-    `sweep`, the motion between samples, reads such numbers.
+    This is so if a future window extends to the end of the trace, or if a number repeats the last sample
+    beyond the end. `sweep`, the motion between samples, reads such numbers.
     """
     windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
     endless = any(node.window.hi is None and not node.back for node in windowed)
@@ -212,14 +218,15 @@ def uses_end(formula: ir.Formula) -> bool:
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
     """Return an instant from which on the robustness of a formula is constant, +inf or -inf.
 
-    The result is None if no such instant is known. The trace is open: beyond its last sample the predicates
-    are unknown, and all count as +inf, or all as -inf. Most formulas are therefore constant from some instant
-    on. A window that ends far beyond a short trace needs only one of these instants.
+    The result is None if no such instant is known. The trace is open: the values beyond its last sample are
+    unknown. For bounds on the robustness, all predicates there count as +inf, or all as -inf. Most formulas
+    are therefore constant from some instant on. An operator with a window far beyond the last sample then
+    needs to read only one of these instants.
 
     Args:
         formula: formula in negation normal form.
         samples: number of known samples.
-        length: length of the trace at which windows to its end are cut.
+        length: assumed length of the whole trace in samples; windows to the end of the trace end there.
     """
     return fold(formula, _Tail(samples, length))
 
@@ -239,9 +246,9 @@ class _Tail(Analysis[int | None]):
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
         """Return an instant from which on an operator is constant, or None if none is known.
 
-        From this instant on, the operator reads its operands only where they are constant, or its window is
-        empty. If the window begins at the start of the trace, it must contain all instants at which its
-        operand varies.
+        `parts` are these instants for the operands; operand i is read at `offsets[i]`. From the returned
+        instant on, the operator reads its operands only where they are constant, or its window is empty. If
+        the window begins at the start of the trace, it must contain all instants at which its operand varies.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

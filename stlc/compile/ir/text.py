@@ -58,8 +58,8 @@ def _operand(formula: ir.Formula) -> str:
 def _parts(formula: ir.Formula) -> Sequence[ir.Formula]:
     """Return the operands of a formula that its text shows.
 
-    An operand that `timers.timer_test` adds to `and` or `or`, the finite robustness of a test of a timer, is
-    left out.
+    The test of a timer is an `or` of two predicates: one with infinite robustness, and one with finite
+    robustness (`timers.timer_test`). The text shows only the first one.
     """
     items = operands(formula)
     if not isinstance(formula, ir.BoolOp):
@@ -105,7 +105,10 @@ def shown(name: str) -> str:
 
 
 def show_number(num: ir.Num, level: int = 0) -> str:
-    """Return a number in infix notation, in parentheses if it binds more loosely than `level`."""
+    """Return a number in infix notation.
+
+    It is in parentheses if its operator binds more loosely than the precedence `level`.
+    """
     text, own = _number(num)
     return f"({text})" if own < level else text
 

@@ -35,7 +35,7 @@ _SORTS: Mapping[str, _Sort] = {
 
 @cache
 def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
-    """Return the fields of a node class that hold children, in order: (name, kind of the children)."""
+    """Return (name, kind of the children) of each field of the node class `kind` that holds children."""
     declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
     return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
@@ -94,7 +94,7 @@ def map_children(
 
 @cache
 def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
-    """Return the fields of a class that hold formulas: (name, whether the value is a tuple of formulas).
+    """Return the fields of node class `kind` with formulas: (name, whether the value is a tuple of formulas).
 
     For `Recalled`, a past operator rewritten with timers, this is only its field `now`.
     """
@@ -134,7 +134,7 @@ def nodes(formula: Any) -> Iterator[Any]:
 
 
 def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
-    """Yield the numbers of predicates, and those bound by `freeze`."""
+    """Yield the numbers in a formula: those of its predicates, and those bound by `freeze`."""
     for node in nodes(formula):
         yield from (child for child in children(node) if isinstance(child, _NUMBERS))
 
@@ -176,21 +176,22 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """Return the key of a signal, a shifted signal or a frozen value in the inputs of a compiled program."""
+    """Return the key under which a compiled program takes a signal or a frozen value as input."""
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name
 
 
 def frozen_in(num: ir.Num) -> frozenset[str]:
-    """Return the names of the frozen values in a number."""
+    """Return the names of the frozen values (bound by `freeze`) that a number reads."""
     return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, ir.FrozenVar))
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """Return a number shifted in time by `steps` samples (positive: later), and further by the time `delay`.
+    """Return a number shifted in time by `steps` samples (positive: later).
 
-    Outside the trace a `clamped` number repeats the first or last sample.
+    If `delay` is given, the number is shifted by this time in addition. Outside the trace a `clamped` number
+    repeats the first or last sample.
     """
 
     def moved(leaf: ir.Num) -> ir.Num:
@@ -286,9 +287,10 @@ def mentions_horizon(formula: typed.Formula) -> bool:
 
 
 def timer_form(formula: typed.Formula) -> typed.Formula:
-    """Return a state formula with each `Recalled` node replaced by the test of its timers.
+    """Return a state formula with its past operators in the form for a single instant.
 
-    A `Recalled` node is a past operator rewritten with timers.
+    The past operators were rewritten with timers before (`Recalled` nodes). Their form for a single instant
+    is a test of the timers, the field `now`.
     """
     if isinstance(formula, typed.Recalled):
         return timer_form(formula.now)

@@ -86,11 +86,11 @@ class Predicate(Node):
     Attributes:
         num: the number compared with 0, in SI.
         strict: whether the comparison is `>`.
-        guard: whether the predicate is on clocks and timers: it decides truth and is never the margin of an
-            enclosing formula.
+        guard: whether the predicate is on clocks and timers: it decides whether an enclosing formula holds,
+            but not by how much.
         unit: unit of the margin, in SI.
-        written: unit of the comparison in the source, to which `num` and `unit` are converted for recorded
-            traces (`stlc.compile.lowering.lower`).
+        written: unit of the comparison in the source. For recorded traces, `num` and `unit` are converted to
+            it (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num
@@ -154,7 +154,7 @@ class Shift(Node):
 
 @dataclass(frozen=True, slots=True)
 class Edge(Node):
-    """`rise(p)` or `fall(p)`: true where p has just become true or false; false at the first sample."""
+    """`rise(p)`: p has just become true. `fall(p)`: p has just become false. False at the first sample."""
 
     op: Literal["rise", "fall"]
     body: Formula
@@ -196,8 +196,8 @@ class Requirement:
         name: name of the requirement.
         doc: text of the `##` comment before the requirement.
         tags: names of the tags without arguments (`safety`, `liveness`).
-        weight: factor of the robustness in the overall minimum.
-        scale: divisor of the robustness in the overall minimum.
+        weight: factor of its robustness in the minimum over all requirements.
+        scale: divisor of its robustness in the minimum over all requirements.
         id: text of `@id("…")`; "" without this tag.
         group: name in `@group(name)`; "" without this tag.
         formula: typed formula.

@@ -75,8 +75,8 @@ def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Form
     """Lower a typed formula to an IR formula in negation normal form, with time in steps.
 
     The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
-    has no such operator (`stlc.compile.augment`). Findings about intervals are appended to `sink`, see
-    `stlc.compile.ir.discretize.to_window`. If one of them is an error, the result must not be used.
+    has no such operator (`stlc.compile.augment`). Findings about intervals are appended to `sink`, such as
+    W304 for a bound that is rounded to a sample. If one of them is an error, the result must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 
@@ -122,7 +122,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _negated(self, node: typed.Formula) -> ir.Formula:
-        """Lower the negation of a node before which `stlc.compile.ir.normal_form.normal` keeps `not`."""
+        """Lower the negation of `node`, one of the nodes before which negation normal form keeps a `not`."""
         match node:
             case typed.Until(_, op, _, left, right):
                 return self._timed(replace(node, left=normal(left, -1), right=normal(right, -1)), DUAL[op])

@@ -1,10 +1,10 @@
 """Local simplification laws on the IR; each preserves robustness wherever both sides are defined.
 
-Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true until q`
-becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
+In the following, `G` stands for `always`; the laws hold in the same form for `eventually`, `historically` and
+`once`. Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true
+until q` becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
 associative, nested `and`s and nested `or`s are merged. If it is idempotent, repeated items are removed. If it
-is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`. The laws for `G` (always) hold for `F` (eventually), `H`
-(historically) and `O` (once) in the same form.
+is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
-    """Remove windows [0, 0] and windows over constants; merge nested windows of the same operator."""
+    """Remove a window [0, 0] or one whose operand is constant; merge nested windows of the same operator."""
     body, window = node.body, node.window
     every = node.op == node.names[0]
     if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
@@ -81,10 +81,10 @@ def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:
-    """Return the window that replaces two nested ones, or None if no single window requires the same samples.
+    """Return the window that replaces two nested windows of one operator; None if there is none.
 
-    Two windows of several samples each read samples repeatedly, so merging them needs a semantics that is
-    idempotent and associative.
+    With two windows of several samples each, some samples are read repeatedly. Merging these windows needs a
+    semantics that is idempotent and associative.
     """
     lattice = semantics.associative and semantics.idempotent
     if outer.hi is not None and inner.hi is not None:
