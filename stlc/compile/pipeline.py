@@ -64,7 +64,8 @@ class CompiledRequirement:
         formula: formula in negation normal form, with time in steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
-        windowed: whether it mentions the horizon `T`, and so applies to every planning window.
+        windowed: whether it mentions the horizon `T`, the length of a plan. If so, and unless `absolute`, it
+            must hold at every sample that T further samples follow.
         uses_end: whether it has a window to the end of the trace.
         absolute: whether it has an operator such as `always@[a, b]`, whose interval counts from the start of
             the mission.
@@ -229,7 +230,11 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
 @final
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """Compiler of typed requirements, which collects the states they add, their goals, and findings."""
+    """Compiler of requirements; the input is the result of the first stage, with names and types resolved.
+
+    The compiler collects the states that the requirements add (`table`), their goals (`goals`), and the
+    findings (`sink`).
+    """
 
     grid: Grid
     purpose: Purpose
@@ -267,11 +272,11 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Replace the absolute operators of a requirement, and for training its past operators.
+        """Rewrite a requirement without absolute operators and, for training, without past operators.
 
-        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission; for
-        recorded traces that is the first sample. For training, both kinds of operators are replaced by
-        formulas over added states.
+        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission. A
+        recorded trace starts with the mission, so there the interval counts from the first sample. For
+        training, formulas over added states replace both kinds of operators.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

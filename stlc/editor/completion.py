@@ -190,10 +190,11 @@ def _functions() -> Iterator[Offer]:
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
-    """Yield proposals at a place where no number can stand.
+    """Yield proposals for names at a cursor where the grammar does not accept a number.
 
-    After a colon or arrow they are types; in a signal declaration they are the states of the system that are
-    not yet declared.
+    `piece` is the text of the declaration up to the word under the cursor. If it ends with a colon or an
+    arrow, types are proposed. In a signal declaration, the states of the system that are not yet declared are
+    proposed.
     """
     words = [lexeme.text for lexeme in lexemes(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):

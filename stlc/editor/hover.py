@@ -124,7 +124,10 @@ def _comment(doc: str) -> str:
 
 
 def about_shared(item: ast.Item, key: str) -> str:
-    """Return the hover text of a declaration in an imported file; `key` names the file."""
+    """Return the hover text of a declaration `item` in an imported file.
+
+    `key` is the name of the file, or the key of the standard library.
+    """
     origin = "library std" if key == STD else markdown_code(key)
     parts = [_code(item), f"from {origin}", _comment(item.doc)]
     return "\n\n".join(filter(None, parts))
@@ -251,7 +254,10 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
 
 
 def _seconds(time: typed.Time, grid: Grid) -> str:
-    """Return an end of an interval as text in seconds; "" if the time step or horizon needed is unknown."""
+    """Return an end of an interval as text in seconds, such as `2.5 s`.
+
+    The result is "" if the time step is unknown, or if the end contains the horizon and that is unknown.
+    """
     if grid.dt is None or (time.horizons and grid.horizon is None):
         return ""
     seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))

@@ -192,7 +192,10 @@ def _float(value: float) -> str:
 
 
 def squashed(task: Task) -> list[str]:
-    """C statements that compute the controls `u` of one time step from outputs `raw` of the network."""
+    """C statements that compute the controls `u` of one time step from outputs `raw` of the network.
+
+    The outputs are mapped to the ranges of the controls, by `tanh` for instance.
+    """
     lines, at = [], 0
     for i, each in enumerate(task.system.decl.controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
@@ -234,7 +237,7 @@ def cost(task: Task) -> list[str]:
     """C statements that add the cost of a plan to `cost`, given its states and its robustness `rho`.
 
     Raises:
-        Untranslatable: the margin of a goal is not defined at a single sample.
+        Untranslatable: the robustness of a goal cannot be computed from a single sample in C.
     """
     at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.system.names)}
     at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.system.names)}
@@ -361,9 +364,10 @@ def _in_its_unit(text: str, column: Column) -> str:
 
 
 def _added(task: Task) -> dict[str, object]:
-    """C texts about the states that the specification adds, by placeholder in the header's template.
+    """Texts for the header about the states that the specification adds: placeholder -> number or C text.
 
-    They contain the meaning of these states, their initial values and their updates.
+    A placeholder is a name in the template of the header. The texts contain the meaning of these states,
+    their initial values and their updates.
     """
     system, first = task.system, len(task.system.decl.signature.names)
     measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]

@@ -26,18 +26,19 @@ def observation(task: Task) -> list[ir.Num]:
 
 
 def state_images(task: Task) -> dict[str, ir.Num]:
-    """Return the states that the mirror symmetry of the system changes: name -> expression of the image.
+    """Return the states that the mirror symmetry of the system changes: name -> mirrored value.
 
-    An example is `{"y": -y}`. The symmetry is declared by the key `mirror` of a system file.
+    The mirrored value is an expression of the states, as in `{"y": -y}`. The key `mirror` of a system file
+    declares the symmetry.
     """
     names = set(task.system.names)
     return {each.name: each.value for each in task.system.decl.policy.mirror if each.name in names}
 
 
 def control_images(task: Task) -> dict[str, ir.Num]:
-    """Return the image of every control under the mirror symmetry of the system: name -> expression.
+    """Return the mirrored value of every control under the symmetry of the system: name -> expression.
 
-    The image of an unaffected control is the control itself. Angles are wrapped into their range.
+    The mirrored value of an unaffected control is the control itself. Angles are wrapped into their range.
     """
     images = {each.name: each.value for each in task.system.decl.policy.mirror}
     found: dict[str, ir.Num] = {}

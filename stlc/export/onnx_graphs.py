@@ -72,10 +72,11 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
 
 class _Rollout:
-    """Rollout that is computed stage by stage, for all time steps at once where possible.
+    """Rollout that is computed in stages, where possible for all time steps at once.
 
-    `states` holds the states computed by previous stages, (steps + 1, batch). `now` holds all values at the
-    start of each step, intermediate variables included: (steps, batch), or (1, batch) if constant in time.
+    A stage is a group of states and intermediate variables that depend only on earlier groups or on each
+    other. `states` holds the states computed by previous stages, (steps + 1, batch). `now` holds the values
+    of states, controls and variables at each step: (steps, batch), or (1, batch) if constant in time.
     """
 
     def __init__(
@@ -88,7 +89,10 @@ class _Rollout:
         self.now |= controls
 
     def run(self, stage: RolloutStage) -> None:
-        """Compute the states and variables of a stage, which depend only on earlier stages or each other."""
+        """Compute the states and variables of a stage for all time steps.
+
+        They depend only on earlier stages or on each other.
+        """
         if stage.early:
             self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
         for state, source in stage.follows.items():
@@ -371,9 +375,10 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
 
 
 def deepened(task: Task, states: States) -> Value:
-    """Mask of the plans whose next step increases the margin of a goal that is satisfied now: (1, batch).
+    """Mask of the plans whose next step increases the robustness of a goal that is satisfied now: (1, batch).
 
-    The mask equals `PendingGoals.deepened`. The task must have at least one goal.
+    A goal counts as long as its robustness is less than the number `gamma` in the system file. The mask
+    equals `PendingGoals.deepened`. The task must have at least one goal.
     """
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
@@ -435,8 +440,8 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """Graph from `state` (batch, n) and `begun` (batch, T, m) to the plan that `Guard` chooses.
 
     `begun` is the rest of the previous plan. It is kept if it satisfies the specification and one of two
-    conditions holds: the policy's plan ranks no higher, or `begun` increases the margin of a goal that is
-    satisfied now. Otherwise the policy's plan is chosen.
+    conditions holds: the policy's plan ranks no higher, or the next step of `begun` increases the robustness
+    of a goal that is satisfied now. Otherwise the policy's plan is chosen.
 
     The outputs of `deciding` are returned for the chosen plan. Further outputs are `kept` (batch,), which
     tells whether `begun` was kept, and the policy's plan and its robustness, `policy_plan` and `policy_rho`.
@@ -462,10 +467,10 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
-    """Judge `count` plans per agent, (batch, count, T, m).
+    """Evaluate several plans per agent: `plans` is (batch, count, T, m), `state` (batch, n).
 
-    Returns a table: name of a result (rank, verdict) -> its values, (batch, count, …). The plans themselves
-    are the entry `plan`.
+    Returns name of a result -> its values, (batch, count, …). The results are `rank`, `rho`, `safe`, `cost`,
+    `requirements`, and the plans themselves as `plan`; with goals in the task also `deepened`.
     """
     names = task.system.names
     count, steps, controls = plans.shape[1:]
@@ -487,7 +492,10 @@ def _best(score: Value) -> Value:
 
 
 def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
-    """Select plan number `index` (batch, 1) of each agent: (batch, count, …) -> (batch, …)."""
+    """Select one plan of each agent from the results in `table`: (batch, count, …) -> (batch, …).
+
+    `index` (batch, 1) is the number of the plan.
+    """
     outputs = {}
     for name, values in table.items():
         shape = (BATCH, *values.shape[2:])

@@ -55,7 +55,7 @@ class Deciding(nn.Module):
 
 
 def judged_by_torch(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
-    """Evaluate plans as `Task.judge`, with torch operations only, so that it can be exported."""
+    """Evaluate plans as `Task.judge` does, but with torch operations only, which torch can export."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
     names = [rule.name for rule in task.rules]
@@ -100,9 +100,11 @@ _NOTHING: tuple[Tensor, ...] = ()
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans whose first T0 steps are a prefix from a grid, and their verdicts, (states, choices, …) each.
+    """Plans that the guard tries with one number T0 of first controls, and their verdicts.
 
-    `falls`, the safety robustness on every prefix of a plan, is computed for the longest T0 only.
+    The first T0 controls of each plan are one choice from a grid of control sequences. The arrays are
+    (states, choices, …). `falls` is the robustness of the safety requirements on every first part of a plan;
+    it is computed for the longest T0 only.
     """
 
     plans: Tensor
@@ -157,11 +159,12 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans for one prefix length T0, with verdicts.
+        """All plans that the guard tries with one number T0 of first controls, and their verdicts.
 
-        The first T0 controls of a plan are a prefix from the backup policy's grid; in the first plan they are
-        those of the policy's own plan. The later controls come from the policy. With `falls`, the safety
-        robustness on every prefix of the plans is computed as well.
+        The first T0 controls of a plan are one of the sequences `prefixes` of the backup policy. In the first
+        plan they are those of the policy's own plan `own`. The later controls come from the policy, for the
+        state reached after T0 steps from `x`. With `falls`, the robustness of the safety requirements on
+        every first part of each plan is computed as well.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
@@ -174,7 +177,8 @@ class Guarding(nn.Module):
         """Plans that begin with the controls `heads` and continue by the policy, and their verdicts.
 
         `heads` is (B, C, L, m): for each state C sequences of L controls. Returns plans, rho, safe,
-        requirements, cost, and with `falls` the safety robustness on every prefix: (B, C, …) each.
+        requirements, cost, and with `falls` the robustness of the safety requirements on every first part of
+        each plan: (B, C, …) each.
         """
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
@@ -191,10 +195,12 @@ class Guarding(nn.Module):
 
 
 def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """Index of the plan that keeps the safety requirements for the longest time (safe prefix).
+    """Index, for each state, of the plan that keeps the safety requirements for the longest time.
 
-    Among plans that keep them equally long, the one with the highest robustness is chosen. Ties are decided
-    by the smaller safety violation (mean over all prefixes), then by the smaller cost.
+    `falls` (states, choices, T + 1) is the robustness of the safety requirements on every first part of each
+    plan in `tried`. Among plans that keep them equally long, the one with the highest robustness is chosen.
+    Ties are decided by the smaller safety violation (mean of `falls`, in which positive values count as 0),
+    then by the smaller cost.
     """
     samples = (falls >= -TOLERANCE).sum(2)
     depth = falls.clamp(max=0.0).mean(2)
@@ -209,9 +215,10 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Select results state by state: those of shorter prefixes, `before`, where `decided`; else `here`.
+    """Select results state by state: those in `before` where `decided` is True, else those in `here`.
 
-    `decided` marks the states for which a shorter prefix sufficed.
+    `decided` marks the states for which a plan was found with fewer first controls T0; `before` holds the
+    results of these plans.
     """
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)

@@ -143,7 +143,10 @@ def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11)
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
-    """Function from states (B, n) to the decisions of ONNX graphs, evaluated by the runtime."""
+    """Return the decisions of ONNX graphs as a function of states (B, n).
+
+    The Python runtime `stlc.runtime` evaluates the graphs.
+    """
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
@@ -153,10 +156,10 @@ def _answer(judged: JudgedPlans) -> Answer:
 
 
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
-    """Compare decisions of the graphs and of the guard that have a previous plan.
+    """Compare the decisions of the ONNX graphs with those of the guard, given a previous plan.
 
-    Both decide one step after random states. The previous plan is the rest of the plan that the guard chose
-    in the random states.
+    The guard first decides in random states and takes one step. The rest of its plan is the previous plan
+    with which the graphs and the guard then decide.
 
     Raises:
         RunError: R105, they disagree.

@@ -123,7 +123,8 @@ class IndexRange:
     def count(self) -> int:
         """Number of instants in the range; 0 or less for an empty range.
 
-        If `start` and `last` depend on loop indices, the earliest `start` and the latest `last` count.
+        If `start` and `last` depend on the indices of loops, it is the number of instants from the earliest
+        `start` to the latest `last` over all iterations.
         """
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
@@ -207,8 +208,8 @@ _NEVER = IndexRange(0, -1)
 def _first(read: ir.Offsets, run: IndexRange) -> Instant:
     """Return the first instant at which a formula reads an operand.
 
-    `run` holds the instants at which the value of the formula is needed. `read` holds the offsets from such
-    an instant at which the formula reads the operand.
+    `run` holds the instants at which the value of the formula is needed. `read` holds offsets in samples: for
+    its value at an instant k, the formula reads the operand from k + `read.first` to k + `read.last`.
     """
     return 0 if read.first is None else at_least(run.start + read.first, 0)
 
@@ -222,9 +223,11 @@ def _last(
     If all operands are known to be constant from some instant on, later instants are left out.
 
     Args:
-        read: offsets from such an instant at which the formula reads the operand.
-        run: instants at which the value of the formula is needed.
-        window: offsets of the formula's window.
+        read: offsets in samples. For its value at an instant k, the formula reads the operand from
+            k + `read.first` to k + `read.last`.
+        run: instants k at which the value of the formula is needed.
+        window: offsets of the formula's window, likewise relative to k. For `until`, the window is part of
+            the samples at which the left operand is read.
         parts: all operands of the formula.
         domain: length of the trace, and treatment of instants beyond its last sample.
     """
@@ -244,17 +247,21 @@ def _last(
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
-    """Return how many samples before and after its instant a number requires in order to be defined.
+    """Return how many samples before and after an instant must exist for an expression to be defined there.
 
-    Outside the trace, a clamped read repeats the last sample. If more samples will follow (`domain.stop` is
-    the final length), the last sample is not known yet, so a clamped read then requires its actual sample.
+    Some expressions read clamped samples: beyond the end of the trace the last sample is repeated, so none
+    need exist there. But if more samples will follow (`domain.stop` is the final length), the last sample is
+    not known yet. The expression then requires the sample that it actually reads.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
-    """Return the instants of `run` at which all samples within the lookback and lookahead `reach` exist."""
+    """Return the instants of `run` for which all samples exist that an expression reads.
+
+    The expression reads up to `reach.past` samples before the instant and up to `reach.future` after it.
+    """
     first = max(earliest(run.start), reach.past)
     return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
 
@@ -301,7 +308,10 @@ class Schedule:
 
 @dataclass(slots=True)
 class StepScope:
-    """Steps of one loop level; `known` maps a formula and its instants to the number of their step."""
+    """Steps in the body of one loop of generated code, or outside of all loops.
+
+    `known` maps a formula and a range of instants to the number of the step that computes its values there.
+    """
 
     steps: list[Step] = field(default_factory=list)
     known: dict[tuple[ir.Formula, IndexRange], int] = field(default_factory=dict)
@@ -334,7 +344,10 @@ class Scheduler:
         return self.add(Step(node, run, args, number=self.number(run)))
 
     def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends allocate memory for it
-        """Return the next free step number, for the values at the instants `run`."""
+        """Return the next free step number.
+
+        `run` holds the instants of the step. It is unused here; a back end may reserve memory for them.
+        """
         self._count += 1
         return self._count - 1
 

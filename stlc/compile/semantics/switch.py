@@ -56,7 +56,7 @@ class Hard:
         return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """Return the mask `truth` as 0 or 1."""
+        """Return the mask `truth` as numbers 0 or 1; the indicator `weight` is not used."""
         return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -81,7 +81,7 @@ class Tanh:
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return `weight` unchanged: at the boundary it is 1/2 for strict and non-strict inequalities."""
+        """Return `weight` unchanged: where the margin is 0, it is 1/2 for `>` and for `>=`."""
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:

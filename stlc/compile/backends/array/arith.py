@@ -39,9 +39,9 @@ class ArrayProgram:
         externs: functions of the system that `ir.Extern` names.
 
     A call takes a dictionary with one array for each name in the attribute `columns`; the arrays must
-    broadcast. A signal that is read some samples earlier or later is a separate entry, under its key in
-    `shifted`. The call returns one array per output; a constant output has the shape of the first array in
-    the dictionary. Common sub-expressions are computed once.
+    broadcast. A signal that is read some samples earlier or later needs an entry of its own; the attribute
+    `shifted` lists the names of these entries. The call returns one array per output; a constant output has
+    the shape of the first array in the dictionary. Common sub-expressions are computed once.
     """
 
     def __init__(
@@ -64,7 +64,11 @@ class ArrayProgram:
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
-        """Return all outputs by name; `switch` turns conditions into numbers (None: exactly 0 or 1)."""
+        """Return the value of each output, by name, from the arrays `env`.
+
+        `switch` converts a condition to a number from 0 (false) to 1 (true). If it is None, the number is
+        exactly 0 or 1.
+        """
         switch = switch or Hard()
         like = _first(env)
         key = (ops.name, switch, ops.kind(like))
@@ -134,8 +138,9 @@ class ArrayProgram:
 class _Bound:
     """Tape (list of operations) bound to the functions of an array library, ready to run.
 
-    `registers` is the initial memory of a run, with the constants in place. `arrays` and `numbers` are the
-    outputs: register of an array, and value of a constant output.
+    `registers` is the initial memory of a run, with the constants in place. Each output is an entry either in
+    `arrays` (name -> number of the register with its value) or, if it is constant, in `numbers` (name ->
+    value).
     """
 
     inputs: list[tuple[str, int]]
@@ -164,7 +169,7 @@ def _first(env: Mapping[str, Array]) -> Array:
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
-    """Numbers of the registers on which the outputs depend, in ascending order."""
+    """Numbers of the registers of `tape` on which the registers `outputs` depend, in ascending order."""
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
     while stack:
@@ -178,8 +183,8 @@ def _needed(tape: GradientTape, outputs: Any) -> list[int]:
 class _TapeWriter(NumberEvaluator[Operand]):
     """Writer of expressions and state formulas (formulas without temporal operators) to a tape.
 
-    If `exact`, a condition is written as a mask of booleans; otherwise as its margin, which the switch
-    converts to a weight between 0 and 1.
+    If `exact`, a condition is written as a mask of booleans. Otherwise it is written as a soft weight between
+    0 (false) and 1 (true), computed from the robustness of the condition.
     """
 
     def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
@@ -259,8 +264,9 @@ class _TapeWriter(NumberEvaluator[Operand]):
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
         """Return the register of a state formula's soft weight, a number between 0 and 1.
 
-        If the weight is constant, its value is returned. The weight is computed from the margin of the
-        formula. If the formula contains both `>` and `>=`, it may be true or false where its margin is 0; the
+        If the weight is constant, its value is returned. The weight is computed from the margin (robustness)
+        of the formula, for instance as `(1 + tanh(sharpness * margin)) / 2`. A default replaces a `sharpness`
+        of None. If the formula contains both `>` and `>=`, it may be true or false where its margin is 0; the
         weight is then adjusted by the exact truth (`Switch.settle`).
         """
         kinds = _strictness(cond)
@@ -316,9 +322,9 @@ def _rows(column: Array, start: int, count: int) -> Array:
 
 
 def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """Values of a signal at the instants `run`, shifted in time by the steps of `at`: `(count, batch)`.
+    """Values of a signal `at.steps` samples after each instant in `run`: `(count, batch)`.
 
-    Outside the trace the first or the last sample is repeated.
+    `column` is the whole signal. Before its first sample and after its last, that sample is repeated.
     """
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)

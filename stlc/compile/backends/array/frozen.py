@@ -149,7 +149,8 @@ class Freezer:
     def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
         """Signals, and values bound by enclosing `freeze` formulas, that the body reads, by name.
 
-        If the body reads none, the result is an arbitrary signal, for its shape.
+        The body is the formula inside the `freeze` operator `node`. If it reads none of them, the result is
+        one arbitrary signal, so that the shape of the signals is still known.
         """
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
@@ -180,10 +181,10 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Number of instants to evaluate at once: the greatest that needs no more than `most` values, at least 1.
+    """Number of instants to evaluate together: the greatest that needs at most `most` values, but at least 1.
 
     For c instants c (c + width) values are needed: each instant has a copy of c + width samples. If `width`
-    is infinite, each has a copy of all samples of the trace.
+    is infinite, each instant has a copy of the whole trace, which has `samples` samples.
     """
     if math.isinf(width):
         return max(most // samples, 1)

@@ -61,7 +61,8 @@ def evaluate(
 
     Raises:
         ValueError: a window extends beyond the trace, and `end` is "strict".
-        TraceError: E306, a lower or upper bound needs values at too many instants beyond the trace.
+        TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
+            the trace.
     """
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, end, windows, stop)
@@ -138,10 +139,16 @@ def robustness_signal(
 
 
 def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Execute an evaluation plan; returns the values of its formulas, `(count, batch)` each.
+    """Execute an evaluation plan; returns the robustness of its formulas, `(count, batch)` each.
+
+    Args:
+        plan: list of the values to compute, and the programs that compute them.
+        env: signal name -> array `(time, batch)`.
+        windows: algorithms for extrema over windows, in one semantics and for one array library.
 
     Raises:
-        TraceError: E306, a lower or upper bound needs values at too many instants beyond the trace.
+        TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
+            the trace.
     """
     values = _checked(plan, env, windows)
     return [values[root] for root in plan.schedule.roots]
@@ -149,6 +156,8 @@ def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list
 
 def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
     """Return the values of all steps of an evaluation plan, `(count, batch)` each.
+
+    A step is one sub-formula at a range of instants.
 
     Raises:
         TraceError: E306, more than `MAX_BEYOND` instants, or `MAX_VALUES` values, lie beyond the trace.
@@ -160,7 +169,7 @@ def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> lis
 
 
 def _too_far(plan: ArrayPlan) -> Diagnostic:
-    """Return finding E306: sub-formulas of a formula are needed at too many instants beyond the trace."""
+    """Return finding E306: a formula needs values at too many instants beyond the trace."""
     step = max(plan.schedule.steps, key=lambda step: step.run.last)
     return Diagnostic(
         "E306",

@@ -84,10 +84,17 @@ class WindowKernel:
 
 
 def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sliding) -> WindowKernel | None:
-    """Return the kernel for operands `(time, batch)` of a dtype; None if it cannot be used.
+    """Return the kernel for operands `(time, batch)` of a dtype; None if no kernel can be used.
 
-    It cannot be used for other dtypes than float32 and float64, if it cannot be compiled, or if its working
-    memory, which grows with the width of the windows, exceeds both `_ROOM` and the size of an operand.
+    The dtype must be float32 or float64, and the kernel must compile. Its working memory grows with the width
+    of the windows; it must not exceed the greater of `_ROOM` bytes and the size of one operand.
+
+    Args:
+        dtype: name of the dtype.
+        traces: length of the batch axis.
+        operands: 1 for an extremum, 2 for `until` and `release`.
+        pick: "max" for a maximum or `until`, "min" for a minimum or `release`.
+        window: layout of the windows.
     """
     if dtype not in _TYPES:
         return None

@@ -175,9 +175,9 @@ class Ops(Protocol):
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
-        """Key of an array, such as (dtype, device).
+        """Key of the array `like`, such as (dtype, device).
 
-        Constants are converted once per key, so arrays with equal keys share the converted constants.
+        Constants are converted once per key. So arrays with equal keys share the converted constants.
         """
 
     def constant(self, value: float, like: Array) -> Array | float:

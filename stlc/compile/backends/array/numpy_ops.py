@@ -142,7 +142,10 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return the key of an array's constants: None, since constants are floats and fit every array."""
+        """Return None for every array: a constant stays a Python float, so one form fits all arrays.
+
+        In general the result is a key, and arrays with equal keys can share converted constants.
+        """
         return None
 
     def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002

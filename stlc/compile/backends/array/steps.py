@@ -90,7 +90,11 @@ class ArrayPlan:
 
 
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the evaluation plan of `formulas` at the instants `run`: the steps and their programs."""
+    """Return the evaluation plan of `formulas` at the instants `run`: the steps and their programs.
+
+    A step is one sub-formula at a range of instants. `domain` tells the length of the trace and how instants
+    beyond its last sample are treated.
+    """
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
@@ -150,7 +154,9 @@ def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list
 @final
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Builder of the functions that compute steps, for traces of one length.
+    """Builder of the functions that evaluate formulas, for traces of one length.
+
+    Each function computes one step of an evaluation schedule: one sub-formula at a range of instants.
 
     Attributes:
         domain: length of the traces, and treatment of instants beyond their last sample.
@@ -199,7 +205,10 @@ class Machine:
         return kernel
 
     def bind(self, step: Step) -> Kernel:
-        """Return the function that computes a step from its operands (not for predicates and `freeze`)."""
+        """Return the function that computes the values of `step` from the values of its operands.
+
+        A step is one sub-formula at a range of instants. The formula must not be a predicate or a `freeze`.
+        """
         node, run = step.node, step.run
         operands = len(step.operands)
         match node:
@@ -230,10 +239,17 @@ class Machine:
         return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
 
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Function for an operator over future windows at the instants `run`.
+        """Function that computes a temporal operator over future windows at the instants `run`.
 
-        On an open trace, an operator has an unknown value where its unbounded window starts beyond the final
-        length of the trace.
+        The function computes an extremum of one operand, or `until` of two. An open trace continues beyond
+        its last known sample. On such a trace, an operator with an unbounded window has an unknown value at
+        instants whose window starts beyond the final length of the trace.
+
+        Args:
+            window: window of the operator, relative to each instant.
+            run: instants at which the operator is evaluated.
+            operands: number of operands; 0 if the windows contain no samples.
+            pick: "max" or "min".
         """
         rows = run.count
         beyond = neutral(pick)
@@ -248,7 +264,10 @@ class Machine:
         return lambda parts, like: padded(inner(parts, like), run.count, beyond)
 
     def _past(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Function for an operator over past windows: that for future windows, applied in reversed time."""
+        """Function that computes a temporal operator over past windows at the instants `run`.
+
+        Operands are reversed in time, and then treated as for future windows (`_future`).
+        """
         ops, reduce = self.windows.ops, self.windows.semantics.reduce
         if not operands:
             return self._constant(run.count, neutral(pick))
@@ -258,7 +277,10 @@ class Machine:
         return lambda parts, like: flip(inner([flip(part) for part in parts], like))
 
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
-        """Function for extrema of one operand, or `until` of two, over `rows` windows [lo, hi]."""
+        """Function that computes extrema of one operand, or `until` of two, over `rows` sliding windows.
+
+        `window` has the bounds of a window relative to its instant, and `pick` is "max" or "min".
+        """
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
         if operands == 1:
@@ -292,7 +314,10 @@ class Machine:
 
 
 def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps of a plan, `(count, batch)` each, from signals `(time, batch)`."""
+    """Return the values of all steps of an evaluation plan, `(count, batch)` each.
+
+    A step is one sub-formula at a range of instants. `env` maps a signal name to an array `(time, batch)`.
+    """
     ops, like = windows.ops, next(iter(env.values()))
     runners = plan.runners.get(windows)
     if runners is None:

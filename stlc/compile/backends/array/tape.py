@@ -217,7 +217,10 @@ class GradientTape:
         return self.emit(kernel, margin, 0.0)
 
     def number(self, mask: int) -> int:
-        """Register of a number that is 1 where `mask` is True, else 0, in the dtype of what was compared."""
+        """Register of a number that is 1 where `mask` is True, else 0.
+
+        The number gets the dtype of the arrays whose comparison gave the mask.
+        """
         return self.emit("number", mask, self._compared(mask))
 
     def _compared(self, mask: int) -> int:

@@ -79,7 +79,10 @@ class Windows:
         return self.ops.flip(running(self.ops.flip(x)))
 
     def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
-        """Extrema over windows inside the array, in about log2(width) merges of blocks of 1, 2, 4, … rows."""
+        """Extrema over windows of `width` rows, in about log2(width) merges of blocks of 1, 2, 4, … rows.
+
+        Every window must lie within the array.
+        """
         if width == 1:
             return x
         piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
@@ -99,9 +102,10 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Merge the partial result of each block of rows with that of the block `shift` rows later.
+        """Merge the partial extremum of each block of rows with that of the block `shift` rows later.
 
-        Row j of `a` and `b` is the partial result of the block that starts at row j.
+        Row j of `a` and `b` is the partial extremum (`Parts` of the semantics) of the block that starts at
+        row j.
         """
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
@@ -226,8 +230,9 @@ class Windows:
         return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
-        """`until` over windows inside the array, in about log2(width) compositions of adjacent blocks.
+        """`until` over windows of `width` rows, in about log2(width) compositions of adjacent blocks.
 
+        Every window must lie within the array.
         Each block of rows has two values: the least `left` over the block (`held`), and `until` within the
         block (`met`). In the loop, row j of `held` and `met` belongs to the block of `size` rows that starts
         at row j. Row j of `total` belongs to the first `done` rows of window j.

@@ -74,7 +74,10 @@ def _writer(motion: Motion) -> NumberWriter:
 
 
 def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
-    """C statements of a step, which compute next states `y` and actuator commands `c` from `x` and `u`."""
+    """C statements of a time step, from states and controls to next states and actuator commands.
+
+    The C arrays `x` and `u` hold the states and the controls, `y` the next states, `c` the commands.
+    """
     index, writer = state_index(motion), _writer(motion)
     given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
     for name, num in motion.lets:
@@ -85,7 +88,10 @@ def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
 
 
 def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
-    """C statements that store the values of expressions of states `x` and commands `u` in `y`."""
+    """C statements that store the values of the expressions `numbers` in the C array `y`.
+
+    The expressions may read the states and the commands, which are in the C arrays `x` and `u`.
+    """
     writer = _writer(motion)
     values = [writer.number(num) for num in numbers]
     return [*writer.lines, *(f"y[{i}][j] = {value};" for i, value in enumerate(values))]

@@ -102,7 +102,7 @@ def state_index(motion: Motion) -> dict[str, int]:
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
-    """Return the C functions `roll`, which computes the states, and `check`, for the robustness."""
+    """Return the C functions `roll`, which computes states, and `check`, which computes the robustness."""
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
@@ -118,7 +118,11 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 
 
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
-    """Return blocks of C statements that compute all sub-formulas, then store the formulas' robustness."""
+    """Return blocks of C statements that compute all sub-formulas, then store the formulas' robustness.
+
+    `plan` is the list of the sub-formulas with their memory. `index` maps the name of a state to its index in
+    the array of trajectories.
+    """
     printer = StepPrinter(plan, index)
     roots = along_roots(plan, "LANE out[{i}][j] = {value};")
     return [*(printer.forward([step]) for step in plan.schedule.steps), roots]
@@ -169,7 +173,8 @@ CHECK = Frame(
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
     """Return the function that maps a state or control to its C expression in a step.
 
-    The expression is for sample `k` and trajectory `j`; it is None for a leaf that is not a signal.
+    The expression is for sample `k` and trajectory `j`. For an operand of another kind, such as a function
+    call, the returned function gives None.
     """
     index = state_index(motion)
 

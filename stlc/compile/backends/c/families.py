@@ -37,7 +37,11 @@ class FamilyTable:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names by which the common formula refers to the constants and signals in the table."""
+        """Names of the table's entries in the formula that the members of a family share.
+
+        For example, `x > 1` and `x > 2` share the formula `x > a`. The name `a` stands for 1 in the first row
+        of the table and for 2 in the second.
+        """
         return frozenset(f"{LISTED}{name}" for name in (*self.constants, *self.columns))
 
 
@@ -47,8 +51,8 @@ class Family:
 
     Attributes:
         members: indices of the formulas.
-        shape: common formula, with names of table entries where the members differ.
-        table: values of these names for each member.
+        shape: the formula that all members share, with a name in each place where the members differ.
+        table: for each of these names, the constant or signal of every member.
     """
 
     members: tuple[int, ...]
@@ -57,12 +61,12 @@ class Family:
 
 
 def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
-    """Return the families of at least `LEAST` members.
+    """Group formulas that differ in constants and signals only; return groups of at least `LEAST` members.
 
     Args:
         formulas: formulas to group.
-        first: number of the first family's table, which is part of the C names in it; the tables of further
-            families are numbered from there.
+        first: number of the first group; the next groups are numbered `first + 1` and so on. The number is
+            part of the C names in the table of the group.
     """
     if len(formulas) < LEAST:
         return []
@@ -101,7 +105,10 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 
 
 def _entries(formula: ir.Formula) -> list[Entry]:
-    """Constants and signals of a formula that may differ within a family, in order of occurrence."""
+    """Constants and signals of a formula that may differ between the members of a family.
+
+    They are listed in order of occurrence. A constant exponent, for instance, must not differ.
+    """
     found: list[Entry] = []
 
     def note(leaf: Entry) -> ir.Num:
@@ -113,7 +120,7 @@ def _entries(formula: ir.Formula) -> list[Entry]:
 
 
 def _changed(node: N, change: Callable[[Entry], ir.Num]) -> N:
-    """Replace each constant or signal that may differ within a family by `change(leaf)`."""
+    """Replace each constant or signal that may differ between the members of a family by `change(leaf)`."""
     if isinstance(node, (ir.Freeze, ir.Extern)):
         return node  # names of frozen values are unique; a call is computed once for its columns
     if isinstance(node, (ir.Const, ir.Signal, ir.ShiftedSignal)):

@@ -136,8 +136,8 @@ class Plan:
     """Evaluation schedule with the memory of its steps.
 
     Attributes:
-        schedule: steps; its roots are the formulas at the first sample.
-        roots: location of each formula's robustness.
+        schedule: steps (sub-formulas at ranges of instants) in the order of computation.
+        roots: location of each formula's robustness at the first sample.
         buffers: memory of each step, by step number.
         size: working memory in doubles per trajectory.
         calls: key of a function call on signals (`call_of`) -> step number of its first component.
@@ -171,10 +171,10 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 
 @dataclass(slots=True)
 class _Scope(StepScope):
-    """Scope of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
+    """Group of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
 
-    `read` names the values that change from iteration to iteration; `own` lists the step numbers in the
-    scope.
+    `read` names the values that change in every iteration of the loop. `own` lists the numbers of the steps
+    in the group. `table` is True for a loop over a table.
     """
 
     read: frozenset[str] = frozenset()
@@ -235,7 +235,7 @@ class _Planner(Scheduler):
         return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add the step of a formula and return its number.
+        """Add the step that computes a formula at the instants `run`; return its number.
 
         Raises:
             Untranslatable: the formula needs samples outside of the trajectory.
@@ -340,9 +340,10 @@ class _Planner(Scheduler):
 
 
 def call_of(num: ir.Num) -> CallKey | None:
-    """Key of a call of an IR function on signals, all read at one sample; None for any other expression.
+    """Key that identifies a function call on signals: (function name, signals).
 
-    Such a call is computed once for all samples.
+    All signals must be read at the same sample. Calls with equal keys are computed once, for all samples. The
+    result is None for any other expression.
     """
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
@@ -375,7 +376,7 @@ LARGE = 64
 def _split(formula: ir.Formula) -> ir.Formula:
     """Rewrite a predicate over a large `min` or `max` as `and` or `or` of predicates.
 
-    Any other formula is returned unchanged.
+    An expression is large if it has more than `LARGE` nodes. Any other formula is returned unchanged.
     """
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula

@@ -350,9 +350,10 @@ class _Windowed(StepForm):
         return [*head, "  else LANE {", *_indented(self._step_back(), 4), "  }", "}"]
 
     def _recursion(self, lines: list[str], *, reverse: bool = False) -> list[str]:
-        """Head of the C loop of the recursion; `lines` are the statements for its first instant.
+        """Head of the C loop that computes each instant from the adjacent one (for unbounded windows).
 
-        With `reverse` the loop runs in the opposite direction, as the adjoint does.
+        `lines` are the C statements for the instant at which the computation starts. With `reverse` the loop
+        runs in the opposite direction, as the gradient needs.
         """
         first = self.run.start if self.back else self.run.last
         head = loop(self.run, back=self.back if reverse else not self.back)
@@ -608,7 +609,11 @@ class _TableLoop(_Repeated):
 
 
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
-    """Entries of a table that have the C type `kind`, as a C array with one row per line."""
+    """C declaration of a table whose entries have the C type `kind`: an array with one row per line.
+
+    `entries` maps each column of the table to the texts of its values. `row` is the C name of the row index;
+    it is part of the array's name. Without columns, the result is empty.
+    """
     if not entries:
         return []
     rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]

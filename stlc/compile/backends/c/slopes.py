@@ -1,7 +1,7 @@
 """Derivatives of expressions as C statements: reverse mode over the registers of a `NumberWriter`.
 
 The derivatives equal those of `backends.torch.ops`, also at ties and kinks. Conditions have the value 0 or 1
-and the slope of `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
+and the derivative of the smooth step `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
 """
 
 from __future__ import annotations
@@ -105,9 +105,10 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
-        """Derivatives of a minimum or maximum with respect to its two operands.
+        """C expressions of the derivatives of a minimum or maximum with respect to its two operands.
 
-        Equal operands share the derivative; a constant operand gets none.
+        `name` is "min" or "max"; `first` and `second` are the operands. Equal operands share the derivative;
+        a constant operand gets none.
         """
         sign = LESS[name]
         if not self._varies(second):

@@ -178,7 +178,7 @@ class CasadiOps:
     # ------------------------------------------------------------------- truth
 
     def settled(self, weight: SymbolicColumn, mask: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """Return `weight` unchanged, since the program must be smooth."""
+        """Return `weight` unchanged, not 0 or 1 as `mask` says, since the program must be smooth."""
         return weight
 
     def number(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
@@ -190,7 +190,10 @@ class CasadiOps:
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """+inf where `mask` is true, else -inf; +-`GREAT` where the mask depends on variables."""
+        """Return +inf where `mask` is true, else -inf.
+
+        Where the mask depends on variables of the program, the number `GREAT` replaces infinity.
+        """
         rows = []
         for each in mask.rows():
             size = math.inf if each.entries.is_constant() else GREAT
@@ -198,7 +201,10 @@ class CasadiOps:
         return self.cat(rows)
 
     def straight_through(self, rho: SymbolicColumn, strict: bool, slope: float) -> SymbolicColumn:  # noqa: ARG002
-        """`(1 + tanh(slope rho)) / 2`, so that value and gradient belong to the same function."""
+        """Return the smooth step `(1 + tanh(slope rho)) / 2`, not 0 or 1 as with other array libraries.
+
+        So the value and the gradient belong to the same function.
+        """
         return SymbolicColumn(0.5 + 0.5 * casadi.tanh(slope * rho.entries))
 
     # -------------------------------------------------------------- along time
@@ -260,7 +266,10 @@ class CasadiOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return the key of an array's constants: None, since constants are floats and fit every array."""
+        """Return None for every array: a constant stays a Python float, so one form fits all arrays.
+
+        In general the result is a key, and arrays with equal keys can share converted constants.
+        """
         return None
 
     def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002

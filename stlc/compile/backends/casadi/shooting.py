@@ -63,7 +63,7 @@ class Eased:
         return ops.sigmoid(rho * (2.0 * width))
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return `weight` unchanged."""
+        """Return the smooth indicator `weight` unchanged, without use of the exact truth `truth`."""
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -205,7 +205,10 @@ class Shooting:
         self._demands = int(values.shape[0])
 
     def _moved(self, env: Mapping[str, SymbolicColumn]) -> Mapping[str, SymbolicColumn]:
-        """States after each step, name -> series (steps, 1), from the series of states and controls."""
+        """States after each step: name -> series (steps, 1).
+
+        `env` maps the name of a state or control to its values at the start of each step, (steps, 1).
+        """
         steps = self._motion.horizon
         known = {**env, ir.ELAPSED: CASADI.counted(0, steps, None)}
         for name, num in self._lets:
@@ -217,7 +220,11 @@ class Shooting:
         return {name: _tall(column, steps) for name, column in moved.items()}
 
     def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
-        """Scaled robustness of the required conditions, (conditions, 1), without those that always hold."""
+        """Scaled robustness of the required conditions, as a column (conditions, 1).
+
+        Each formula in `demands` is split into conditions at single samples. Conditions that always hold are
+        left out. `rows` maps the name of a signal to its values.
+        """
         found = []
         for each in demands:
             for formula, first, last in _conditions(each.formula, 0, 0, self._motion.horizon):
@@ -234,7 +241,8 @@ class Shooting:
     def limits(self, *, maximise: bool) -> dict[str, Vector]:
         """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), under the names of CasADi.
 
-        If `maximise`, the shortfall may become negative, so that robustness beyond the margin is rewarded.
+        The last variable is the shortfall: the amount by which the worst condition misses the robustness that
+        is asked for. If `maximise`, it may become negative, so that additional robustness is rewarded.
         """
         motion, steps = self._motion, self._motion.horizon
         free = (-math.inf, math.inf)

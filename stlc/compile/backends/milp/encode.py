@@ -1,6 +1,6 @@
 """Encoding of dynamics and formulas of the IR as a mixed-integer linear model, for one initial state.
 
-Signals that no control affects are constants, and expressions of constants are evaluated at once. The
+Signals that no control affects are constants, and an expression of constants is replaced by its value. The
 encoding is tight or relaxed. In a tight encoding the conditions in the dynamics hold or fail with a margin of
 at least `MARGIN`, so that every solution is a plan. A relaxed encoding has every satisfying plan among its
 solutions, so that its infeasibility proves that no plan satisfies the specification.
@@ -120,8 +120,8 @@ class Demand:
 
     Attributes:
         formula: formula of the IR.
-        margin: affine form that the robustness of its predicates must reach; predicates on time have no
-            margin.
+        margin: affine form. The robustness of each predicate in the formula must be at least this form.
+            Predicates on time are excepted: they must be true, without a minimum robustness.
     """
 
     formula: ir.Formula
@@ -135,8 +135,8 @@ Row: TypeAlias = dict[str, Expression]
 class Encoding:
     """Mixed-integer linear model whose solutions are plans from one initial state.
 
-    With `tight`, every solution of the model is a plan of the system; otherwise the encoding is relaxed, so
-    that every plan that satisfies the requirements is a solution.
+    If `tight`, every solution of the model is a plan of the system. Otherwise the encoding is relaxed: every
+    plan that satisfies the requirements is a solution, but some solutions may be no plans of the system.
 
     Attributes:
         model: variables and constraints of the program.
@@ -212,7 +212,11 @@ class Encoding:
         return [self._tree(each.formula, 0, each) for each in requirements]
 
     def _invariants(self, requirements: Sequence[Demand], row: Row, k: int) -> None:
-        """Tighten the bounds of the states of sample `k` by conditions that hold in every satisfying plan."""
+        """Tighten the bounds of the states of sample `k` by conditions that hold in every satisfying plan.
+
+        `row` maps the name of a signal to its value at sample `k`. If one of the conditions cannot hold, the
+        model is marked as infeasible.
+        """
         self.rows.append(row)
         for each in requirements:
             for body in self._demanded(each.formula, k, each):
@@ -348,7 +352,7 @@ class Encoding:
         """`value >= margin` as a tree of affine conditions.
 
         Each operand of a maximum, and each branch of a conditional value, becomes a condition of its own.
-        `num` is the expression that an error names.
+        `num` is the source expression of `value`; error messages show it.
 
         Raises:
             UnencodableError: the condition has no mixed-integer linear form.
@@ -370,7 +374,7 @@ class Encoding:
     def _polynomial(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
         """`value >= margin` as a tree, for an affine or quadratic value without maxima and conditionals.
 
-        `num` is the expression that an error names.
+        `num` is the source expression of `value`; error messages show it.
         """
         squares: dict[int, float] = {}
         for factor, atom in value.atoms:
@@ -573,9 +577,9 @@ class Encoding:
         return Expression(rest)
 
     def _linear(self, value: Expression, num: ir.Num) -> Affine:
-        """Affine form that equals a value; maxima and conditional values become variables of the model.
+        """Affine form that equals `value`; maxima and conditional values become variables of the model.
 
-        `num` is the expression that an error names.
+        `num` is the source expression of `value`; error messages show it.
 
         Raises:
             UnencodableError: the value contains a norm or a square.
@@ -635,7 +639,7 @@ _FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {
 
 
 def _read_once(names: set[str], nums: Sequence[ir.Num]) -> set[str]:
-    """Those of the signals `names` that the expressions `nums` read exactly once in total."""
+    """Names of the signals that the expressions `nums` read exactly once in total; a subset of `names`."""
     reads = [leaf.name for num in nums for leaf in leaves(num) if isinstance(leaf, ir.Signal)]
     return {name for name in names if reads.count(name) == 1}
 
@@ -648,7 +652,7 @@ def _of_state(formula: ir.Formula) -> bool:
 
 
 def _conjuncts(tree: Tree) -> Iterator[Tree]:
-    """Conditions whose conjunction equals the tree."""
+    """Yield conditions whose conjunction equals the condition `tree`."""
     if isinstance(tree, Junction) and tree.op == "and":
         for item in tree.items:
             yield from _conjuncts(item)
@@ -657,7 +661,10 @@ def _conjuncts(tree: Tree) -> Iterator[Tree]:
 
 
 def _scaled(one: Expression, other: Expression) -> Expression | None:
-    """Product of two values, if `one` is a choice between two constants; None otherwise."""
+    """Product of `one` and `other`, if `one` is a choice between two constants; None otherwise.
+
+    The product is a choice between two multiples of `other`.
+    """
     match one.atoms:
         case ((factor, Conditional(yes, no, holds, fails)),) if not one.form.terms:
             if yes.known is None or no.known is None:

@@ -1,8 +1,9 @@
-"""Mixed-integer linear models: variables with bounds, affine forms, rows, and trees of conditions.
+"""Mixed-integer linear models: variables with bounds, affine forms, linear constraints, conditions.
 
 A tree of conditions is a conjunction or disjunction of affine conditions. Each condition is tied to a binary
-variable in one direction only: if the variable is 1, the condition holds. Each big-M is the least one that
-the bounds of the variables in its row allow.
+variable in one direction only: if the variable is 1, the condition holds. The constraint for this has a
+constant (big-M) that makes it void if the variable is 0. The constant is the least one that the bounds of the
+variables in the constraint allow.
 """
 
 from __future__ import annotations
@@ -108,7 +109,9 @@ def junction(op: Literal["and", "or"], items: Iterable[Tree]) -> Tree:
 
 @dataclass(frozen=True, slots=True)
 class Arrays:
-    """A model as arrays, with the matrix of its rows in compressed row format, for a solver.
+    """A model as arrays for a solver; the matrix of its linear constraints is in compressed row format.
+
+    A row is one constraint; n is the number of variables.
 
     Attributes:
         lower, upper: bounds of the variables, (n,).
@@ -146,14 +149,14 @@ class Model:
     _rows: list[tuple[Mapping[int, float], float, float]] = field(default_factory=list)
 
     def variable(self, lower: float, upper: float, *, integer: bool = False) -> Affine:
-        """A new variable within bounds."""
+        """Add a variable with the bounds `lower` and `upper`; return it as an affine form."""
         self._lower.append(lower)
         self._upper.append(upper)
         self._integer.append(integer)
         return Affine({len(self._lower) - 1: 1.0}, 0.0)
 
     def binary(self) -> Affine:
-        """A new binary variable."""
+        """Add a binary variable; return it as an affine form."""
         return self.variable(0.0, 1.0, integer=True)
 
     def is_binary(self, index: int) -> bool:
@@ -169,7 +172,7 @@ class Model:
         return low, high
 
     def most(self, tree: Tree) -> float:
-        """Upper bound on the margin by which a condition can hold, from the bounds of the variables.
+        """Upper bound on the robustness of the condition `tree`, from the bounds of the variables.
 
         It is inf for a condition that is True and -inf for one that is False.
         """
@@ -180,9 +183,9 @@ class Model:
         return (min if tree.op == "and" else max)(map(self.most, tree.items))
 
     def tighten(self, form: Affine, lower: float) -> None:
-        """Require `form >= lower` by tightening the bound of its variable.
+        """Require `form >= lower` by tightening the bound of the single variable in `form`.
 
-        A form with more than one variable, or none, is ignored.
+        If `form` has more than one variable, or none, nothing is done.
         """
         if len(form.terms) != 1:
             return
@@ -216,7 +219,7 @@ class Model:
         return found
 
     def selected(self, binary: Affine, yes: Affine, no: Affine) -> Affine:
-        """Variable, within the bounds of both, that equals `yes` if a binary variable is 1, else `no`."""
+        """New variable that equals `yes` if the binary variable `binary` is 1, and `no` if it is 0."""
         (low, high), (least, most) = self.bounds(yes), self.bounds(no)
         found = self.variable(min(low, least), max(high, most))
         below, above = self.bounds(yes.plus(no, -1.0))
@@ -227,7 +230,10 @@ class Model:
         return found
 
     def imply(self, off: Affine, tree: Tree) -> None:
-        """Add constraints by which a condition must hold if `off`, a nonnegative integer form, is 0."""
+        """Add constraints by which the condition `tree` must hold if `off` is 0.
+
+        `off` is an affine form with nonnegative integer values. If it is 1 or more, nothing is required.
+        """
         if isinstance(tree, bool):
             if not tree:
                 self.require(off, 1.0)
@@ -246,9 +252,10 @@ class Model:
             self.require(total, 1.0)
 
     def literal(self, tree: Leaf | Junction | bool) -> Affine:
-        """Binary variable that implies a condition: if the variable is 1, the condition holds.
+        """Binary variable that implies the condition `tree`: if the variable is 1, the condition holds.
 
-        It is created on the first call for the condition; a constant condition gives a constant.
+        The variable is created on the first call for the condition. For a constant condition, the result is
+        the constant 0 or 1.
         """
         if isinstance(tree, bool):
             return constant(float(tree))

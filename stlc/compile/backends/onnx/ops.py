@@ -179,7 +179,10 @@ class OnnxOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: Value) -> Hashable:
-        """Return the key of an array's constants: the element type, to which the graph converts floats."""
+        """Return the element type of the array `like`.
+
+        Arrays with equal element types can share converted constants.
+        """
         return like.kind
 
     def constant(self, value: float, like: Value) -> float:  # noqa: ARG002

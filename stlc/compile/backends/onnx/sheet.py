@@ -79,7 +79,7 @@ class OnnxGraph:
         nodes: operations in order.
         constants: name -> array.
         inputs: input values of the graph.
-        prefix: prefix of its names, different for a loop body and the enclosing graph.
+        prefix: start of all names in the graph; a loop body and the enclosing graph have different ones.
     """
 
     nodes: list[GraphNode] = field(default_factory=list)
@@ -219,11 +219,17 @@ class Value:
         return self.apply("Neg")
 
     def beside(self, other: Value | float) -> Value:
-        """Convert a float to a constant of the element type of this value; a value is returned unchanged."""
+        """Return `other` as a symbolic array: a float becomes a constant of this array's element type.
+
+        A symbolic array is returned unchanged.
+        """
         return other if isinstance(other, Value) else self.sheet.constant(other, self.kind)
 
     def apply(self, op: str, *others: Value | float, kind: Kind | None = None) -> Value:
-        """Apply an elementwise operation; shapes broadcast as in NumPy."""
+        """Apply the elementwise ONNX operation `op` to this value and `others`; shapes broadcast.
+
+        `kind` is the element type of the result; None means that of this value.
+        """
         parts = [self.beside(other) for other in others]
         (out,) = self.sheet.emit(op, (self, *parts), [self.broadcast(*parts)], kind or self.kind)
         return out
@@ -291,7 +297,10 @@ class Value:
         return self.transposed(1, 0)
 
     def expand(self, *shape: int, like: Value | None = None) -> Value:
-        """Expand axes of length 1 to a shape; `BATCH` in it is the unknown length of `like`'s last axis."""
+        """Expand axes of length 1, so that the result has the given shape.
+
+        A length `BATCH` in the shape is unknown; it is the length of the last axis of `like`.
+        """
         if self.shape == shape:
             return self
         parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]

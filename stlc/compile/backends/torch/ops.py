@@ -266,7 +266,7 @@ class TorchOps:
         return out
 
     def kind(self, like: Tensor) -> Hashable:
-        """Return the key of an array's constants: dtype and device."""
+        """Return (dtype, device) of `like`; arrays with equal keys can share converted constants."""
         return like.dtype, like.device
 
     def constant(self, value: float, like: Tensor) -> Tensor:

@@ -35,32 +35,40 @@ class Mean(ABC):
 
     @abstractmethod
     def gain(self, x: Array, ops: Ops) -> Array:
-        """Return the summand of an operand x > 0; the sum is used where all operands are positive."""
+        """Return the term that an operand x > 0 adds to the sum `gains`.
+
+        `satisfied` computes the mean from this sum where all operands are positive.
+        """
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Return the summand of an operand -x <= 0, from its magnitude x >= 0; it is 0 for x = 0.
+        """Return the term that a negative operand adds to the sum `losses`.
 
-        The sum is used where some operand is not positive.
+        The argument `x` is the magnitude of the operand, so the operand is -x. The term is 0 for x = 0.
+        `violated` computes the mean from this sum where some operand is not positive.
         """
 
     @abstractmethod
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
         """Return the mean where all operands are positive.
 
-        `gains` is the sum of the summands `gain` of the operands, `count` the number of finite operands.
+        `gains` is the sum of `gain(x)` over the finite operands x, `count` the number of finite operands.
         """
 
     @abstractmethod
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
         """Return the mean where some operand is not positive.
 
-        `losses` is the sum of the summands `loss` of the operands that are not positive, `count` the number
+        `losses` is the sum of `loss(|x|)` over the finite operands x that are negative. `count` is the number
         of all finite operands.
         """
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the partial result of each operand: its value, its two summands, and 1 if finite, else 0."""
+        """Return the partial result of each operand in `x`.
+
+        It consists of four arrays: the value, its terms `gain` and `loss`, and 1 if it is finite, else 0. For
+        a maximum (`pick` "max") the operands change sign first.
+        """
         x = x if pick == "min" else -x
         known = ops.gt(math.inf, ops.abs(x))
         positive = ops.both(known, ops.gt(x, 0.0))
@@ -70,7 +78,10 @@ class Mean(ABC):
         return x, gains, losses, ops.number(known, x)
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """Return the partial result of two disjoint sets of operands together: least value, and sums."""
+        """Return the partial result of the union of two disjoint sets of operands.
+
+        The least values are combined by a minimum; the sums and the numbers of operands are added.
+        """
         return (ops.minimum(a[0], b[0]), a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:

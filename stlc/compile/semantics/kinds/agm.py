@@ -24,11 +24,11 @@ class ArithmeticGeometricMean(Mean):
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:
-        """Return log(1 + x), the summand of an operand x > 0."""
+        """Return log(1 + x), the term of an operand x > 0 in the sum `gains`."""
         return ops.log1p(x)
 
     def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return x, the magnitude of an operand -x <= 0, as its summand."""
+        """Return x, the term of a negative operand -x in the sum `losses`."""
         return x
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:

@@ -31,11 +31,11 @@ class GeneralizedMean(Mean):
     p: int = 1
 
     def gain(self, x: Array, ops: Ops) -> Array:
-        """Return log(x^2 / eps), the summand of an operand x > 0."""
+        """Return log(x^2 / eps), the term of an operand x > 0 in the sum `gains`."""
         return ops.log(x) * 2.0 - math.log(self.eps)
 
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Return (x^2 / eps)^p, the summand of an operand -x <= 0, from its magnitude x."""
+        """Return (x^2 / eps)^p, the term of a negative operand -x in the sum `losses`."""
         square = ops.square(x) * (1.0 / self.eps)
         return square if self.p == 1 else ops.pow(square, float(self.p))
 
@@ -48,7 +48,10 @@ class GeneralizedMean(Mean):
         return ops.expm1(soft / (count * 2.0)) * math.sqrt(self.eps)
 
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """Return sqrt(eps) - sqrt((eps^p + mean x^2p)^(1/p)), where some operand is not positive."""
+        """Return sqrt(eps) - sqrt((eps^p + mean x^(2p))^(1/p)), where some operand is not positive.
+
+        The mean is over all finite operands; positive ones count as 0.
+        """
         return ops.expm1(ops.log1p(losses / count) / (2.0 * self.p)) * -math.sqrt(self.eps)
 
 
