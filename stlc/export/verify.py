@@ -176,7 +176,8 @@ def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed
 def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:
     """Return the greatest difference between verdicts of the graphs and of the task on random plans.
 
-    A verdict consists of robustness, cost, states, and robustness of prefixes.
+    A verdict consists of the robustness, the cost, the states under the plan, and the robustness of the
+    safety requirements on each first part of the plan.
 
     Raises:
         RunError: R105, the difference is too large.

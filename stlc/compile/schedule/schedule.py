@@ -296,7 +296,7 @@ class Schedule:
     """Steps in the order of computation.
 
     Attributes:
-        domain: trace that the steps read.
+        domain: length of the trace, and treatment of instants beyond its last sample.
         steps: steps, each after those of its operands.
         roots: step numbers of the requested formulas.
     """

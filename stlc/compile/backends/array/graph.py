@@ -102,7 +102,9 @@ def _domain(
 
 @lru_cache(maxsize=512)
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the evaluation plan of `formulas` at the instants `run`, for traces of one length; cached.
+    """Return the evaluation plan of `formulas` at the instants `run`; plans are cached.
+
+    The plan is for traces of the length in `domain`.
 
     Raises:
         ValueError: an instant lies outside the trace, or a window does and `domain.end` is "strict".
@@ -125,9 +127,9 @@ def robustness_signal(
     semantics: Semantics | None = None,
     end: Boundary = "strict",
 ) -> Array:
-    """Return the robustness at every sample, `(time, batch)`.
+    """Return the robustness of a formula at every sample, `(time, batch)`.
 
-    With `end` "strict", it is NaN where the formula needs samples beyond the trace.
+    If `end` is "strict", the robustness is NaN at samples where the formula needs samples beyond the trace.
     """
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, "truncate" if end == "strict" else end, windows)

@@ -76,8 +76,8 @@ class ArrayPlan:
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
-        predicates: step number -> source of the predicate's values; absent if it is defined at none of its
-            instants.
+        predicates: number of a predicate's step -> source of the predicate's values. A predicate that is
+            defined at none of its instants is absent.
         beyond: number of instants beyond the last sample, summed over all steps.
         runners: (semantics, array library) -> function of each step, built on first use.
     """

@@ -25,8 +25,9 @@ class Instr:
     """Array operation.
 
     Attributes:
-        kernel: name of the operation: a method of `Ops` or of the switch; or `input` (read a signal),
-            `extern` (call a function of the system), or `pick` (select a component of its result).
+        kernel: name of the operation: a method of `Ops` (array library) or of `Switch` (conditions as
+            numbers); or `input` (read a signal), `extern` (call a function of the system), or `pick` (select
+            a component of the function's result).
         args: operands: register numbers or constants.
         params: further arguments of the operation, after the operands.
     """
@@ -161,7 +162,10 @@ class GradientTape:
                 return self.call("pow", a, b)
 
     def call(self, kernel: str, *args: Operand) -> Operand:
-        """Result of the operation called `kernel`; computed at once if all operands are constants."""
+        """Result of the operation called `kernel` on the operands `args`.
+
+        It is a register, or a number if all operands are constants.
+        """
         if all(isinstance(arg, float) for arg in args):
             with NUMPY.quiet():
                 return float(getattr(NUMPY, kernel)(*(np.float64(arg) for arg in args)))

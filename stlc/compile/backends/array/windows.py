@@ -165,10 +165,11 @@ class Windows:
     def _until_by_definition(
         self, left: Array, right: Array, pick: Pick, sizes: tuple[int, int, int]
     ) -> Array:
-        """`until` by a loop over the offset of `t`: `lo + width` operations on `count` rows.
+        """Compute `until` by its definition, for extrema that are not exact.
 
-        Faster methods assume that min distributes over max, which is true of exact extrema only. `sizes` is
-        (count, width, lo), as in `until`.
+        Faster methods assume that min distributes over max, which is true of exact extrema only. A loop runs
+        over the samples of the window; its `lo + width` iterations work on all `count` windows together.
+        `sizes` is (count, width, lo), as in `until`.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -250,7 +251,11 @@ class Windows:
             size *= 2
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """Compose each block `a` with the adjacent later block `b`; a block is (least `left`, `until`)."""
+        """Combine each block of rows in `a` with the next block, in `b`, to one block.
+
+        A block is given by two values: the least `left` over its rows, and `until` within the block. For
+        `pick` "min", it is the greatest `left`, and `release`.
+        """
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)
         later = pair(a[0][:rows], b[1][:rows], other, self.ops)

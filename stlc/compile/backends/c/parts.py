@@ -30,7 +30,7 @@ class Frame:
 
 
 def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str, str]) -> list[str]:
-    """Return the C functions of the parts, then the function that calls them.
+    """Split a long C function into parts: return the functions of the parts, then one that calls them.
 
     Args:
         frame: name, arguments and local statements of the function.

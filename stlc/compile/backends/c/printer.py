@@ -73,11 +73,11 @@ class StepForm(ABC):
 
     @abstractmethod
     def forward(self) -> list[str]:
-        """Return C statements that compute the values."""
+        """Return C statements that compute the values of the step."""
 
     @abstractmethod
     def backward(self) -> list[str]:
-        """Return C statements that propagate the gradient of the values to the operands."""
+        """Return C statements that propagate the gradient from the values of the step to its operands."""
 
     def filled(self, value: float) -> list[str]:
         """Return C statements that set the values of the step to `value` at all instants."""
