@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from stlc.controller.methods import Method
 from stlc.registry import METHODS, PLANNERS
 
 Options = Mapping[str, str]
@@ -82,7 +81,7 @@ PLANNERS_OF_PAPER: dict[str, Contender] = {
 
 def learners() -> tuple[Contender, ...]:
     """All learners."""
-    trained = [name for name in METHODS.names if type(METHODS.get(name)).learner is not Method.learner]
+    trained = [name for name in METHODS.names if METHODS.get(name).trains]
     return tuple(each for name in trained for each in LEARNERS.get(name, (Contender(name, name),)))
 
 

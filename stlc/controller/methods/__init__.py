@@ -42,25 +42,32 @@ class Method(ABC):
     Attributes:
         options: class of the resolved options. A method with options of its own declares a subclass of
             `ResolvedConfig`, whose added fields are int, float or str and have defaults.
+        learns: class of the learner; None if the method plans without training, or overrides `learner`.
     """
 
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
+    learns: ClassVar[type[Learner] | None] = None
+
+    @property
+    def trains(self) -> bool:
+        """True if there is something to train; False if the method plans without training."""
+        return self.learns is not None or type(self).learner is not Method.learner
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
         """Resolve the options of a run: those of the user, else of the system file, else of the method."""
         return base_config(task, config, kind=self.options)
 
     def learner(
-        self,
-        task: Task,  # noqa: ARG002
-        config: ResolvedConfig,  # noqa: ARG002
-        *,
-        steps: int,  # noqa: ARG002
-        device: torch.device,  # noqa: ARG002
-        ranks: Ranks,  # noqa: ARG002
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
     ) -> Learner | None:
-        """Make the learner, in its state before the first step; None if the method plans without training."""
-        return None
+        """Make the learner, in its state before the first step; None if the method plans without training.
+
+        Raises:
+            UsageError: U101, the method cannot train for the task or with these options, device or ranks.
+        """
+        if self.learns is None:
+            return None
+        return self.learns(task, config, steps=steps, device=device, ranks=ranks)
 
     @abstractmethod
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> Policy:

@@ -85,12 +85,6 @@ class ActorLearner(Learner):
         return {"verdicts": reasons["verdicts"]}
 
 
-def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Tensors whose names begin with `prefix.`, under their names without the prefix."""
-    start = prefix + "."
-    return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
-
-
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
     """State of an optimiser as tensors, whose names begin with `prefix.`."""
     states = optimizer.state_dict()["state"].items()

@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from stlc.controller.methods import Learner
-from stlc.controller.methods._actor import ActorConfig, below, optimizer_tensors, restore_optimizer
+from stlc.controller.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
 from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import MOST, SATISFIED, Environments, Reward
 from stlc.controller.problem.task import satisfied
+from stlc.controller.training.checkpoint import below
 from stlc.controller.training.config import bounded
 from stlc.diagnostics import usage
 

@@ -22,13 +22,13 @@ from torch import Tensor
 from stlc.controller.methods._actor import (
     ActorLearner,
     ActorPolicy,
-    below,
     optimizer_tensors,
     restore_optimizer,
 )
 from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
+from stlc.controller.training.checkpoint import below
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

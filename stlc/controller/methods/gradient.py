@@ -28,7 +28,7 @@ class Gradient(NetworkMethod):
         As in Meng and Fan (2023), every step uses newly drawn states, unless `train: {samples: N}` in the
         system file asks for a fixed training set of N states.
         """
-        found = base_config(task, config, batch=512)
+        found = base_config(task, config, kind=self.options, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 
     def objective(self, learner: Trainer) -> Objective:

@@ -36,7 +36,7 @@ class Guided(NetworkMethod):
         By default the network proposes four plans. Half of the states of a step are newly drawn, the other
         half are states at which the policy failed before and for which the search found a plan.
         """
-        found = base_config(task, config, batch=256, plans=4, searches=True)
+        found = base_config(task, config, kind=self.options, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:

@@ -20,13 +20,12 @@ import torch
 from torch import Tensor, nn
 
 from stlc.controller.methods import Method
-from stlc.controller.methods._actor import ActorPolicy, below
+from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
 from stlc.controller.methods._soft_actor_critic import Batch, SacOptions, SoftActorCritic
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.training.checkpoint import load_checkpoint, restoring
 from stlc.controller.training.config import base_config, bounded
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.run import load_weights
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
@@ -258,30 +257,17 @@ class Mbpo(Method):
     """Soft actor-critic that learns from short episodes imagined by a learnt ensemble."""
 
     options = MbpoConfig
+    learns = MbpoLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> MbpoConfig:
         """Resolve the options; `--batch` and `--lr` are those of actor and critics."""
-        found = base_config(task, config, kind=MbpoConfig)
-        assert isinstance(found, MbpoConfig)
-        lr = config.lr or task.system.decl.train.lr or RATE
-        return replace(
-            found, hidden=HIDDEN, plans=1, lr=lr, batch=config.batch or BATCH, every=EVERY, pool=POOL
-        )
-
-    def learner(
-        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
-    ) -> MbpoLearner:
-        """Make the learner, in its state before the first step. Raises UsageError, see `ModelLearner`."""
-        assert isinstance(config, MbpoConfig)
-        return MbpoLearner(task, config, steps=steps, device=device, ranks=ranks)
+        found = base_config(task, config, kind=MbpoConfig, rate=RATE)
+        return replace(found, hidden=HIDDEN, plans=1, batch=config.batch or BATCH, every=EVERY, pool=POOL)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:  # noqa: ARG002
         """Load the actor of a run as a policy."""
         assert isinstance(config, MbpoConfig)
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
-        found = actor_critic_of(task, config)
-        with restoring(run):
-            found.load_state_dict(below(saved.tensors, "sac.weights"))
+        found = load_weights(run, actor_critic_of(task, config), "sac.weights")
         return ActorPolicy(task, Acting(task, found).eval())
 
 

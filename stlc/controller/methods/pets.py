@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from stlc.controller.methods import Method
-from stlc.controller.methods._actor import below
 from stlc.controller.methods._imagined import (
     LearntModel,
     ModelConfig,
@@ -30,12 +29,10 @@ from stlc.controller.methods._imagined import (
     step_rewards,
 )
 from stlc.controller.policies.policy import Policy
-from stlc.controller.training.checkpoint import load_checkpoint, restoring
 from stlc.controller.training.config import base_config, bounded
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.run import load_weights
 
 if TYPE_CHECKING:
-    from stlc.controller.parallel.ddp import Ranks
     from stlc.controller.problem.environments import Reward
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import ResolvedConfig, TrainConfig
@@ -243,27 +240,17 @@ class Pets(Method):
     """Planning with a learnt ensemble by the cross-entropy method."""
 
     options = PetsConfig
+    learns = PetsLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
         """Resolve the options; a validation judges few states, since planning takes long."""
         found = base_config(task, config, kind=PetsConfig)
-        assert isinstance(found, PetsConfig)
         return replace(found, hidden=(200,) * 4, plans=1, every=EVERY, pool=POOL)
-
-    def learner(
-        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
-    ) -> PetsLearner:
-        """Make the learner, in its state before the first step. Raises UsageError, see `ModelLearner`."""
-        assert isinstance(config, PetsConfig)
-        return PetsLearner(task, config, steps=steps, device=device, ranks=ranks)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> PetsPolicy:  # noqa: ARG002
         """Load the ensemble of a run as a policy that plans with it."""
         assert isinstance(config, PetsConfig)
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
-        ensemble = ensemble_of(task, config)
-        with restoring(run):
-            ensemble.load_state_dict(below(saved.tensors, "ensemble"))
+        ensemble = load_weights(run, ensemble_of(task, config), "ensemble")
         return PetsPolicy(task, LearntModel(task, ensemble.predictor()), config)
 
 

@@ -45,7 +45,6 @@ class PlanMethod(Method):
     def resolve(self, task: Task, config: TrainConfig) -> PlanConfig:
         """Resolve the options; the options of the planner are taken from `config.planner`."""
         found = base_config(task, config, kind=PlanConfig)
-        assert isinstance(found, PlanConfig)
         asked = config.planner
         if asked is None:
             return found

@@ -21,15 +21,14 @@ from stlc.controller.methods._actor import (
     ActorConfig,
     ActorLearner,
     ActorPolicy,
-    below,
     optimizer_tensors,
     restore_optimizer,
 )
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
-from stlc.controller.training.checkpoint import load_checkpoint, restoring, weights
+from stlc.controller.training.checkpoint import below
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.run import load_weights
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
@@ -385,32 +384,17 @@ class Ppo(Method):
     """Proximal policy optimisation with 512 episodes in parallel."""
 
     options = PpoConfig
+    learns = PpoLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> PpoConfig:
         """Resolve the options; `--batch` sets the number of episodes that are simulated in parallel."""
-        found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS)
-        assert isinstance(found, PpoConfig)
-        lr = config.lr or task.system.decl.train.lr or RATE
-        return replace(found, hidden=HIDDEN, plans=1, lr=lr, every=EVERY, environments=found.batch)
-
-    def learner(
-        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
-    ) -> PpoLearner:
-        """Make the learner, in its state before the first step.
-
-        Raises:
-            UsageError: U101, there is no such reward, or it is `task` and the system declares none.
-        """
-        assert isinstance(config, PpoConfig)
-        return PpoLearner(task, config, steps=steps, device=device, ranks=ranks)
+        found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS, rate=RATE)
+        return replace(found, hidden=HIDDEN, plans=1, every=EVERY, environments=found.batch)
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:
         """Load the actor of a run as a policy."""
         assert isinstance(config, PpoConfig)
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
-        network = network_of(task, config)
-        with restoring(run):
-            network.load_state_dict(weights(saved, "network"))
+        network = load_weights(run, network_of(task, config), "network")
         return ActorPolicy(task, network.to(torch.device(device)).eval())
 
 

@@ -14,9 +14,8 @@ import torch
 from stlc.controller.methods import Learner, Method
 from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._sac import SacActor, SacConfig
-from stlc.controller.training.checkpoint import load_checkpoint, restoring, weights
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.run import load_weights
 from stlc.diagnostics import Diagnostic, MissingError
 
 if TYPE_CHECKING:
@@ -38,10 +37,8 @@ class Sac(Method):
 
     def resolve(self, task: Task, config: TrainConfig) -> SacConfig:
         """Resolve the options; `--batch` is the number of transitions of a gradient step."""
-        found = base_config(task, config, kind=SacConfig, batch=BATCH)
-        assert isinstance(found, SacConfig)
-        lr = config.lr or task.system.decl.train.lr or RATE
-        return replace(found, plans=1, share=0.0, lr=lr, every=EVERY)
+        found = base_config(task, config, kind=SacConfig, batch=BATCH, rate=RATE)
+        return replace(found, plans=1, share=0.0, every=EVERY)
 
     def learner(
         self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
@@ -67,10 +64,7 @@ class Sac(Method):
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str) -> ActorPolicy:
         """Load the actor of a run as a policy."""
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
-        actor = SacActor(task, config.hidden)
-        with restoring(run):
-            actor.load_state_dict(weights(saved, "policy"))
+        actor = load_weights(run, SacActor(task, config.hidden), "policy")
         return ActorPolicy(task, actor.to(torch.device(device)).eval())
 
 

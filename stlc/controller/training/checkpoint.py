@@ -154,5 +154,10 @@ def _shown(folder: Path) -> str:
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
     """Weights of one module: the tensors whose names begin with `prefix.`, under names without it."""
+    return below(checkpoint.tensors, prefix)
+
+
+def below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Tensors whose names begin with `prefix.`, under their names without the prefix."""
     start = prefix + "."
-    return {name[len(start) :]: value for name, value in checkpoint.tensors.items() if name.startswith(start)}
+    return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}

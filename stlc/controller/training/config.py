@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import torch
 
@@ -251,15 +251,19 @@ def _number(name: str, text: str, kind: str) -> int | float:
         raise usage(f"`{name}={text}` is no {wanted}", f"--option {name}=N") from None
 
 
+Options = TypeVar("Options", bound=ResolvedConfig)
+
+
 def base_config(
     task: Task,
     config: TrainConfig,
     *,
-    kind: type[ResolvedConfig] = ResolvedConfig,
+    kind: type[Options],
     batch: int = 1,
     plans: int = 1,
+    rate: float = 1e-3,
     searches: bool = False,
-) -> ResolvedConfig:
+) -> Options:
     """Resolve the options that all methods have: those of the user, else of the system file, else defaults.
 
     Args:
@@ -268,6 +272,7 @@ def base_config(
         kind: type of the options; fields that a method adds keep their defaults.
         batch: default number of fresh states per step.
         plans: default number of plans of the network.
+        rate: default learning rate.
         searches: whether a search runs concurrently with the training steps; torch then leaves it one core.
     """
     declared = task.system.decl.train
@@ -280,7 +285,7 @@ def base_config(
         plans=plans,
         batch=config.batch or declared.batch or batch,
         hard=0,
-        lr=config.lr or declared.lr or 1e-3,
+        lr=config.lr or declared.lr or rate,
         hold=MISSION_HOLD if mission else 0.0,
         most=MISSION_MOST if mission else 768,
         share=0.05 if plans > 1 else 0.0,

@@ -22,14 +22,13 @@ from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import rank, satisfied
-from stlc.controller.training.checkpoint import load_checkpoint, weights
+from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.objective import loss
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.run import load_weights
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
-from stlc.diagnostics import Diagnostic, RunError
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -402,9 +401,9 @@ class Trainer(Learner):
         self.objective = self.method.objective(self)
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
-            module.load_state_dict(_below(tensors, prefix))
+            module.load_state_dict(below(tensors, prefix))
         layout = self.optimizer.state_dict()
-        adam = _below(tensors, "adam")
+        adam = below(tensors, "adam")
         for key, value in adam.items():
             index, name = key.split(".")
             layout["state"].setdefault(int(index), {})[name] = value
@@ -413,12 +412,12 @@ class Trainer(Learner):
         self.buffer.states[:count] = tensors["buffer.states"]
         self.buffer.plans[:count] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
-        self.supply.restore(_below(tensors, "supply"))
+        self.supply.restore(below(tensors, "supply"))
         if isinstance(self.training, FixedSet):
-            self.training.restore(_below(tensors, "training"))
-        if known := _below(tensors, "repairing"):
+            self.training.restore(below(tensors, "training"))
+        if known := below(tensors, "repairing"):
             self.repairing = Search.of(SearchResult(**known))
-        elif pending := _below(tensors, "searching"):
+        elif pending := below(tensors, "searching"):
             states, plans = pending["states"].to(self.device), pending["plans"].to(self.device)
             self.repairing = self._begin(states, plans, int(pending["seed"]))
 
@@ -433,17 +432,10 @@ class Trainer(Learner):
             return tensors, facts
         shared = ("network.", "average.", "adam.")
         common = {name: value for name, value in tensors.items() if name.startswith(shared)}
-        own = _below(tensors, f"rank{self.ranks.rank}")
+        own = below(tensors, f"rank{self.ranks.rank}")
         accuracy, solved, barren, effort = own.pop("counts").tolist()
         counts = {"solved": int(solved), "barren": int(barren), "effort": int(effort)}
         return common | own, {**facts, "accuracy": accuracy, **counts}
-
-
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Entries whose names begin with `prefix.`, under names without it."""
-    return {
-        name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
-    }
 
 
 # ------------------------------------------------------------------ methods with a plan network
@@ -458,18 +450,13 @@ class NetworkMethod(Method):
         mirrored: whether the network uses the mirror symmetry that the system file declares.
     """
 
+    learns = Trainer
     searches = False
     mirrored = False
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
         """Parameters of the method's loss, with `learner.margin` if the method adapts the margin."""
-
-    def learner(
-        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
-    ) -> Trainer:
-        """Make the learner, in its state before the first step."""
-        return Trainer(task, config, steps=steps, device=device, ranks=ranks)
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
         """Make a network with random weights, drawn from torch's global generator."""
@@ -481,11 +468,5 @@ class NetworkMethod(Method):
         Raises:
             RunError: R101 or R102, see `Method.load`.
         """
-        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
-        network = self.network(task, config)
-        try:
-            network.load_state_dict(weights(saved, "average"))
-        except RuntimeError as error:
-            message = f"the checkpoint of `{run.shown}` does not fit its network"
-            raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+        network = load_weights(run, self.network(task, config), "average")
         return BestOfKPolicy(task, network.to(torch.device(device)).eval())

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from torch import nn
 
 from stlc.compile.frontend.modules import file_of
 from stlc.controller.evaluation.held_out import save_states
 from stlc.controller.problem.task import Task
-from stlc.controller.training.checkpoint import save_checkpoint
+from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint, weights
 from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.declaration.load import load_system_decl
@@ -174,6 +176,25 @@ def task_of_run(
     constants = {name: text for name, text in changed.items() if name not in drawn}
     system = System.load(folder.path / SYSTEM, changed, scenario=scenario)
     return Task.of(spec, system, overrides=constants, values=values)
+
+
+Net = TypeVar("Net", bound=nn.Module)
+
+
+def load_weights(folder: RunDir, module: Net, prefix: str) -> Net:
+    """Load the weights of a module from the checkpoint of a run, where their names begin with `prefix.`.
+
+    Raises:
+        RunError: R101, there is no checkpoint, it is damaged, or it does not fit the module; R102, it belongs
+            to another task.
+    """
+    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=trained_on(folder))
+    try:
+        module.load_state_dict(weights(saved, prefix))
+    except RuntimeError as error:
+        message = f"the checkpoint of `{folder.shown}` does not fit its network"
+        raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+    return module
 
 
 def spec_hash(folder: RunDir) -> str:
