@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from benchmarks.deployments import recorded
-from benchmarks.plannings import PlanCell, reason, time_text
-from benchmarks.store import Key, Result, ResultStore, inputs_of, load
+from benchmarks.measured import Measured, has_changed, measured, reason
+from benchmarks.plannings import PlanCell, time_text
+from benchmarks.store import Key, Result, ResultStore, load
 from benchmarks.timing import Times, one_thread
-from stlc.cli.framework.output import say
 from stlc.controller.deployment.simulator import DeploymentRecording, Setting
 from stlc.controller.evaluation.deployment import decided
 from stlc.controller.evaluation.executed import judge_executed
@@ -30,7 +30,7 @@ from stlc.controller.planning.planner import PLANNING_VERSION, PlanBudget, Plann
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
-from stlc.diagnostics import StlcError, UsageError
+from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
 
 GUARDS: tuple[Mode, ...] = ("none", "paper")
@@ -195,40 +195,14 @@ def _half(metric: Mapping[str, Any]) -> float | None:
 
 def is_outdated(result: Result) -> bool:
     """True if the specification, the system or a version has changed since a measurement."""
-    key = result["key"]
-    now = {**inputs_of(load(key["benchmark"])), "planner_version": PLANNING_VERSION}
-    return any(key.get(name) != value for name, value in {**now, "guard_version": GUARD_VERSION}.items())
-
-
-@dataclass(frozen=True, slots=True)
-class Driven:
-    """Outcome of closed-loop cells: results in order, number of new ones, name and reason of failures."""
-
-    results: tuple[Result, ...]
-    driven: int
-    failed: tuple[dict[str, str], ...]
+    return has_changed(result, {"planner_version": PLANNING_VERSION, "guard_version": GUARD_VERSION})
 
 
 def driven(
     cells: Iterable[Drive], store: ResultStore, *, driving: Callable[[Drive], Result] = drive
-) -> Driven:
-    """Results of closed-loop cells, stored or newly simulated, each stored at once; prints progress."""
-    results, failed, new = [], [], 0
-    for cell in cells:
-        key = cell.key
-        kept = store.find(key)
-        if kept is None:
-            say(f"deploying {cell.name}")
-            try:
-                kept = store.put(key, driving(cell))
-            except StlcError as error:
-                if isinstance(error, UsageError):
-                    raise
-                failed.append({"name": cell.name, "why": reason(error)})
-                continue
-            new += 1
-        results.append(kept)
-    return Driven(tuple(results), new, tuple(failed))
+) -> Measured:
+    """Results of closed-loop cells, stored or newly simulated."""
+    return measured(cells, store, driving, doing="deploying")
 
 
 def budget_text(seconds: float | None) -> str:

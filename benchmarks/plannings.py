@@ -15,15 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.measured import Measured, has_changed, measured, reason
 from benchmarks.roster import REPLAYED, Contender
 from benchmarks.store import Key, Result, ResultStore, inputs_of, load
 from benchmarks.timing import WARM, Times, one_thread
 from benchmarks.training import pack, unpack
-from stlc.cli.framework.output import say
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.planning.planner import PLANNING_VERSION, PlanBudget, PlanSearch, Solver, planner_named
 from stlc.controller.problem.task import Task
-from stlc.diagnostics import MissingError, StlcError, UsageError
+from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
@@ -150,11 +150,6 @@ def _planned(task: Task, solver: Solver, states: Tensor, budget: PlanBudget) -> 
     return search
 
 
-def reason(error: StlcError) -> str:
-    """The message of an error, in one line."""
-    return "; ".join(each.message for each in error.diagnostics)
-
-
 @dataclass(frozen=True, slots=True)
 class PlanRow:
     """A planner, or a trained policy, on the starts of a benchmark.
@@ -212,9 +207,7 @@ class PlanRow:
 
 def is_outdated(result: Result) -> bool:
     """True if the specification, the system or the version of planning has changed since a measurement."""
-    key = result["key"]
-    now = {**inputs_of(load(key["benchmark"])), "planner_version": PLANNING_VERSION}
-    return any(key.get(name) != value for name, value in now.items())
+    return has_changed(result, {"planner_version": PLANNING_VERSION})
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,42 +262,12 @@ def improves(cell: PlanCell, store: ResultStore) -> bool:
     return many > few
 
 
-@dataclass(frozen=True, slots=True)
-class Planned:
-    """Outcome of the planner cells of a table.
-
-    Attributes:
-        results: stored or new, in the order of the cells.
-        measured: number of new ones.
-        failed: name and reason of cells that could not be measured.
-    """
-
-    results: tuple[Result, ...]
-    measured: int
-    failed: tuple[dict[str, str], ...]
-
-
 def planned(
     cells: Iterable[PlanCell], store: ResultStore, *, measuring: Callable[[PlanCell], Result] = measure
-) -> Planned:
-    """Results of cells, stored or newly measured, each stored at once; prints progress."""
-    results, failed, new = [], [], 0
-    for cell in cells:
-        if not improves(cell, store):
-            continue
-        key = cell.key
-        kept = store.find(key)
-        if kept is None:
-            say(f"planning {cell.name}")
-            try:
-                kept = store.put(key, measuring(cell))
-            except MissingError as error:
-                failed.append({"name": cell.name, "why": reason(error)})
-                continue
-            new += 1
-            say(f"{cell.name}  {_summary(kept)}")
-        results.append(kept)
-    return Planned(tuple(results), new, tuple(failed))
+) -> Measured:
+    """Results of cells, stored or newly measured; those that are not worth their time are left out."""
+    worth = (cell for cell in cells if improves(cell, store))
+    return measured(worth, store, measuring, doing="planning", told=_summary)
 
 
 def _summary(result: Mapping[str, Any]) -> str:

@@ -84,5 +84,5 @@ def paper(
     page = output.page
     assert page is not None
     facts = filling.facts(len(results), (*plans.failed, *drives.failed))
-    new = {"planned": plans.measured, "driven": drives.driven}
+    new = {"planned": plans.new, "driven": drives.new}
     publish("paper", output, lambda: section(stored, page), shown, **facts, **new)

@@ -23,7 +23,7 @@ from benchmarks.store import ResultStore
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place, _job, pack
 from stlc.controller.parallel.jobs import Job
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import Diagnostic, MissingError, RunError
 
 ROOT = Path(__file__).parents[2]
 SEARCH = Contender("plan:search", "search", plans=True)
@@ -74,7 +74,7 @@ def test_options_of_a_learner_are_in_name_key_and_command(tmp_path: Path) -> Non
 def test_a_planner_is_measured_once_for_its_inputs(tmp_path: Path) -> None:
     store = ResultStore("plans", tmp_path)
     first, second = planned([tiny()], store), planned([tiny()], store)
-    assert (first.measured, second.measured) == (1, 0)
+    assert (first.new, second.new) == (1, 0)
     assert first.results == second.results
     (row,) = [PlanRow.of(each) for each in first.results]
     assert row.accuracy is not None
@@ -101,7 +101,7 @@ def test_a_killed_cell_costs_itself_only(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         planned(cells, store, measuring=killed)
     assert [*store.all()] == [cells[0].name]
-    assert planned(cells, store, measuring=killed).measured == 2
+    assert planned(cells, store, measuring=killed).new == 2
     assert asked == [cells[0].name, cells[1].name, cells[1].name, cells[2].name]
 
 
@@ -125,6 +125,17 @@ def test_a_missing_package_is_no_result(tmp_path: Path) -> None:
     store = ResultStore("plans", tmp_path)
     assert planned([tiny()], store, measuring=missing).failed == ({"name": tiny().name, "why": "no package"},)
     assert store.all() == {}
+
+
+def test_a_damaged_run_costs_its_own_cell_only(tmp_path: Path) -> None:
+    def damaged(cell: PlanCell) -> dict[str, Any]:
+        if cell.seconds == 0.003:
+            raise RunError(Diagnostic("R101", "the run is damaged"))
+        return {"refused": "not asked"}
+
+    cells = [tiny(), tiny(seconds=0.003), tiny(seconds=0.004)]
+    found = planned(cells, ResultStore("plans", tmp_path), measuring=damaged)
+    assert (found.new, found.failed) == (2, ({"name": cells[1].name, "why": "the run is damaged"},))
 
 
 def test_a_long_cell_is_measured_where_time_helps(tmp_path: Path) -> None:
@@ -275,7 +286,7 @@ def test_a_drive_is_stored_with_guard_and_size(tmp_path: Path) -> None:
     store = ResultStore("drives", tmp_path)
     cells = [Drive(tiny(), guard, (0,), agents=2, steps=3) for guard in ("none", "paper")]
     found, again = driven(cells, store), driven(cells, store)
-    assert (found.driven, again.driven) == (2, 0)
+    assert (found.new, again.new) == (2, 0)
     assert found.results == again.results
     assert {*store.all()} == {f"{tiny().name}-none", f"{tiny().name}-paper"}
     for result in found.results:
