@@ -33,6 +33,9 @@ At: TypeAlias = int | Literal["all"] | None
 def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:
     """Return the instants at which a requirement is evaluated on a trace of `samples` samples.
 
+    `at` is the number of one sample, or "all" for every sample with a complete window, or None for the
+    instants that the requirement prescribes. `horizon` is the length of a planning window in steps.
+
     Raises:
         UsageError: U101, `at` is not a sample of the trace.
     """

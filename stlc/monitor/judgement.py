@@ -297,8 +297,9 @@ class Verdict:
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
         """Return truth values of a judgement at `most` instants, (most, traces).
 
-        A judgement with fewer instants gets one truth value per trace, repeated `most` times: whether the
-        requirement holds at all of its instants, or, if `truth` is `fails`, whether it fails at any.
+        `truth` is `judgement.holds` or `judgement.fails`. It is returned unchanged if the judgement has
+        `most` instants. Otherwise the values of a trace are all equal: for `holds` they tell whether the
+        requirement holds at all of its instants, for `fails` whether it fails at any.
         """
         if judgement.instants == most:
             return truth

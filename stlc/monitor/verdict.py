@@ -184,7 +184,10 @@ class Monitor:
         at: int | None = None,
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
-        """Robustness of each requirement by name, without weight and scale; arguments as in `robustness`."""
+        """Robustness of each requirement by name, without weight and scale.
+
+        The arguments are those of the method `robustness`, which explains them.
+        """
         ready = self._prepare(signals, ()).under(semantics_of(semantics))
         shaped = ready.signals.like_given if at is None else ready.signals.at_one
         rows = _rows(ready, end, at)

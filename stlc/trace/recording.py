@@ -104,7 +104,10 @@ def clock_among(names: Iterable[str]) -> str | None:
 
 
 def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """Recording from arrays with common times; arrays called `extra.…` are not signals."""
+    """Recording of signals with common times, which are in the time column, if any.
+
+    Arrays called `extra.…` are not signals: they become the extras of the recording.
+    """
     named = clock_among(arrays)
     extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
     signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}

@@ -201,7 +201,10 @@ def _longest(group: ClockGroup) -> int:
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:
-    """The trace of a recording whose signals share one uniform time column."""
+    """The trace of a recording whose signals share one uniform time column.
+
+    `step` is the time step in seconds that the user gives, or None. It must not contradict the times.
+    """
     name = recording.name
     groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
     if len(groups) > 1:

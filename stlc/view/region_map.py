@@ -162,7 +162,10 @@ def _summary(region_map: RegionMap) -> str:
 
 
 def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
-    """Return the axes of the map, and the axes beside it, one per region below one another."""
+    """Return the axes of the map, and a list of the axes beside it.
+
+    The list contains one entry per region, from top to bottom.
+    """
     (left, right), (low, high) = region_map.plane.window(region_map.trace)
     ratio = min(max((right - left) / (high - low), 0.6), 2.0)
     grid = figure.add_gridspec(1, 2, width_ratios=[1.55 * ratio**0.5, 1])
@@ -209,7 +212,11 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Grid position (row, column) for a region's label: deep inside it and, if possible, outside others."""
+    """Grid position (row, column) for the label of a region.
+
+    `depth` is the distance to the border on the grid, positive inside; `others` are those of the other
+    regions. The label is placed deep inside the region and, if possible, outside the other regions.
+    """
     free = np.minimum.reduce([depth, *(-other for other in others)])
     row, column = np.unravel_index(np.argmax(free if (free >= 0).any() else depth), depth.shape)
     return int(row), int(column)
@@ -463,9 +470,9 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
 
 
 def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
-    """A monitor of one membership predicate; None if the predicate cannot be compiled by itself.
+    """A monitor of one predicate `point in region`; None if it cannot be compiled by itself.
 
-    This is the case, for example, if it uses an argument of a definition.
+    This is the case, for example, if the predicate uses an argument of a definition.
     """
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
     formula = replace(node, item=_point(node), negated=False)
@@ -535,7 +542,7 @@ def _key(span: Span) -> tuple[str, int, int]:
 
 
 def _point(node: ast.Member) -> ast.Expr:
-    """The point of a membership predicate; if it is `sweep(p)`, the point is `p`."""
+    """The point of the predicate `point in region`; if the point is `sweep(p)`, `p` is returned."""
     match node.item:
         case ast.Call(func=ast.Name(name="sweep"), args=(arg,)):
             return arg.value
@@ -544,7 +551,7 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """Key that identifies a region: the texts of the point and of the region."""
+    """Key that identifies a region in the predicate `point in region`: (text of point, text of region)."""
     point, region = (" ".join(part.span.text.split()) for part in (_point(node), node.region))
     return point, region
 

@@ -125,9 +125,10 @@ def scene_animation(scene: Scene, options: SceneOptions) -> Animation:
 
 
 def _moment(scene: Scene, frames: int) -> int:
-    """Index of the frame with most interventions of the guard, without the first and last sixth of frames.
+    """Index of the frame with the most interventions of the guard.
 
-    Without interventions, the index of the middle frame is returned.
+    The first sixth and the last sixth of the frames are not considered. Without interventions, the index of
+    the middle frame is returned.
     """
     middle = frames // 2
     low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)

@@ -203,7 +203,10 @@ class _Words:
         return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
 
     def because(self, tree: CauseNode) -> str:
-        """The cause in words; if the left side of an implication decides, its right side is described too."""
+        """The cause in words, as one line of text.
+
+        If the left side of an implication decides, the right side of the implication is described after it.
+        """
         text = self.reason(tree)
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
@@ -227,7 +230,11 @@ class _Words:
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
-        """`span` itself, or, if it is inside a definition, the name in the requirement that leads to it."""
+        """Source location to underline for the location `span`.
+
+        If `span` lies inside a definition, it is the name in the requirement that leads to this definition.
+        Otherwise it is `span` itself.
+        """
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 

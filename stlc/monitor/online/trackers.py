@@ -480,7 +480,7 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Free the samples that the coefficients in `UnboundedState` already account for.
+        """Free the samples whose effect is already contained in the coefficients of `UnboundedState`.
 
         Returns the index of the first sample that is still needed.
         """

@@ -66,7 +66,10 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Greatest lookahead in samples of the subformulas and operators, without unbounded windows."""
+        """Greatest number of samples by which a subformula or an operator reads ahead.
+
+        Unbounded windows are not counted.
+        """
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
@@ -79,7 +82,7 @@ class UnboundedOperators:
 
     @property
     def back(self) -> int:
-        """Greatest lookback of the subformulas without unbounded windows, in rows."""
+        """Greatest number of rows by which a subformula without unbounded windows reads back."""
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
@@ -170,7 +173,10 @@ def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Form
 
 
 def _neutral(origin: DelayedFormula) -> float:
-    """Value of an unbounded operator over no samples: +inf for `always` and `release`, else -inf."""
+    """Value of an unbounded operator if no sample lies in its window.
+
+    It is +inf for `always` and `release`, -inf for `eventually` and `until`.
+    """
     assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 

@@ -84,7 +84,14 @@ def _real(values: Array) -> Array:
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """Yield the numeric datasets below a group by name, without following links."""
+    """Yield (name, dataset) for every numeric dataset below `group`, without following links.
+
+    The group may contain groups. `prefix` is put before every name, and `depth` is the nesting depth of
+    `group`.
+
+    Raises:
+        TraceError: E603, the file is nested too deeply or contains too many arrays.
+    """
     h5py = needed("h5py")
     if depth > 8 or len(group) > MAX_ARRAYS:
         raise unreadable(path, "it is nested too deeply, or holds too many arrays")
