@@ -71,8 +71,8 @@ class _Test:
     def lacks(self) -> typed.Recalled:
         """Return the test in the form in which it can be an operand of `and`.
 
-        Where the test fails, its robustness is negative and finite: it is proportional to the number of
-        missing steps.
+        Where the test fails, its robustness is negative and finite: it is proportional to the number of steps
+        that are missing until the test holds.
         """
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)

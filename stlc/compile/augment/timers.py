@@ -2,8 +2,8 @@
 
 `clock`: number of steps since the start of the mission. `status`: whether an absolute formula (`always@[a, b]
 p`, whose interval counts from the start of the mission) is open (undecided), true or false. `latch`: whether
-a formula held at the previous sample, or ever. `timer`: for how many steps a formula has held, or has not
-held. All are integers, updated from the state at the start of a step.
+a formula held at the previous sample, or at any sample so far. `timer`: for how many steps a formula has
+held, or has not held. All are integers, updated from the state at the start of a step.
 """
 
 from __future__ import annotations
@@ -128,10 +128,10 @@ def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
     """Return a formula that holds if `left >= right`, with finite robustness where it fails.
 
-    The robustness is +inf where the formula holds. Where it fails, it is `-MISSING` times the number of
-    missing steps. This is less than the robustness of any other predicate. The maximum of an `or` or
-    `eventually` is therefore that of an operand that the plan can influence. The robustness is finite, so
-    that plans that all fail can still be ranked.
+    The robustness is +inf where the formula holds. Where it fails, it is `-MISSING` times the number of steps
+    that are missing until it holds. This is less than the robustness of any other predicate. The maximum of
+    an `or` or `eventually` is therefore that of an operand that the plan can influence. The robustness is
+    finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))

@@ -1,9 +1,9 @@
 """Arithmetic on numbers and vectors: unit checks, constant folding, broadcasting.
 
 A number in a unit with an offset, such as 20 degC, is a temperature, as opposed to a temperature difference.
-Temperatures can be compared and selected; the difference of two is in kelvin; a temperature plus kelvin is a
-temperature. `abs` and other magnitudes reject temperatures in degC, all other functions convert them to
-kelvin.
+Temperatures can be compared, and selected by `if`, `min` and `max`; the difference of two is in kelvin; a
+temperature plus kelvin is a temperature. `abs` and other magnitudes reject temperatures in degC, all other
+functions convert them to kelvin.
 """
 
 from __future__ import annotations
@@ -396,7 +396,7 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
 
 
 def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
-    """Return the argument of `abs` or another magnitude, which must not be a temperature in degC.
+    """Return `arg`, the argument of a magnitude such as `abs`; it must not be a temperature in degC.
 
     A number that may be a temperature or a difference (`Number.sense` is `open`) counts as a difference.
 
@@ -414,7 +414,7 @@ def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number
 def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
     """Raise Failed (E203) if a number is a temperature in degC where an amount is needed.
 
-    `what` names the operator or function for the message.
+    An amount is needed in `abs(x)`, for example. `what` names the operator or function for the message.
     """
     if number.unit.offset:
         scope.fail(point_for_amount(what, number, span))
@@ -423,7 +423,7 @@ def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
 def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
     """Return E203 for a temperature in degC where an amount is needed.
 
-    `what` names the operator or function for the message.
+    An amount is needed in `abs(x)`, for example. `what` names the operator or function for the message.
     """
     unit = number.unit
     text = (number.span or span).text

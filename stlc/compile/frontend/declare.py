@@ -144,7 +144,7 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """Return the unit that a declaration has in brackets; dimensionless if `text` is empty.
+    """Return the unit `text` that a declaration has in brackets; dimensionless if `text` is empty.
 
     W107 is reported for a name such as `temp` in coulombs (`[C]`).
 

@@ -75,7 +75,10 @@ def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
 
 
 def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement") -> typed.Formula:
-    """Return an expression as a formula, with temporal operators if `scope.temporal`.
+    """Return an expression as a formula.
+
+    Temporal operators are allowed if `scope.temporal` is True. `what` is the role of the formula, for
+    messages.
 
     Raises:
         Failed: the expression has errors, which are in `scope.sink`.

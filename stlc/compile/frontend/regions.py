@@ -227,9 +227,10 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
 
 
 def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
-    """Return `turn(start, end, point)` for points that vary: twice the signed area of the triangle.
+    """Return twice the signed area of the triangle `start`, `end`, `point`.
 
-    The area is positive if `point` is left of the edge from `start` to `end`.
+    The points may vary, unlike those of `turn`. The area is positive if `point` is left of the edge from
+    `start` to `end`.
     """
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)

@@ -192,7 +192,7 @@ class Windowed(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets at which the operand is read: those of the window."""
+        """Offsets at which the operand of a temporal operator is read: those of the window."""
         return (self.window_offsets,)
 
 
@@ -234,7 +234,7 @@ class BoolOp(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operands: each is read at the present sample."""
+        """Offsets at which the operands of `and` or `or` are read: each is read at the present sample."""
         return (NOW,) * len(self.items)
 
 
@@ -274,7 +274,10 @@ class Until(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operands: `left` from now to the end of the window, `right` over the window."""
+        """Offsets at which the operands of `until` or `release` are read.
+
+        `left` is read from now to the end of the window, `right` over the window.
+        """
         return Offsets(0, self.window.hi), self.window_offsets
 
 
@@ -295,7 +298,10 @@ class Since(Windowed):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operands: `left` from the far end of the window to now, `right` over the window."""
+        """Offsets at which the operands of `since` or `trigger` are read.
+
+        `left` is read from the far end of the window to now, `right` over the window.
+        """
         return Offsets(self.window_offsets.first, 0), self.window_offsets
 
 
@@ -321,7 +327,7 @@ class Shift(Operator):
 
     @property
     def offsets(self) -> tuple[Offsets, ...]:
-        """Offsets of the operand: the single instant `steps` samples later."""
+        """Offset at which the operand is read: the single instant `steps` samples later."""
         return (Offsets(self.steps, self.steps),)
 
 

@@ -53,7 +53,7 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
 
 
 def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
-    """Rewrite `a -> b`, `a <-> b` (both implications) or `a xor b` (the negation of `a <-> b`).
+    """Rewrite `a -> b`, `a <-> b` (both directions) or `a xor b` (the negation of `a <-> b`).
 
     For `sign` -1 the result is the negation.
     """

@@ -27,11 +27,11 @@ class Analysis(ABC, Generic[V]):
 
     @abstractmethod
     def predicate(self, num: ir.Num) -> V:
-        """Value of a predicate, or of a number bound by `freeze`."""
+        """Value of a predicate on the number `num`, or of the number `num` bound by `freeze`."""
 
     @abstractmethod
     def constant(self) -> V:
-        """Value of `true` and `false`."""
+        """Value of the formulas `true` and `false`."""
 
     @abstractmethod
     def over(self, parts: Sequence[V], offsets: Sequence[ir.Offsets]) -> V:
@@ -42,10 +42,10 @@ class Analysis(ABC, Generic[V]):
 
     @abstractmethod
     def at_start(self, body: V) -> V:
-        """Value of a formula at the first sample."""
+        """Value of an `ir.AtStart`, which reads a formula with the value `body` at the first sample."""
 
     def shift(self, body: V, node: ir.Shift) -> V:
-        """Value of a formula read at another sample (`ir.Shift`)."""
+        """Value of the `ir.Shift` `node`, which reads a formula with the value `body` at another sample."""
         return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
@@ -82,7 +82,7 @@ class Reach(NamedTuple):
 
 
 def reach(formula: ir.Formula) -> Reach:
-    """Return how many samples before and after its instant a formula requires (lookback and lookahead).
+    """Return how many samples before and after now a formula requires (lookback and lookahead).
 
     A window to the end of the trace requires only its start. The interval of an operator such as `always@[a,
     b]` counts from the first sample, wherever the operator stands; its end counts as lookahead.
@@ -106,7 +106,7 @@ def farthest(num: ir.Num) -> Reach:
 
 
 def history(formula: ir.Formula) -> int:
-    """Return how many samples before its instant a formula reads; 2^40 stands for all earlier samples.
+    """Return how many samples before now a formula reads; 2^40 stands for all earlier samples.
 
     Unlike in `reach`, past windows count in full, although they are cut at the start of the trace.
     """
@@ -156,7 +156,7 @@ class _Required(Analysis[_Needs]):
 
 @final
 class _History(Analysis[int]):
-    """Analysis of the samples that a formula reads before its instant, with past windows counted in full."""
+    """Analysis of the samples that a formula reads before now, with past windows counted in full."""
 
     def predicate(self, num: ir.Num) -> int:
         return farthest(num).past

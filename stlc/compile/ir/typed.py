@@ -142,8 +142,8 @@ class Until(Node):
 class Shift(Node):
     """Formula at another sample: `next(p)` (`steps` is 1) or `prev(p)` (-1).
 
-    `outside` is its value outside the trace, as for `ir.Shift`; `delay`, if given, is a time that replaces
-    `steps`.
+    `outside` is its truth if the other sample lies outside the trace; None: it is undefined there. `delay`,
+    if it is given, is a time that replaces `steps`.
     """
 
     steps: int

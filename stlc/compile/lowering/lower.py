@@ -26,7 +26,8 @@ from stlc.units import Unit, same_dims
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
     """Return a requirement with margins in the units of the source.
 
-    If all predicates of the requirement have the same unit, `@scale` is converted to that unit too.
+    If all predicates of the requirement have the same unit, the divisor of `@scale` is converted to this unit
+    as well.
     """
     unit = _one_unit(requirement.formula)
     scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
