@@ -64,8 +64,8 @@ class CompiledRequirement:
         formula: formula in negation normal form, with time in steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
-        windowed: whether it mentions the horizon `T`, the length of a plan. If so, and unless `absolute`, it
-            must hold at every sample that T further samples follow.
+        windowed: whether it mentions the horizon `T`, the length of a plan. If so, it must hold at each
+            sample with at least T samples after it; but if it is also `absolute`, at the first sample only.
         uses_end: whether it has a window to the end of the trace.
         absolute: whether it has an operator such as `always@[a, b]`, whose interval counts from the start of
             the mission.

@@ -28,7 +28,8 @@ _FROM_ELSEWHERE = ("module", "extern", "param")
 def can_rename(document: Document, offset: int) -> Occurrence | None:
     """Return the symbol at `offset` and its place, if the symbol can be renamed; else None.
 
-    Imported modules, external functions and parameters cannot, because other files may refer to them by name.
+    Imported modules, external functions and parameters cannot be renamed, because other files may refer to
+    them by name.
     """
     found = document.names.at(offset)
     return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
@@ -79,7 +80,10 @@ def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
 
 
 def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
-    """Raise RenameError unless every name refers to the same declaration after the edits as before."""
+    """Raise RenameError if, after the edits, some name refers to another declaration than before.
+
+    `edits` give a symbol the new name `name`.
+    """
     text = edited(document.source.text, edits)
     try:
         after = names_of(parse(Source(document.source.name, text)))

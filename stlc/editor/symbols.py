@@ -95,7 +95,8 @@ Scope: TypeAlias = Mapping[str, Symbol]
 def names_of(spec: ast.Spec) -> SymbolNames:
     """Return the symbols of a specification and their occurrences.
 
-    Of several declarations of one name, the first counts; the others are occurrences of it.
+    If a name is declared several times, the first declaration counts. The others are listed as further
+    occurrences of the symbol.
     """
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}

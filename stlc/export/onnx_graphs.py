@@ -1,4 +1,4 @@
-"""ONNX graphs of a controller: rollout, policy, verdicts on plans, and length of safe prefixes.
+"""ONNX graphs of a controller: rollout, policy, verdicts on plans, and safety of their first steps.
 
 `stlc.runtime` runs the graphs. It also contains the search of the guard (Meng and Fan 2023) and stores the
 previous plans.
@@ -190,7 +190,8 @@ def _folded(
 ) -> tuple[Mapping[str, Value], Value | None]:
     """Reflect states to the side of the mirror symmetry on which the network was trained.
 
-    Returns the states by name, and the mask (1, batch) of the reflected ones, None without a symmetry.
+    Returns the states by name, and the mask (1, batch) of the reflected ones. The mask is None if the system
+    has no symmetry.
     """
     if network.mirror is None:
         return state, None
@@ -301,7 +302,10 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
 
 
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
-    """Weighted minimum of the robustness of `rules`, (1, batch); +inf without requirements."""
+    """Weighted minimum of the robustness of `rules`, (1, batch); +inf without requirements.
+
+    `each` maps the name of a requirement to its robustness. `like` is any array of the batch.
+    """
     if not rules:
         return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
     weighed = [

@@ -47,7 +47,7 @@ class Switch(Protocol):
 @final
 @dataclass(frozen=True, slots=True)
 class Hard:
-    """Exact switch: conditions are 0 or 1, without gradient and without tolerance."""
+    """Exact evaluation of conditions as 0 or 1, without gradient and without tolerance."""
 
     exact: ClassVar[bool] = True
 
@@ -67,9 +67,10 @@ class Hard:
 @final
 @dataclass(frozen=True, slots=True)
 class Tanh:
-    """Smooth switch by `(1 + tanh(w rho)) / 2 = sigmoid(2 w rho)` (Meng and Fan 2023, Eq. 6).
+    """Smooth evaluation of conditions by `(1 + tanh(w rho)) / 2` (Meng and Fan 2023, Eq. 6).
 
-    `if cond then a else b` becomes I a + (1 - I) b, where I is the value above for the margin rho of `cond`.
+    `if cond then a else b` becomes I a + (1 - I) b. Here I is the value above, and rho is the margin of
+    `cond`: positive where the condition holds. I equals `sigmoid(2 w rho)`.
     """
 
     exact: ClassVar[bool] = False
@@ -92,9 +93,10 @@ class Tanh:
 @final
 @dataclass(frozen=True, slots=True)
 class StraightThrough:
-    """Exact switch whose gradient is that of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
+    """Exact evaluation of conditions as 0 or 1, with the gradient of `(1 + tanh(slope rho)) / 2`.
 
-    A choice has the value and gradient of the branch taken, plus the gradient of the condition.
+    The argument `sharpness` is not used. `if cond then a else b` has the value and gradient of the branch
+    taken, plus the gradient of the condition.
     """
 
     exact: ClassVar[bool] = False

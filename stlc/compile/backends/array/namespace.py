@@ -128,9 +128,10 @@ class Ops(Protocol):
         """Array that is +inf where `mask` is True, else -inf, in the dtype of `like`, without gradient."""
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:
-        """Array that is 1 if `rho` > 0 (>= 0 unless `strict`), else 0, with the gradient of a smooth step.
+        """Array that is 1 where the condition with robustness `rho` holds, else 0, with a smooth gradient.
 
-        The smooth step is `(1 + tanh(slope rho)) / 2`.
+        The condition is `rho > 0` if `strict`, and `rho >= 0` otherwise. The gradient is that of
+        `(1 + tanh(slope rho)) / 2`.
         """
 
     # along time

@@ -84,7 +84,7 @@ class NumpyOps:
         return np.where(mask, np.inf, -np.inf).astype(like.dtype)
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
-        """Array that is 1 if `rho` > 0 (or >= 0 unless `strict`), else 0."""
+        """Array that is 1 where `rho > 0` (if `strict`) or `rho >= 0` (otherwise), and 0 elsewhere."""
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:

@@ -1,7 +1,8 @@
 """Execution of an evaluation schedule (`stlc.compile.schedule.schedule`: a list of steps) over arrays.
 
-The predicates at the same instants are computed by one program, every other step by one function. The values
-of a step are `(count, batch)`. Functions are built once per semantics and array library, and cached.
+A step is one sub-formula at a range of instants; its values are `(count, batch)`. One program computes all
+predicates at the same instants. For each of the remaining steps there is one function. Functions are built
+once per semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -170,7 +171,7 @@ class Machine:
     def unknown(self) -> float:
         """Robustness of an unknown predicate: -inf in a lower bound, +inf in an upper bound.
 
-        If both bounds are computed at once (`end` of the domain is "both"), the batch holds one trace per
+        If both bounds are computed together (`end` of the domain is "both"), the batch holds one trace per
         bound. The result is then an array of the two values.
         """
         if self.domain.end == "both":

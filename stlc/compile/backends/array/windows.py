@@ -233,10 +233,10 @@ class Windows:
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
         """`until` over windows of `width` rows, in about log2(width) compositions of adjacent blocks.
 
-        Every window must lie within the array.
-        Each block of rows has two values: the least `left` over the block (`held`), and `until` within the
-        block (`met`). In the loop, row j of `held` and `met` belongs to the block of `size` rows that starts
-        at row j. Row j of `total` belongs to the first `done` rows of window j.
+        Every window must lie within the array. Each block of rows has two values: the least `left` over the
+        block (`held`), and `until` within the block (`met`). In the loop, row j of `held` and `met` belongs
+        to the block of `size` rows that starts at row j. Row j of `total` belongs to the first `done` rows of
+        window j.
         """
         size, done = 1, 0
         total: tuple[Array, Array] | None = None

@@ -62,7 +62,8 @@ class Buffer:
 class Called:
     """Step that evaluates a function of signals at all samples.
 
-    The components of the result have consecutive step numbers, from the number of this step on.
+    The function may return several values. They have consecutive step numbers: the first value has the number
+    of this step.
     """
 
     function: ir.Extern

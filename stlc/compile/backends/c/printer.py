@@ -582,9 +582,10 @@ class _TableLoop(_Repeated):
         return [*self._head(), *self.printer.forward(self.loop.steps), *gathered, "}}"]
 
     def backward(self) -> list[str]:
-        """Return C statements that for each row recompute its value, then propagate the gradient.
+        """Return C statements that propagate the gradient, in a loop over the rows of the table.
 
-        If the step is an extremum over the rows, only the first row that attains it gets a gradient.
+        Each iteration first recomputes the values of its row. If the step is an extremum over the rows, only
+        the first row that attains it gets a gradient.
         """
         if self.node.pick is None:
             own, body = self.out[self.loop.index], self.root[0]

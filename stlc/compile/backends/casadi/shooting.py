@@ -310,7 +310,10 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals that an expression reads at the first sample, wherever it is evaluated."""
+    """Names of the signals that an expression always reads at the first sample of the plan.
+
+    It does so at whatever sample the expression is evaluated.
+    """
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 

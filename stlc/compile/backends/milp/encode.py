@@ -178,7 +178,8 @@ class Encoding:
             lets: intermediate results of a step, in order.
             step: name of a state that changes -> expression of its value one step later.
             horizon: number of steps.
-            requirements: formulas that must hold at the first sample, with the margin of their predicates.
+            requirements: formulas that must hold at the first sample, with the robustness that their
+                predicates must reach.
 
         Returns:
             For each requirement the condition under which it holds. The caller must add these conditions to

@@ -69,8 +69,8 @@ class Leaf:
 
     Attributes:
         form: affine form.
-        margin: affine form, such as the variable of the robustness that is maximised; 0 for predicates on
-            time.
+        margin: affine form that `form` must reach. For example, it is the variable of the robustness that is
+            maximised. It is 0 for predicates on time.
         literal: index of the binary variable that implies the condition; None until one is needed.
     """
 
