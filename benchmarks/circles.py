@@ -2,16 +2,14 @@
 
 Sizes, windows and shapes of formulas are those of its generator (https://github.com/mengyuest/TeLoGraF,
 commit e37bece, `code/generate_scene_v1.py`): reach or stay, nested `and`/`or`, sequences, until, each with up
-to six obstacles. The published windows are cut at the last sample of a plan of 64 steps. For planning, a stay
-must end within the plan, and the windows of a sequence share its length, so that all fit. Such a plan
-satisfies the published formula too, by which it is judged.
+to six obstacles. As published, windows are cut at the last sample of a plan of 64 steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import dist, hypot, pi
+from math import hypot, pi
 
 from numpy.random import Generator, default_rng
 
@@ -41,28 +39,18 @@ PATTERNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class CircleTask:
+class DrawnTask:
     """A drawn task.
 
     Attributes:
         kind: one of `KINDS`.
-        planned: specification whose windows fit the plan, without a system.
-        published: the same with the published windows, to be judged with windows cut at the last sample.
-        x0: initial position, heading and speed.
+        text: specification, without a system; its windows are cut at the end of the plan.
+        x0: initial state; for circles position, heading and speed.
     """
 
     kind: str
-    planned: str
-    published: str
-    x0: tuple[float, float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class _Text:
-    """A formula with windows that fit, and as published."""
-
-    planned: str
-    published: str
+    text: str
+    x0: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,73 +62,64 @@ class _Visit:
     last: int
     stay: int
 
-    @property
-    def alone(self) -> _Text:
-        """As a formula at the first sample."""
+    def then(self, rest: str = "") -> str:
+        """Formula of this visit, and from its begin on of the `rest`."""
         inside = f"at_{self.circle}"
-        published = f"eventually[{self.first} steps, {self.last} steps] {self._held(inside)}"
-        if not self.stay:
-            return _Text(published, published)
-        last = min(self.last, STEPS - self.stay)
-        planned = f"eventually[{self.first} steps, {last} steps] {self._held(inside)}"
-        if last < self.first:  # the end of the plan cuts every stay
-            planned = f"eventually[{self.first} steps, {self.last} steps] always[0, end] {inside}"
-        return _Text(planned, published)
-
-    def then(self, rest: str, last: int) -> str:
-        """Formula of this visit, to begin at `last` at the latest, and from its begin on of the `rest`."""
-        follow = f" and {rest}" if rest else ""
-        inside = self._held(f"at_{self.circle}")
-        return f"eventually[{self.first} steps, {min(self.last, last)} steps] ({inside}{follow})"
-
-    def _held(self, inside: str) -> str:
-        return f"always[0, {self.stay} steps] {inside}" if self.stay else inside
+        held = f"always[0, {self.stay} steps] {inside}" if self.stay else inside
+        follow = f"({held} and {rest})" if rest else held
+        return f"eventually[{self.first} steps, {self.last} steps] {follow}"
 
 
-def draw(seed: int, kind: str | None = None) -> CircleTask:
+def draw(seed: int, kind: str | None = None) -> DrawnTask:
     """Draw a task; the kind by `RATIOS` if None."""
-    return _Draw(default_rng(seed)).task(kind)
+    return Draw(default_rng(seed)).task(kind)
 
 
-class _Draw:
-    """One drawing: its random numbers and the circles so far."""
+class Draw:
+    """One drawing: its random numbers and the objects so far, here circles (x, y, radius).
+
+    Attributes:
+        patterns: until-tasks, as in `PATTERNS`.
+        most: greatest number of visits in a sequence.
+    """
+
+    patterns: tuple[tuple[str, ...], ...] = PATTERNS
+    most = 4
 
     def __init__(self, random: Generator) -> None:
         self._random = random
-        self._circles: list[tuple[float, float, float]] = []
+        self._objects: list[tuple[float, ...]] = []
 
-    def task(self, kind: str | None) -> CircleTask:
+    def task(self, kind: str | None) -> DrawnTask:
+        """Draw a task; the kind by `RATIOS` if None."""
         shares = [each / sum(RATIOS) for each in RATIOS]
         kind = kind or KINDS[int(self._random.choice(len(KINDS), p=shares))]
-        kinds: Mapping[str, Callable[[], _Text | list[_Visit]]] = {
+        kinds: Mapping[str, Callable[[], str]] = {
             "reach": self._reach,
             "nested": self._nested,
             "sequence": self._sequence,
             "until": self._until,
         }
-        drawn = kinds[kind]()
-        goals = len(self._circles)
+        goal = kinds[kind]()
+        goals = len(self._objects)
         for _ in range(int(self._random.choice(len(OBSTACLES), p=OBSTACLES))):
-            if self._placed(MIDDLE, LARGE) is None:
+            if self._obstacle() is None:
                 break
-        start = self._start()
-        goal = drawn if isinstance(drawn, _Text) else self._chain(drawn, start)
+        x0 = self._start()
         avoid = {
-            f"avoid_{i}": f"always[0, {STEPS - 1} steps] not at_{i}" for i in range(goals, len(self._circles))
+            f"avoid_{i}": f"always[0, {STEPS - 1} steps] not at_{i}" for i in range(goals, len(self._objects))
         }
-        heading, speed = float(self._random.uniform(-pi, pi)), float(self._random.uniform(0, 1))
-        planned, published = ({"goal": text, **avoid} for text in (goal.planned, goal.published))
-        return CircleTask(kind, self._spec(planned), self._spec(published), (*start, heading, speed))
+        return DrawnTask(kind, self._spec({"goal": goal, **avoid}, goals), x0)
 
     # ------------------------------------------------------------------- kinds
 
-    def _reach(self) -> _Text:
-        return self._visit().alone
+    def _reach(self) -> str:
+        return self._visit().then()
 
-    def _nested(self) -> _Text:
+    def _nested(self) -> str:
         return self._branch(0, "and" if self._random.random() < 0.5 else "or")
 
-    def _branch(self, depth: int, word: str) -> _Text:
+    def _branch(self, depth: int, word: str) -> str:
         """A tree of `and` and `or` whose leaves, marked r, are visits; deeper branches end sooner."""
         shapes = (
             ("rr", "rrr", "_r", "__"),
@@ -150,18 +129,22 @@ class _Draw:
         other = "or" if word == "and" else "and"
         shape = shapes[int(self._random.integers(len(shapes)))]
         return _joined(
-            word, [self._visit().alone if leaf == "r" else self._branch(depth + 1, other) for leaf in shape]
+            word, [self._visit().then() if leaf == "r" else self._branch(depth + 1, other) for leaf in shape]
         )
 
-    def _sequence(self) -> list[_Visit]:
+    def _sequence(self) -> str:
         """Two to four visits, each within its window after the one before began."""
-        return [
+        visits = [
             self._visit(int(self._random.integers(8)), int(self._random.integers(STEPS - 8, STEPS)))
-            for _ in range(int(self._random.integers(2, 5)))
+            for _ in range(int(self._random.integers(2, self.most + 1)))
         ]
+        text = ""
+        for visit in reversed(visits):
+            text = visit.then(text)
+        return text
 
-    def _until(self) -> _Text:
-        pattern = PATTERNS[int(self._random.integers(len(PATTERNS)))]
+    def _until(self) -> str:
+        pattern = self.patterns[int(self._random.integers(len(self.patterns)))]
         circles: dict[str, int] = {}
         parts = []
         for term in pattern:
@@ -169,10 +152,9 @@ class _Draw:
                 if name not in circles:
                     circles[name] = self._goal()
             if len(term) == 2:
-                text = f"(not at_{circles[term[0]]}) until[0, end] at_{circles[term[1]]}"
-                parts.append(_Text(text, text))
+                parts.append(f"(not at_{circles[term[0]]}) until[0, end] at_{circles[term[1]]}")
             else:
-                parts.append(_Visit(circles[term], 0, STEPS - 1, self._stay()).alone)
+                parts.append(_Visit(circles[term], 0, STEPS - 1, self._stay()).then())
         return _joined("and", parts)
 
     # ------------------------------------------------------------------- parts
@@ -189,52 +171,42 @@ class _Draw:
         return int(self._random.integers(3, 10)) - 1 if self._random.random() > 0.5 else 0
 
     def _goal(self) -> int:
-        number = self._placed(SMALL, MIDDLE)
+        number = self._circle(SMALL, MIDDLE)
         assert number is not None
         return number
 
-    def _placed(self, least: float, most: float) -> int | None:
+    def _obstacle(self) -> int | None:
+        """A new obstacle; None where no place was found."""
+        return self._circle(MIDDLE, LARGE)
+
+    def _circle(self, least: float, most: float) -> int | None:
         """A new circle apart from the others; None where no place was found."""
         for _ in range(TRIES):
             radius = float(self._random.uniform(least, most))
             limit = ARENA - 1.05 * radius
             x, y = (float(each) for each in self._random.uniform(-limit, limit, 2))
-            if all(hypot(x - a, y - b) - r - radius >= GAP for a, b, r in self._circles):
-                self._circles.append((x, y, radius))
-                return len(self._circles) - 1
+            if all(hypot(x - a, y - b) - r - radius >= GAP for a, b, r in self._objects):
+                self._objects.append((x, y, radius))
+                return len(self._objects) - 1
         return None
 
-    def _start(self) -> tuple[float, float]:
-        """A position apart from the circles, the last one tried if there is none."""
+    def _start(self) -> tuple[float, ...]:
+        """A position apart from the circles, the last one tried if there is none, heading and speed."""
         for _ in range(TRIES):
             limit = ARENA - MARGIN
             x, y = (float(each) for each in self._random.uniform(-limit, limit, 2))
-            if all(hypot(x - a, y - b) - r > GAP for a, b, r in self._circles):
+            if all(hypot(x - a, y - b) - r > GAP for a, b, r in self._objects):
                 break
-        return x, y
+        return x, y, float(self._random.uniform(-pi, pi)), float(self._random.uniform(0, 1))
 
-    def _chain(self, visits: Sequence[_Visit], start: tuple[float, float]) -> _Text:
-        """Visits in sequence; for planning, each window has a share of the plan, by stays and distances."""
-        places = [start, *(self._circles[visit.circle][:2] for visit in visits)]
-        stays = [0, *(visit.stay for visit in visits)]
-        needs = [stay + 2 * dist(a, b) for stay, a, b in zip(stays, places, places[1:], strict=False)]
-        left = STEPS - stays[-1] - sum(visit.first for visit in visits)
-        published = planned = ""
-        for visit, need in zip(reversed(visits), reversed(needs), strict=True):
-            published = visit.then(published, visit.last)
-            planned = visit.then(planned, visit.first + int(left * need / sum(needs)))
-        return _Text(planned, published)
-
-    def _spec(self, requirements: Mapping[str, str]) -> str:
+    def _spec(self, requirements: Mapping[str, str], goals: int) -> str:  # noqa: ARG002 - all are circles
+        """The specification; the first `goals` objects are goals, the others obstacles."""
         lines = ["spec circles", "state signal x, y [m]"]
-        for number, (x, y, r) in enumerate(self._circles):
+        for number, (x, y, r) in enumerate(self._objects):
             margin = f"({r:.4f} m)^2 - (x - ({x:.4f} m))^2 - (y - ({y:.4f} m))^2"
             lines.append(f"def at_{number} = {margin} >= 0 m^2")
         return "\n".join([*lines, *(f"require {name}: {text}" for name, text in requirements.items()), ""])
 
 
-def _joined(word: str, parts: Sequence[_Text]) -> _Text:
-    joint = f" {word} "
-    return _Text(
-        joint.join(f"({each.planned})" for each in parts), joint.join(f"({each.published})" for each in parts)
-    )
+def _joined(word: str, parts: Sequence[str]) -> str:
+    return f" {word} ".join(f"({each})" for each in parts)

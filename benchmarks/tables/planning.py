@@ -1,13 +1,14 @@
 """Planning problems of other people: found or not, robustness and processor time, beside published figures.
 
-Problems of stlpy and STLCCP are one start each, whose robustness is maximised up to a target. Circles are
-tasks drawn in the manner of TeLoGraF, searched up to the first satisfying plan. Compilation is not counted.
+Problems of stlpy and STLCCP are one start each, whose robustness is maximised up to a target. Circles and arm
+are tasks drawn in the manner of TeLoGraF, searched up to the first satisfying plan. Compilation is not
+counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import inf
 from pathlib import Path
 from statistics import fmean
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 import typer
 
+from benchmarks.arm import draw_arm
 from benchmarks.circles import STEPS, draw
 from benchmarks.options import OnlyOption, ResultsOption
 from benchmarks.store import RESULTS, Key, ResultStore, inputs_of, load
@@ -23,19 +25,23 @@ from benchmarks.table import Columns, Table, show
 from benchmarks.timing import one_thread
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
-from stlc.controller.planning.planner import PlanBudget, plan
-from stlc.diagnostics import StlcError
+from stlc.controller.planning.planner import PlanBudget, PlanResult, plan
+from stlc.diagnostics import StlcError, UsageError
 from stlc.files import find_system
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from stlc.controller.problem.task import Task
 
 SEED = 12345
-"""Of the planner; circles are the tasks of this seed and the following ones."""
+"""Of the planner; drawn tasks are those of this seed and the following ones."""
 SLOW = {"umax": "0.2 m/s^2"}
 """Limit of the controls in STLCCP's instances."""
-METHODS = ("search", "halving", "gradient", "cem", "milp")
+METHODS = ("search", "halving", "schedule", "gradient", "cem", "milp")
+PROOF = 5.0
+"""Processor seconds for a plan of a drawn task, then for the proof that there is none."""
 MARGIN = 1e-3
 """Robustness at which the search of a drawn task ends, above the tolerance of a verdict."""
 
@@ -45,7 +51,7 @@ class Problem:
     """A problem: a specification with changes, or a system with drawn tasks.
 
     Attributes:
-        spec: name in `specs/planning`, or of a system for circles.
+        spec: name in `specs/planning`, or of a system for drawn tasks.
         published: figures of other tools, with their source.
         steps: horizon, if changed.
         target: robustness at which the search ends.
@@ -94,7 +100,10 @@ PROBLEMS = (
         100,
     ),
     Problem("circles_dubins", "TeLoGraF .62 / 1.3 s; gradient .60 / 6.7 s", None, MARGIN, 0.15, 100),
+    Problem("arm", "TeLoGraF .83 / 1.4 s", None, MARGIN, 1.4, 100),
 )
+DRAWS = {"circles_linear": draw, "circles_dubins": draw, "arm": draw_arm}
+"""System -> function that draws a task for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,8 +182,8 @@ def measured(problem: Problem, method: str, store: ResultStore) -> Row:
     shown = (problem.name, method, budget, target, SEED)
     try:
         if problem.tasks:
-            texts = sha256("\0".join(draw(SEED + i).planned for i in range(problem.tasks)))
-            inputs: Mapping[str, Any] = {"tasks": texts, "system": sha256(_circles(problem).read_bytes())}
+            texts = sha256("\0".join(DRAWS[problem.spec](SEED + i).text for i in range(problem.tasks)))
+            inputs: Mapping[str, Any] = {"tasks": texts, "system": sha256(_system(problem).read_bytes())}
         else:
             inputs = inputs_of(_task(problem))
         key = Key(
@@ -184,11 +193,30 @@ def measured(problem: Problem, method: str, store: ResultStore) -> Row:
         kept = store.get(
             key, lambda: _values(_drawn(problem, method) if problem.tasks else _one(problem, method))
         )
+        none = len(_impossible(problem, inputs, store)) if problem.tasks else 0
     except StlcError as why:
         return Row(*shown, None, str(why), problem.published)
-    return Row(
-        *shown, Solution(**{each.name: kept[each.name] for each in fields(Solution)}), "", problem.published
-    )
+    found = Solution(**{each.name: kept[each.name] for each in fields(Solution)})
+    return Row(*shown, replace(found, starts=found.starts - none), "", problem.published)
+
+
+def _impossible(problem: Problem, inputs: Mapping[str, Any], store: ResultStore) -> list[int]:
+    """Seeds of the drawn tasks that `milp` proves to have no plan; none for systems that it refuses."""
+    key = Key(f"{problem.name}, no plan", {**inputs, "seconds": PROOF})
+
+    def proved() -> Mapping[str, Any]:
+        left = (
+            seed for seed in _seeds(problem) if not bool(_planned(problem, seed, "schedule", PROOF).satisfied)
+        )
+        try:
+            return {
+                "seeds": [seed for seed in left if bool(_planned(problem, seed, "milp", PROOF).infeasible)]
+            }
+        except UsageError:  # the system has no mixed-integer linear form
+            return {"seeds": []}
+
+    seeds: list[int] = store.get(key, proved)["seeds"]
+    return seeds
 
 
 def _values(solution: Solution) -> dict[str, float]:
@@ -208,28 +236,45 @@ def _one(problem: Problem, method: str) -> Solution:
     return Solution(int(found.satisfied.sum()), 1, *(float(each[0]) for each in values))
 
 
-def _circles(problem: Problem) -> Path:
+def _system(problem: Problem) -> Path:
     return find_system(f"examples/planning/{problem.spec}.yaml")
 
 
-def _drawn(problem: Problem, method: str) -> Solution:
-    """Plans for drawn tasks, judged by the published formulas with windows cut at the last sample."""
+def _seeds(problem: Problem) -> range:
+    return range(SEED, SEED + problem.tasks)
+
+
+def _planned(problem: Problem, seed: int, method: str, seconds: float) -> PlanResult:
+    """Plan for the drawn task of a seed; compiling is not counted."""
+    task, x0 = _task_of(problem, seed)
+    idle = torch.zeros(1, STEPS, len(task.system.control_names))
+    task.judge(x0.float(), idle, states=False)
+    return plan(task, x0, method, budget=PlanBudget(seconds, target=problem.target), seed=SEED)
+
+
+def _task_of(problem: Problem, seed: int) -> tuple[Task, Tensor]:
+    """The drawn task of a seed, and its initial state (1, n)."""
     import stlc
     from stlc.controller.problem.task import Task
     from stlc.dynamics.model.system import System
 
-    system = System.load(_circles(problem))
+    drawn, system = DRAWS[problem.spec](seed), System.load(_system(problem))
+    x0 = torch.tensor([drawn.x0[: len(system.names)]], dtype=torch.float64)
+    return Task.of(stlc.parse(drawn.text), system, end="truncate"), x0
+
+
+def _drawn(problem: Problem, method: str) -> Solution:
+    """Plans for drawn tasks, judged by the monitor with windows cut at the last sample."""
+    import stlc
+
     rows = []
-    for seed in range(SEED, SEED + problem.tasks):
-        drawn = draw(seed)
-        task = Task.of(stlc.parse(drawn.planned), system)
-        x0 = torch.tensor([drawn.x0[: len(system.names)]], dtype=torch.float64)
-        made = plan(task, x0, method, budget=PlanBudget(problem.seconds, target=problem.target), seed=SEED)
-        states = task.rollout(made.states, made.plans)[0, : STEPS + 1].numpy()
-        signals = {"x": states[:, 0], "y": states[:, 1]}
-        rho = stlc.Monitor(stlc.parse(drawn.published), dt=system.dt).robustness(
-            signals, at=0, end="truncate"
-        )
+    for seed in _seeds(problem):
+        made = _planned(problem, seed, method, problem.seconds)
+        task, _ = _task_of(problem, seed)
+        states = task.rollout(made.states, made.plans)[0].numpy()
+        signals = dict(zip(task.system.names, states.T, strict=True))
+        monitor = stlc.Monitor(task.compiled.spec, system=_system(problem))
+        rho = monitor.robustness(signals, at=0, end="truncate")
         rows.append((float(rho), float(made.seconds[0]), float(made.evaluations[0])))
     rho, seconds, evaluations = zip(*rows, strict=True)
     found = sum(each >= 0.0 for each in rho)

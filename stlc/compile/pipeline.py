@@ -36,6 +36,7 @@ from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.lowering.lower import as_written, lower
 from stlc.compile.lowering.simplify import simplify
+from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
@@ -121,6 +122,7 @@ class Compiled:
         grid: time step and horizon.
         warnings: findings that are not errors.
         typed: the specification after the first stage.
+        end: treatment of windows that extend beyond the end of a plan.
     """
 
     name: str
@@ -136,6 +138,7 @@ class Compiled:
     grid: Grid
     warnings: tuple[Diagnostic, ...]
     typed: typed.Spec = field(repr=False)
+    end: End = "strict"
 
     @property
     def safety(self) -> tuple[CompiledRequirement, ...]:
@@ -155,6 +158,7 @@ def compile_spec(
     interface: Interface | None = None,
     overrides: Mapping[str, str] | None = None,
     purpose: Purpose = "train",
+    end: End = "strict",
 ) -> Compiled:
     """Compile a specification: run all stages.
 
@@ -164,11 +168,13 @@ def compile_spec(
         interface: interface of the system; None: signals are as declared in the specification.
         overrides: name of a constant -> text of the value that replaces its own.
         purpose: "train", or "check" for judging recorded traces.
+        end: for training, "truncate" cuts windows that extend beyond the end of a plan; "strict" refuses
+            them.
 
     Raises:
         SpecError: all errors of the first stage that fails.
     """
-    return compile_resolved(resolve_for(spec, interface, overrides, purpose), grid, purpose)
+    return compile_resolved(resolve_for(spec, interface, overrides, purpose), grid, purpose, end)
 
 
 def resolve_for(
@@ -188,7 +194,9 @@ def resolve_for(
     return resolve(spec, interface=interface, overrides=overrides)
 
 
-def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -> Compiled:
+def compile_resolved(
+    spec: typed.Spec, grid: Grid, purpose: Purpose = "train", end: End = "strict"
+) -> Compiled:
     """Run all stages of the compiler but the first, for one time grid.
 
     Raises:
@@ -207,7 +215,12 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
     assumptions = tuple(map(stage.rule, spec.assumptions))
     errors = [finding for finding in sink if finding.severity == "error"]
     if not errors and purpose == "train":
-        errors = [_too_far(rule, grid) for rule in requirements if _leaves_plan(rule, grid)]
+        cut = end == "truncate"
+        errors = [
+            _too_far(rule, grid)
+            for rule in requirements
+            if _leaves_plan(rule, grid) and not (cut and not reach(rule.formula).past)
+        ]
     if errors:
         raise SpecError(*errors)
     return Compiled(
@@ -224,6 +237,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
         grid=grid,
         warnings=tuple(sink),
         typed=spec,
+        end=end,
     )
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import stlc
+from benchmarks.arm import draw_arm
 from benchmarks.circles import KINDS, STEPS, draw
 from benchmarks.store import ResultStore, load
 from benchmarks.table import text_of
@@ -21,26 +22,44 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(5))
-def test_drawn_tasks_fit_a_plan_and_imply_the_published_formula(kind: str, seed: int) -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_drawn_tasks_are_judged_as_the_monitor_judges_them(kind: str, seed: int) -> None:
     drawn = draw(seed, kind)
     assert drawn == draw(seed, kind)
     system = System.load(ROOT / "examples/planning/circles_linear.yaml")
-    Task.of(stlc.parse(drawn.planned), system)
-    monitors = [stlc.Monitor(stlc.parse(text), dt=0.5) for text in (drawn.planned, drawn.published)]
+    task = Task.of(stlc.parse(drawn.text), system, end="truncate")
+    monitor = stlc.Monitor(stlc.parse(drawn.text), dt=0.5)
     random = torch.Generator().manual_seed(seed)
-    for _ in range(20):
-        steps = (torch.rand(STEPS, 2, generator=random) - 0.5).repeat_interleave(4, 0)[:STEPS]
-        path = torch.cat((torch.zeros(1, 2), steps.cumsum(0))).add(torch.tensor(drawn.x0[:2])).numpy()
-        signals = {"x": path[:, 0], "y": path[:, 1]}
-        planned, published = (float(each.robustness(signals, at=0, end="truncate")) for each in monitors)
-        assert published >= planned
+    plans = (torch.rand(6, STEPS, 2, generator=random).double() - 0.5).repeat_interleave(4, 1)[:, :STEPS]
+    x0 = torch.tensor(drawn.x0[:2], dtype=torch.float64).expand(6, -1)
+    judged = task.judge(x0, 2.0 * plans)
+    assert torch.allclose(task.robustness(task.system.rollout(x0, 2.0 * plans)), judged.rho)
+    for i, rho in enumerate(judged.rho.tolist()):
+        signals = {name: column[:, i].numpy() for name, column in judged.columns.items()}
+        assert float(monitor.robustness(signals, at=0, end="truncate")) == pytest.approx(rho)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tasks_of_the_arm_keep_their_objects_apart(kind: str) -> None:
+    drawn = draw_arm(4, kind)
+    assert drawn == draw_arm(4, kind)
+    path = ROOT / "examples/planning/arm.yaml"
+    task = Task.of(stlc.parse(drawn.text), System.load(path), end="truncate")
+    x0 = torch.tensor([drawn.x0], dtype=torch.float64)
+    assert torch.allclose(task.sample(1, seed=0, dtype=torch.float64), x0)
+    judged = task.judge(x0, torch.full((1, STEPS, 7), 0.5, dtype=torch.float64))
+    signals = {name: column[:, 0].numpy() for name, column in judged.columns.items()}
+    monitor = stlc.Monitor(stlc.parse(drawn.text), system=path)
+    assert float(monitor.robustness(signals, at=0, end="truncate")) == pytest.approx(float(judged.rho))
+    avoided = [i for i, rule in enumerate(task.rules) if rule.name.startswith("avoid")]
+    still = task.judge(x0, torch.zeros(1, STEPS, 7, dtype=torch.float64))
+    assert bool((still.requirements[:, avoided] > 0.0).all())
 
 
 def test_a_task_of_one_visit_is_solved_by_going_there() -> None:
     drawn = draw(3, "reach")
     system = System.load(ROOT / "examples/planning/circles_linear.yaml")
-    task = Task.of(stlc.parse(drawn.planned), system)
+    task = Task.of(stlc.parse(drawn.text), system, end="truncate")
     found = plan(task, torch.tensor(drawn.x0[:2]), budget=PlanBudget(1.0))
     assert bool(found.satisfied)
     assert dist(drawn.x0[:2], (0, 0)) < 10

@@ -27,6 +27,9 @@ sample. `lower` and `upper`: the trace is open, that is, it continues with unkno
 without `freeze`): the batch holds two traces, the first with lower, the second with upper bounds.
 """
 
+End: TypeAlias = Literal["strict", "truncate"]
+"""Treatment of windows that extend beyond the end of a plan: an error, or they are cut there."""
+
 Pick: TypeAlias = Literal["min", "max"]
 
 PICKS: Mapping[str, Pick] = MappingProxyType(

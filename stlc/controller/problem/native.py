@@ -25,6 +25,7 @@ from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
+    from stlc.compile.schedule.schedule import End
     from stlc.dynamics.model.system import System
 
 
@@ -72,10 +73,12 @@ class NativeJudge:
         self._factors = np.array([rule.weight / rule.scale for rule in rules])
 
     @classmethod
-    def of(cls, system: System, rules: Sequence[CompiledRequirement]) -> NativeJudge | None:
+    def of(
+        cls, system: System, rules: Sequence[CompiledRequirement], end: End = "strict"
+    ) -> NativeJudge | None:
         """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
         try:
-            library = load(emit(motion_of(system), [rule.formula for rule in rules]))
+            library = load(emit(motion_of(system), [rule.formula for rule in rules], end))
         except Untranslatable:
             return None
         if library is None:
@@ -152,14 +155,19 @@ class NativeGradient:
 
     @classmethod
     def of(
-        cls, system: System, rules: Sequence[CompiledRequirement], judge: NativeJudge | None
+        cls,
+        system: System,
+        rules: Sequence[CompiledRequirement],
+        judge: NativeJudge | None,
+        end: End = "strict",
     ) -> NativeGradient | None:
         """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
         if judge is None:
             return None
         fixed = [timer.name for timer in system.timers]
         try:
-            library = load(emit_adjoint(motion_of(system), [rule.formula for rule in rules], fixed=fixed))
+            formulas = [rule.formula for rule in rules]
+            library = load(emit_adjoint(motion_of(system), formulas, fixed=fixed, end=end))
         except Untranslatable:
             return None
         return None if library is None else cls(judge, Adjoint(library))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from stlc.compile.pipeline import Compiled, CompiledRequirement
+    from stlc.compile.schedule.schedule import End
     from stlc.dynamics.model.system import System
     from stlc.grammar import ast
 
@@ -101,8 +102,8 @@ class Task:
         self.plain = system
         added = compiled.timers, compiled.parameters
         self.system = system.augmented(*added) if any(added) else system
-        self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
-        self.safety = RobustnessGraph(compiled.safety, self.system.signature)
+        self.graph = RobustnessGraph(compiled.requirements, self.system.signature, end=compiled.end)
+        self.safety = RobustnessGraph(compiled.safety, self.system.signature, end=compiled.end)
 
     def __deepcopy__(self, memo: object) -> Self:
         """Return the task itself, which is immutable: a copied network belongs to the same task."""
@@ -116,6 +117,7 @@ class Task:
         *,
         overrides: Mapping[str, str] | None = None,
         values: Mapping[str, str] | None = None,
+        end: End = "strict",
     ) -> Task:
         """Compile a specification for a system.
 
@@ -124,6 +126,7 @@ class Task:
             system: system that the specification is about.
             overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
             values: parameters that get one fixed value in all trajectories; the policy still observes them.
+            end: "truncate" cuts windows that extend beyond the end of the plan; "strict" refuses them.
 
         Raises:
             UsageError: a value in `overrides` or `values` is not admissible.
@@ -131,7 +134,9 @@ class Task:
         """
         decl = system.decl
         grid = Grid(dt=decl.dt, horizon=decl.horizon)
-        compiled = compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {})
+        compiled = compile_spec(
+            spec, grid=grid, interface=system.interface(), overrides=overrides or {}, end=end
+        )
         if values:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
         return cls(compiled, system)
@@ -194,7 +199,7 @@ class Task:
     @cached_property
     def native(self) -> NativeJudge | None:
         """Native kernel for verdicts and local search, without gradient; None: torch is used."""
-        return NativeJudge.of(self.system, self.rules)
+        return NativeJudge.of(self.system, self.rules, self.compiled.end)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
@@ -202,7 +207,7 @@ class Task:
 
         None: torch is used.
         """
-        return NativeGradient.of(self.system, self.rules, self.native)
+        return NativeGradient.of(self.system, self.rules, self.native, self.compiled.end)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
         """Reasons why parts of a training run in torch: name of the part -> reason; "" if it runs in C.
@@ -217,13 +222,13 @@ class Task:
         if device != "cpu":
             return dict.fromkeys(("verdicts", "search", "gradient"), f"the device is {device}")
         motion, formulas = motion_of(self.system), [rule.formula for rule in self.rules]
-        judged = "" if self.native is not None else reason(lambda: emit(motion, formulas))
+        judged = "" if self.native is not None else reason(lambda: emit(motion, formulas, self.compiled.end))
         if smooth:
             gradient = "the paper's objective is smooth"
         elif judged or self.gradient is not None:
             gradient = judged
         else:
-            gradient = reason(lambda: emit_adjoint(motion, formulas))
+            gradient = reason(lambda: emit_adjoint(motion, formulas, end=self.compiled.end))
         return {"verdicts": judged, **({"search": judged} if searches else {}), "gradient": gradient}
 
     def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> PlanVerdicts:

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
-from stlc.compile.schedule.schedule import Boundary, IndexRange, TraceDomain, spanning
+from stlc.compile.schedule.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
@@ -206,6 +206,7 @@ class RobustnessGraph:
         rules: the requirements.
         signature: names of the states, in the order of the last axis of trajectories.
         semantics: definition of min and max, or a name in `stlc.compile.semantics.semantics.SEMANTICS`.
+        end: treatment of windows that extend beyond the last sample.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
     The argument `smoothing` of a method replaces the semantics in that call by log-sum-exp with scale k =
@@ -216,9 +217,14 @@ class RobustnessGraph:
     """
 
     def __init__(
-        self, rules: Sequence[Weighed], signature: Signature, semantics: str | Semantics = "exact"
+        self,
+        rules: Sequence[Weighed],
+        signature: Signature,
+        semantics: str | Semantics = "exact",
+        end: End = "strict",
     ) -> None:
         self.rules = tuple(rules)
+        self.end = end
         self.signature = signature
         self.semantics = semantics_of(semantics)
         self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
@@ -262,7 +268,7 @@ class RobustnessGraph:
         laws = semantics.associative, semantics.idempotent
         if laws not in self._formulas:
             self._formulas[laws] = [rule.under(semantics) for rule in self.rules]
-        return evaluate(self._formulas[laws], env, ops=ops, semantics=semantics)
+        return evaluate(self._formulas[laws], env, ops=ops, semantics=semantics, end=self.end)
 
     def _columns(self, x: Array) -> tuple[dict[str, Array], Ops]:
         if x.shape[-1] != len(self.signature):

@@ -14,6 +14,7 @@ from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.c.slopes import SlopeWriter
 from stlc.compile.ir import nodes as ir
+from stlc.compile.schedule.schedule import End
 
 _BUMP = """
 /* e^x for x <= 0, to the last digits, in a form that vectorises. */
@@ -37,18 +38,25 @@ static inline double bump(double z, double slope) {
 """
 
 
-def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Collection[str] = ()) -> str:
+def emit_adjoint(
+    motion: Motion,
+    formulas: Sequence[ir.Formula],
+    *,
+    fixed: Collection[str] = (),
+    end: End = "strict",
+) -> str:
     """Return the C source of `pull`, which computes the gradient; see `stlc.native` for its signature.
 
     Args:
         motion: one step of the system.
         formulas: the requirements.
         fixed: states through whose update no gradient is propagated.
+        end: treatment of windows that extend beyond the end of a plan.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
     """
-    plan = plan_of(formulas, motion.steps + 1)
+    plan = plan_of(formulas, motion.steps + 1, end)
     printer = StepPrinter(plan, state_index(motion))
     blocks = [along_roots(plan, "LANE g{value} += g[{i}][j];")]
     blocks += [printer.backward([step]) for step in reversed(plan.schedule.steps)]

@@ -16,6 +16,7 @@ from stlc.compile.backends.c.plan import Plan, Storage, plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
+from stlc.compile.schedule.schedule import End
 
 LANES = 16
 
@@ -73,13 +74,15 @@ class Motion:
     dt: float
 
 
-def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
+def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") -> str:
     """Return the C source of `judge` (robustness) and `climb` (local search), described in `stlc.native`.
+
+    With `end` "truncate", windows are cut at the end of the plan.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
     """
-    plan = plan_of(formulas, motion.steps + 1)
+    plan = plan_of(formulas, motion.steps + 1, end)
     states, rules, steps = len(motion.states), len(formulas), motion.steps
     return "\n".join(
         [

@@ -20,6 +20,7 @@ from stlc.compile.ir.support import columns_of, reach_of
 from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
 from stlc.compile.schedule.schedule import (
     PICKS,
+    End,
     IndexRange,
     Instant,
     LoopIndex,
@@ -156,13 +157,15 @@ class Plan:
         return self.schedule.domain.samples
 
 
-def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
+def plan_of(formulas: Sequence[ir.Formula], samples: int, end: End = "strict") -> Plan:
     """Return the schedule, with its memory, that evaluates formulas at the first sample of a trajectory.
+
+    With `end` "truncate", windows are cut at the last sample.
 
     Raises:
         Untranslatable: a formula needs samples outside of the trajectory.
     """
-    planner = _Planner(TraceDomain(samples))
+    planner = _Planner(TraceDomain(samples, end))
     places = planner.roots(formulas)
     numbers = tuple(number for number, _ in places)
     schedule = Schedule(planner.domain, tuple(planner.scope.steps), numbers)
@@ -246,11 +249,11 @@ class _Planner(Scheduler):
                 self._check(num, run)
             case ir.BoolOp(op, items):
                 return self._join(node, PICKS[op], _operands(op, items), run)
-            case ir.Windowed(window=window, back=False):
+            case ir.Windowed(window=window, back=False) if self.domain.end == "strict":
                 most = latest(run.last) + max(window.lo, window.hi or 0)
                 if most >= self.domain.samples:
                     raise Untranslatable("a window that leaves the plan")
-            case ir.Shift(steps, _, None):
+            case ir.Shift(steps, _, None):  # also refused where windows are cut: it has no window
                 if earliest(run.start) + steps < 0 or latest(run.last) + steps >= self.domain.samples:
                     raise Untranslatable("a sample outside of the plan")
             case ir.Freeze():

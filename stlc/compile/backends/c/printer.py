@@ -21,7 +21,7 @@ from stlc.compile.backends.c.slopes import SlopeWriter
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import leaves
-from stlc.compile.schedule.schedule import PICKS, IndexRange, Pick, Step, earliest, neutral
+from stlc.compile.schedule.schedule import PICKS, IndexRange, Pick, Step, earliest, latest, neutral
 
 Macro: TypeAlias = Literal["MIN", "MAX"]
 
@@ -360,19 +360,28 @@ class _Windowed(StepForm):
         return [f"{head} {{", f"  if (k == {first}) {{", *_indented(lines, 4), "  }"]
 
     def _empty(self, statement: str) -> list[str]:
-        """C branch that executes `statement` at instants whose past window lies before the trace.
+        """C branch that executes `statement` at instants whose window lies outside of the trace.
 
         If there are no such instants, the result is empty.
         """
-        late = self.back and earliest(self.run.start) < self.window.lo
-        return [f"  else if (k < {self.window.lo}) {statement}"] if late else []
+        lo = self.window.lo
+        if self.back:
+            return [f"  else if (k < {lo}) {statement}"] if earliest(self.run.start) < lo else []
+        return (
+            [f"  else if (k > {self.last - lo}) {statement}"]
+            if latest(self.run.last) + lo > self.last
+            else []
+        )
 
     def _ends(self) -> tuple[str, str]:
         """C expressions of the first and last sample of the window at instant `k`."""
         lo, hi = self.window.lo, self.window.hi
         if self.back:
             return "0" if hi is None else f"LATER(k - {hi}, 0)", f"k - {lo}"
-        return f"k + {lo}", f"{self.last}" if hi is None else f"k + {hi}"
+        if hi is None:
+            return f"k + {lo}", f"{self.last}"
+        leaves = latest(self.run.last) + hi > self.last
+        return f"k + {lo}", f"(k + {hi} < {self.last} ? k + {hi} : {self.last})" if leaves else f"k + {hi}"
 
 
 class _WindowExtremum(_Windowed):
@@ -427,7 +436,9 @@ class _Until(_Windowed):
         first, stop = self._ends()
         if self.back:
             return f"for (int i = k; i > LATER({stop}, -1); --i)", f"for (int i = {stop}; i >= {first}; --i)"
-        return f"for (int i = k; i < {first}; ++i)", f"for (int i = {first}; i <= {stop}; ++i)"
+        leaves = latest(self.run.last) + self.window.lo > self.last
+        near = f"i < {first} && i <= {self.last}" if leaves else f"i < {first}"
+        return f"for (int i = k; {near}; ++i)", f"for (int i = {first}; i <= {stop}; ++i)"
 
     def _scan(self) -> list[str]:
         out, pick, dual = self.out["k"], self.pick, self.dual

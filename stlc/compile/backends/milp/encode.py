@@ -31,6 +31,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.text import show_number
 from stlc.compile.ir.traverse import leaves, nodes, numbers
+from stlc.compile.schedule.schedule import End
 
 MARGIN = 1e-5
 """Margin of the dynamics' conditions in a tight encoding; tolerance of all conditions in a relaxed one."""
@@ -144,8 +145,9 @@ class Encoding:
         controls: variables of the plan, (T, m).
     """
 
-    def __init__(self, *, tight: bool) -> None:
+    def __init__(self, *, tight: bool, end: End = "strict") -> None:
         self.model = Model()
+        self._end = end
         self.rows: list[Row] = []
         self.controls: list[list[Affine]] = []
         self._tight = tight
@@ -319,9 +321,9 @@ class Encoding:
 
     def _samples(self, window: ir.Window, k: int) -> range:
         last = len(self.rows) - 1 if window.hi is None else k + window.hi
-        if last >= len(self.rows):
+        if last >= len(self.rows) and self._end == "strict":
             raise UnencodableError("a window beyond the horizon")
-        return range(k + window.lo, last + 1)
+        return range(k + window.lo, min(last + 1, len(self.rows)))
 
     def _predicate(self, node: ir.Predicate, k: int, margin: Affine) -> Tree:
         value = self._number(node.num, k).times(float(node.sign))

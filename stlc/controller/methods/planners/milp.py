@@ -221,7 +221,7 @@ def _encoded(
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.
     """
-    encoding, system = Encoding(tight=tight), task.system
+    encoding, system = Encoding(tight=tight, end=task.compiled.end), task.system
     step = system.exact_step
     low, high = system.control_low.tolist(), system.control_high.tolist()
     bounds = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))

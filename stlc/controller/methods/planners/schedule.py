@@ -1,0 +1,201 @@
+"""`schedule`: random schedules of the goals, met by Gauss-Newton steps.
+
+A local search fails where goals are reached in the wrong order. Here each attempt first draws when, and by
+which alternative, every part of the specification shall hold; then it changes a plan until the states meet
+these conditions. The attempts that come nearest go on, and a local search on exact robustness ends them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.planning.newton import GaussNewton, Pull, state_gradient, values_of
+from stlc.controller.planning.schedules import GoalScheduler, tempo
+from stlc.controller.training.local_search import Searcher
+from stlc.diagnostics import Diagnostic, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.planning.planner import PlanSearch, Solver
+    from stlc.controller.problem.task import Task
+
+PIECES = 12
+"""Maximum number of constant pieces of a random plan."""
+LEAST = 1e-9
+"""Speed that is added to each, for its logarithm."""
+SEEN = 0.1
+"""Share of the library of random plans among which each schedule chooses, so that attempts differ."""
+MODERATE = 0.6
+"""Share of the control ranges in which random plans lie."""
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulePlanner:
+    """Gauss-Newton steps towards random schedules of the goals.
+
+    Attributes:
+        schedules: number of schedules per round, those of `draws` with the least speed between goals.
+        draws: number of schedules drawn.
+        steps: number of Gauss-Newton steps.
+        halvings: number of selections of the better half of the attempts, at equal distances.
+        library: number of random plans; each schedule begins with the best of them.
+        rows: maximum number of conditions that a step considers.
+        margin: distance by which conditions shall hold, as a share of the typical range of the states.
+        greed: preference for schedules with a low speed between goals; 0 draws them at random.
+        best: number of plans that a local search improves at the end of a round.
+        tries: number of plans that it tries for each of these.
+        starts: number of random plans, the best ones, that a local search improves at the beginning.
+        first: number of plans that it tries for each of these.
+    """
+
+    schedules: int = 48
+    draws: int = 1_024
+    steps: int = 12
+    halvings: int = 2
+    library: int = 512
+    rows: int = 16
+    margin: float = 0.03
+    greed: float = 10.0
+    best: int = 8
+    tries: int = 500
+    starts: int = 16
+    first: int = 1_000
+
+    def prepare(self, task: Task) -> Solver:
+        """Return the solver, with the conditions of the specification.
+
+        Raises:
+            UsageError: U101, the specification has no condition on states.
+        """
+        scheduler = GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
+        if not scheduler.conditions:
+            message = "planner `schedule` needs a condition on states, at one sample, in the specification"
+            raise UsageError(Diagnostic("U101", message, help=("search, cem and cma plan for any task",)))
+        blank = torch.zeros(1, task.horizon + 1, len(task.system.names), dtype=torch.float64)
+        for states in (blank, blank[:, :1]):  # so that the programs of the conditions are built
+            values_of(task, scheduler.conditions, states)
+        return partial(self._run, scheduler=scheduler, pull=state_gradient(task.system))
+
+    def _run(self, search: PlanSearch, scheduler: GoalScheduler, pull: Pull) -> None:
+        random = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
+        searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
+        while len(rows := search.open()):
+            row = rows[:1]
+            with search.charged(row):
+                others = _random_plans(search, search.affordable(row, self.library))
+                library = torch.cat((search.start[row], others))
+                rho = search.offer(row, library[None])[0]
+                if len(search.open()) and self.first:
+                    best = rho.argsort(descending=True)[: self.starts]
+                    _polish(search, row, library[best], searcher, self.first)
+            if not bool((search.open() == row).any()):
+                continue
+            with search.charged(row):
+                attempts = _Attempts(self, search, row, library, (scheduler, pull), random)
+            while bool((search.open() == row).any()):
+                attempts.round(searcher)
+
+
+class _Attempts:
+    """Attempts from one initial state.
+
+    Args:
+        options: the planner.
+        search: the search for plans.
+        row: index of the initial state, (1,).
+        library: plans with which attempts begin, (k, T, m).
+        prepared: the conditions of the specification, and the derivative of the states.
+        random: random numbers.
+    """
+
+    def __init__(
+        self,
+        options: SchedulePlanner,
+        search: PlanSearch,
+        row: Tensor,
+        library: Tensor,
+        prepared: tuple[GoalScheduler, Pull],
+        random: Generator,
+    ) -> None:
+        self._options, self._search, self._row, self._library = options, search, row, library
+        (self._scheduler, pull), self._random = prepared, random
+        conditions, self._x0 = self._scheduler.conditions, search.states[row]
+        states = search.task.rollout(self._x0.expand(len(library), -1), library).nan_to_num(0.0, 0.0, 0.0)
+        spread = states.flatten(0, 1).std(0)
+        self._newton = GaussNewton(
+            search.task, conditions, spread, pull, rows=options.rows, margin=options.margin
+        )
+        missed = values_of(search.task, conditions, states).neg().clamp(min=0.0).sqrt()
+        self._missed = missed.flatten(0, 1)  # by each plan of the library: (conditions * (T + 1), k)
+        places, violated = self._newton.nearest(self._x0[0])
+        self._goals = violated.nonzero()[:, 0].numpy()
+        places = torch.cat((self._x0, places[violated])) / self._newton.spread
+        self._apart = torch.cdist(places, places).nan_to_num(0.0).numpy()
+
+    def round(self, searcher: Searcher) -> None:
+        """Draw schedules, and improve plans for them."""
+        search, row, options = self._search, self._row, self._options
+        with search.charged(row):
+            needed = self._drawn()
+            plans = self._nearest(needed)
+        cuts = {options.steps * (i + 1) // (options.halvings + 1) for i in range(options.halvings)}
+        for number in range(options.steps if len(needed) else 0):
+            with search.charged(row):
+                plans, missing = self._newton.step(self._x0.expand(len(plans), -1), plans, needed)
+                if number in cuts:
+                    kept = missing.argsort()[: -(-len(plans) // 2)]
+                    plans, needed = plans[kept], needed[kept]
+                order = search.offer(row, plans[None])[0].argsort(descending=True)
+                plans, needed = plans[order], needed[order]
+            if not bool((search.open() == row).any()):
+                return
+        with search.charged(row):
+            best = torch.cat((search.plans[row], plans[: options.best]))
+            _polish(search, row, best, searcher, options.tries)
+
+    def _drawn(self) -> Tensor:
+        """Schedules, those with a low speed between goals more likely, (k, conditions, T + 1)."""
+        options, random = self._options, self._random
+        needed: NDArray[np.bool_] = self._scheduler.draw(options.draws, random)
+        speed = tempo(needed[:, self._goals], self._apart)
+        order = (options.greed * np.log(speed + LEAST) - random.gumbel(size=len(speed))).argsort()
+        return torch.from_numpy(needed[order[: options.schedules]])
+
+    def _nearest(self, needed: Tensor) -> Tensor:
+        """For each schedule the plan that misses it least, among random ones of the library, (k, T, m)."""
+        missed = needed.flatten(1).double() @ self._missed
+        seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
+        return self._library[torch.where(seen, missed, torch.inf).argmin(1)]
+
+
+def _polish(search: PlanSearch, row: Tensor, plans: Tensor, searcher: Searcher, tries: int) -> None:
+    """Improve plans, (k, T, m), of the initial state `row` by local search, with `tries` plans each."""
+    count = len(plans)
+    tries = max(1, search.affordable(row, tries * count) // count)
+    bank = plans.new_zeros(0, *plans.shape[1:])
+    x0 = search.states[row].expand(count, -1).contiguous()
+    found = searcher.repair(x0, plans, bank, tries=tries, stop=search.budget.stop)
+    search.offer(row, found.plans[None], evaluations=tries * count)
+
+
+def _random_plans(search: PlanSearch, count: int) -> Tensor:
+    """Draw piecewise constant plans with random numbers of pieces, (count, T, m)."""
+    system, draw = search.task.system, search.generator
+    low, high = system.control_low.double(), system.control_high.double()
+    number = torch.randint(1, PIECES + 1, (count, 1), generator=draw)
+    begins = torch.rand(count, system.horizon, generator=draw) < number / system.horizon
+    piece = begins.cumsum(1)[..., None].expand(-1, -1, len(low))
+    levels = torch.rand(count, system.horizon + 1, len(low), generator=draw).double()
+    return 0.5 * (low + high) + MODERATE * (high - low) * (levels.gather(1, piece) - 0.5)
+
+
+PLANNER = SchedulePlanner

@@ -1,0 +1,264 @@
+"""Schedules: random choices of when, and by which alternative, the parts of a formula shall hold.
+
+A schedule decides every `or`, `eventually` and `until` of a specification. What remains are conditions on
+states that must hold at known samples. A trajectory that meets them satisfies the specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import leaves, nodes, numbers, operands
+
+Instants = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+MOST_INSTANTS = 16
+"""Longest window of an `always` whose operand has choices of its own; longer ones are left out."""
+
+
+class GoalScheduler:
+    """Draws schedules of some formulas.
+
+    Sub-formulas that cannot be decided in advance (those of the past, `freeze`, an `always` over a long
+    window of choices, conditions that read other signals than states) are left out: a trajectory may meet the
+    schedule and still violate them.
+
+    Attributes:
+        conditions: the conditions on states that schedules refer to.
+    """
+
+    def __init__(self, formulas: Sequence[ir.Formula], states: Sequence[str], steps: int) -> None:
+        self._formulas, self._states, self._steps = tuple(formulas), frozenset(states), steps
+        self._numbers: dict[ir.Formula, int] = {}
+        self._depths: dict[int, int] = {}
+        self._decidable: dict[int, bool] = {}
+        for formula in formulas:
+            self._collect(formula)
+        self.conditions = tuple(self._numbers)
+        self._opposed = {
+            i: self._numbers[_opposite(condition)]
+            for condition, i in self._numbers.items()
+            if isinstance(condition, ir.Predicate) and _opposite(condition) in self._numbers
+        }
+
+    def draw(self, count: int, random: Generator) -> Flags:
+        """Draw `count` schedules, and drop those that contradict themselves.
+
+        Returns:
+            Whether a condition is needed at a sample, (schedules, conditions, T + 1).
+        """
+        drawing = _Drawing(self, count, random)
+        for i in random.permutation(len(self._formulas)):
+            formula = self._formulas[i]
+            drawing.need(formula, np.zeros(count, np.int64), np.ones(count, np.bool_))
+        possible = drawing.possible
+        for i, j in self._opposed.items():
+            possible &= ~(drawing.needed[:, i] & drawing.needed[:, j]).any(1)
+        return drawing.needed[possible]
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of a plan."""
+        return self._steps
+
+    def number(self, condition: ir.Formula) -> int:
+        """Index of a condition."""
+        return self._numbers[condition]
+
+    def opposite(self, condition: ir.Formula) -> int | None:
+        """Index of the negation of a condition, if that is a condition too."""
+        return self._opposed.get(self._numbers.get(condition, -1))
+
+    def depth(self, formula: ir.Formula) -> int:
+        """Greatest number of nested choices of a sample in a formula."""
+        found = self._depths.get(id(formula))
+        if found is None:
+            own = isinstance(formula, ir.Windowed) and formula.op in ("eventually", "until", "release")
+            found = self._depths[id(formula)] = own + max(map(self.depth, operands(formula)), default=0)
+        return found
+
+    def decidable(self, formula: ir.Formula) -> bool:
+        """True for a condition on the states of one sample."""
+        known = self._decidable.get(id(formula))
+        if known is None:
+            known = self._decidable[id(formula)] = self._decided(formula)
+        return known
+
+    def _decided(self, formula: ir.Formula) -> bool:
+        return all(isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)) and all(
+            isinstance(leaf, ir.Const) or (isinstance(leaf, ir.Signal) and leaf.name in self._states)
+            for num in numbers(formula)
+            for leaf in leaves(num)
+        )
+
+    def parts(self, formula: ir.Formula) -> Iterator[ir.Formula]:
+        """The conditions of which a condition is the conjunction."""
+        if isinstance(formula, ir.BoolOp) and formula.op == "and":
+            for item in formula.items:
+                yield from self.parts(item)
+        else:
+            yield formula
+
+    def present(self, formula: ir.Formula) -> Iterator[ir.Formula]:
+        """The conditions that must hold at the sample at which a formula holds."""
+        match formula:
+            case ir.BoolOp("and", items):
+                for item in items:
+                    yield from self.present(item)
+            case ir.Temporal("always", ir.Window(0), body):
+                yield from self.present(body)
+            case _ if self.decidable(formula):
+                yield formula
+
+    def _collect(self, formula: ir.Formula) -> None:
+        if self.decidable(formula):
+            for part in self.parts(formula):
+                if not isinstance(part, ir.Truth):
+                    self._numbers.setdefault(part, len(self._numbers))
+            return
+        for part in operands(formula):
+            self._collect(part)
+
+
+def _opposite(condition: ir.Predicate) -> ir.Predicate:
+    return replace(condition, sign=-condition.sign, strict=not condition.strict)
+
+
+class _Drawing:
+    """Schedules that are being drawn side by side.
+
+    Attributes:
+        needed: whether a condition is needed at a sample, (schedules, conditions, T + 1).
+        possible: schedules without a window that is empty, (schedules,).
+    """
+
+    def __init__(self, scheduler: GoalScheduler, count: int, random: Generator) -> None:
+        self._scheduler, self._random = scheduler, random
+        self._last = scheduler.steps
+        self._samples = np.arange(scheduler.steps + 1)
+        self.needed = np.zeros((count, len(scheduler.conditions), scheduler.steps + 1), np.bool_)
+        self.possible = np.ones(count, np.bool_)
+
+    def need(self, formula: ir.Formula, now: Instants, on: Flags) -> None:
+        """Demand a formula at the samples `now`, in the schedules `on`: both (schedules,)."""
+        if not on.any():
+            return
+        if self._scheduler.decidable(formula):
+            self._hold(formula, now, now, on)
+            return
+        match formula:
+            case ir.BoolOp("and", items):
+                for i in self._random.permutation(len(items)):
+                    self.need(items[i], now, on)
+            case ir.BoolOp("or", items):
+                chosen = self._random.integers(len(items), size=len(on))
+                for i, item in enumerate(items):
+                    self.need(item, now, on & (chosen == i))
+            case ir.AtStart(body):
+                self.need(body, np.zeros_like(now), on)
+            case ir.Shift(steps, body):
+                there = now + steps
+                inside = (there >= 0) & (there <= self._last)
+                self.possible &= inside | ~on | (formula.outside is True)
+                self.need(body, there, on & inside)
+            case ir.Temporal() | ir.Until():
+                self._window(formula, now, on)
+
+    def _window(self, formula: ir.Temporal | ir.Until, now: Instants, on: Flags) -> None:
+        window = formula.window
+        first = now + window.lo
+        last = np.full_like(now, self._last) if window.hi is None else np.minimum(now + window.hi, self._last)
+        within = (self._samples >= first[:, None]) & (self._samples <= last[:, None])
+        match formula:
+            case ir.Temporal("always", _, body):
+                self._always(body, first, last, on)
+            case ir.Temporal("eventually", _, body):
+                chosen, on = self._chosen(formula, within & self._free(body), on)
+                self.need(body, chosen, on)
+            case ir.Until("until", _, left, right):
+                before = np.where(self._samples < now[:, None], True, self._free(left))
+                within &= np.logical_and.accumulate(before, axis=1)
+                chosen, on = self._chosen(formula, within & self._free(right), on)
+                self._always(left, now, chosen, on)
+                self.need(right, chosen, on)
+            case ir.Until("release", _, left, right):  # released by `left`, or `right` over the whole window
+                released = on & within.any(1) & (self._random.random(len(on)) < 0.5)
+                chosen, released = self._chosen(formula, within, released)
+                self.need(left, chosen, released)
+                self._always(right, first, np.where(released, chosen, last), on)
+
+    def _chosen(self, formula: ir.Formula, allowed: Flags, on: Flags) -> tuple[Instants, Flags]:
+        """Random allowed samples, (schedules,), and the schedules that have one.
+
+        If `n` further choices follow within the formula, each is the first of `n + 1` random samples.
+        """
+        count = allowed.sum(1)
+        share = 1.0 - self._random.random(len(on)) ** (1.0 / self._scheduler.depth(formula))
+        rank = (share * count).astype(np.int64)
+        chosen: Instants = (allowed.cumsum(1, dtype=np.int32) > rank[:, None]).argmax(1)
+        self.possible &= (count > 0) | ~on
+        return chosen, on & (count > 0)
+
+    def _free(self, formula: ir.Formula) -> Flags:
+        """Samples at which a formula may hold: no opposite of its present conditions is needed there.
+
+        Shape (schedules, T + 1).
+        """
+        free = np.ones((len(self.needed), self._last + 1), np.bool_)
+        for part in self._scheduler.present(formula):
+            other = self._scheduler.opposite(part)
+            if other is not None:
+                free &= ~self.needed[:, other]
+        return free
+
+    def _always(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
+        if self._scheduler.decidable(formula):
+            self._hold(formula, first, last, on)
+            return
+        length = int((last - first)[on].max(initial=-1)) + 1
+        if length <= MOST_INSTANTS:
+            for k in range(length):
+                self.need(formula, first + k, on & (first + k <= last))
+
+    def _hold(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
+        """Demand a condition from the sample `first` to `last`."""
+        within = (self._samples >= first[:, None]) & (self._samples <= last[:, None]) & on[:, None]
+        for part in self._scheduler.parts(formula):
+            if isinstance(part, ir.Truth):
+                self.possible &= part.value | ~within.any(1)
+            else:
+                self.needed[:, self._scheduler.number(part)] |= within
+
+
+def tempo(needed: Flags, apart: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Greatest speed that schedules demand between one goal and the next, per sample.
+
+    Args:
+        needed: samples at which each goal is needed, (schedules, goals, T + 1).
+        apart: distances between the initial state and the goals, (1 + goals, 1 + goals).
+
+    Returns:
+        Speeds, (schedules,); 0 without goals.
+    """
+    count, goals, samples = needed.shape
+    visited = np.logical_or.reduce(needed, axis=2)
+    first = np.where(visited, needed.argmax(2), samples)
+    last = samples - 1 - needed[:, :, ::-1].argmax(2)
+    order = first.argsort(1, kind="stable")
+    each = np.arange(count)
+    place, left = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    greatest = np.zeros(count)
+    for rank in range(goals):
+        goal = order[:, rank]
+        on = visited[each, goal]
+        speed = apart[place, goal + 1] / np.maximum(first[each, goal] - left, 0.5)
+        greatest = np.where(on, np.maximum(greatest, speed), greatest)
+        place, left = np.where(on, goal + 1, place), np.where(on, last[each, goal], left)
+    return greatest

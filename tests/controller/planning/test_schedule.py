@@ -1,0 +1,149 @@
+"""Schedules of goals, and the planner that meets them by Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import stlc
+from stlc.compile.ir import nodes as ir
+from stlc.controller.planning.newton import GaussNewton, _pulled_by_torch, state_gradient, values_of
+from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.planning.schedules import GoalScheduler, tempo
+from stlc.controller.problem.task import Task
+from stlc.diagnostics import UsageError
+from stlc.dynamics.model.system import System
+
+ROOT = Path(__file__).parents[3]
+HEAD = """spec goals
+state signal x, y [m]
+def at_a = (1 m)^2 - (x - 3 m)^2 - y^2 >= 0 m^2
+def at_b = (1 m)^2 - (x + 3 m)^2 - y^2 >= 0 m^2
+"""
+
+
+def task_of(text: str, system: str = "linear") -> Task:
+    loaded = System.load(ROOT / f"examples/planning/circles_{system}.yaml")
+    return Task.of(stlc.parse(HEAD + text), loaded, end="truncate")
+
+
+def scheduler_of(task: Task) -> GoalScheduler:
+    return GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "((not at_a) until[0, end] at_b) and (eventually[0, 40 steps] at_a)",
+        "eventually[3 steps, 9 steps] (at_a and eventually[5 steps, 60 steps] always[0, 4 steps] at_b)",
+        "(at_a or eventually[0, end] at_b) and always[0, end] (x < 20 m or y < 20 m)",
+        "(x < 20 m) release[0, 20 steps] (y < 20 m)",
+        "always[0, 3 steps] eventually[0, 3 steps] x < 9 m",
+    ],
+)
+def test_states_that_meet_a_schedule_satisfy_the_formula(formula: str) -> None:
+    task = task_of(f"require goal: {formula}")
+    scheduler = scheduler_of(task)
+    drawn = scheduler.draw(64, np.random.default_rng(0))
+    assert len(drawn)
+    for needed in drawn[:8]:  # conditions are independent signals here, false where they are not needed
+        signals = {f"c{i}": np.where(row, 1.0, -1.0) for i, row in enumerate(needed)}
+        for i, condition in enumerate(scheduler.conditions):  # an opposite has the same signal
+            other = scheduler.opposite(condition)
+            if other is not None and other < i:
+                signals[f"c{i}"] = np.where(needed[i], 1.0, -signals[f"c{other}"])
+                signals[f"c{other}"] = np.where(needed[i], -1.0, signals[f"c{other}"])
+        assert holds(task.rules[0].formula, scheduler, signals, 0)
+
+
+def holds(node: ir.Formula, scheduler: GoalScheduler, signals: dict[str, np.ndarray], k: int) -> bool:
+    """Truth by the definition of the operators, with windows cut at the last sample."""
+    last = scheduler.steps
+    if scheduler.decidable(node):
+        return all(signals[f"c{scheduler.number(part)}"][k] > 0 for part in scheduler.parts(node))
+    if isinstance(node, ir.BoolOp):
+        both = all if node.op == "and" else any
+        return both(holds(item, scheduler, signals, k) for item in node.items)
+    assert isinstance(node, (ir.Temporal, ir.Until))
+    end = last if node.window.hi is None else min(last, k + node.window.hi)
+    window = range(k + node.window.lo, end + 1)
+    if isinstance(node, ir.Temporal):
+        both = all if node.op == "always" else any
+        return both(holds(node.body, scheduler, signals, i) for i in window)
+    if node.op == "until":
+        return any(
+            holds(node.right, scheduler, signals, i)
+            and all(holds(node.left, scheduler, signals, j) for j in range(k, i + 1))
+            for i in window
+        )
+    return all(
+        holds(node.right, scheduler, signals, i)
+        or any(holds(node.left, scheduler, signals, j) for j in range(k, i))
+        for i in window
+    )
+
+
+def test_schedules_that_contradict_themselves_are_dropped() -> None:
+    scheduler = scheduler_of(task_of("require goal: (eventually[5 steps, 5 steps] at_a) and always not at_a"))
+    assert not len(scheduler.draw(50, np.random.default_rng(0)))
+
+
+def test_the_tempo_is_the_greatest_speed_between_goals() -> None:
+    needed = np.zeros((2, 2, 11), np.bool_)
+    needed[0, 0, 2:4] = needed[0, 1, 5] = needed[1, 1, 10] = True
+    apart = np.array([[0.0, 4.0, 1.0], [4.0, 0.0, 6.0], [1.0, 6.0, 0.0]])
+    assert tempo(needed, apart).tolist() == [3.0, 0.1]
+
+
+@pytest.mark.parametrize("system", ["linear", "dubins"])
+def test_derivatives_of_states_equal_differences(system: str) -> None:
+    task = task_of("require goal: eventually at_a", system)
+    random = torch.Generator().manual_seed(0)
+    size, controls = len(task.system.names), len(task.system.control_names)
+    x0 = torch.zeros(3, size, dtype=torch.float64)
+    x0[:, 2:] = 0.5
+    plans = 0.1 * torch.randn(3, 64, controls, generator=random).double()
+    columns = torch.zeros(size, 65, 3, dtype=torch.float64)
+    columns[0, 40] = columns[1, 20] = 1.0
+    slopes = state_gradient(task.system)(x0, plans, columns)
+    assert torch.allclose(slopes, _pulled_by_torch(task.system, x0, plans, columns), atol=1e-9)
+    move = 1e-5 * torch.randn(3, 64, controls, generator=random).double()
+    ahead, back = (task.rollout(x0, plans + sign * move) for sign in (1.0, -1.0))
+    change = ((ahead - back) * columns.permute(2, 1, 0)).sum((1, 2)) / 2.0
+    assert torch.allclose(change, (slopes * move).sum((1, 2)), rtol=1e-3)
+
+
+def test_steps_reach_a_goal_and_projections_lie_in_it() -> None:
+    task = task_of("require goal: eventually[20 steps, 20 steps] at_a")
+    scheduler = scheduler_of(task)
+    x0 = torch.zeros(1, 2, dtype=torch.float64)
+    spread, pull = torch.full((2,), 5.0, dtype=torch.float64), state_gradient(task.system)
+    newton = GaussNewton(task, scheduler.conditions, spread, pull)
+    places, violated = newton.nearest(x0[0])
+    assert violated.tolist() == [True]
+    assert float(values_of(task, scheduler.conditions, places[None, :])[0, 0, 0]) > 0.0
+    needed = torch.from_numpy(scheduler.draw(1, np.random.default_rng(0)))
+    plans, missing = torch.zeros(1, 64, 2, dtype=torch.float64), []
+    for _ in range(6):
+        plans, short = newton.step(x0, plans, needed)
+        missing.append(float(short))
+    assert missing[-1] < 1e-3 < missing[0]
+    assert float(task.judge(x0, plans, states=False).rho) > 0.0
+
+
+def test_goals_in_an_order_are_reached() -> None:
+    task = task_of("require goal: ((not at_a) until[0, end] at_b) and eventually[0, end] at_a", "dubins")
+    x0 = torch.tensor([[2.0, 2.0, 0.0, 0.5], [2.0, -2.0, 0.0, 0.5]], dtype=torch.float64)
+    found = plan(task, x0, "schedule", budget=PlanBudget(10.0))
+    assert bool(found.satisfied.all())
+    again = plan(task, x0, "schedule", budget=PlanBudget(10.0))
+    assert torch.equal(found.plans, again.plans)
+
+
+def test_without_a_condition_on_states_it_refuses() -> None:
+    task = task_of("require goal: true")
+    with pytest.raises(UsageError, match="needs a condition on states"):
+        plan(task, torch.zeros(1, 2), "schedule")
