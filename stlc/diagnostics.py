@@ -104,7 +104,7 @@ class StlcError(Exception):
         self.diagnostics = diagnostics
 
     def __reduce__(self) -> tuple[type[StlcError], tuple[Diagnostic, ...]]:
-        """Arguments for pickling, by which an error keeps its findings when it is sent to another process."""
+        """Arguments for pickling, so that an error keeps its findings when it is sent to another process."""
         return type(self), self.diagnostics
 
 

@@ -252,9 +252,9 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def spreadsheet(text: str) -> str:
-    """Return the text of a table cell that no spreadsheet program interprets as a formula.
+    """Return the text of a table cell such that no spreadsheet program interprets it as a formula.
 
-    A quote is put before a text that looks like one.
+    A quote is put before a text that looks like a formula.
     """
     return f"'{text}" if _FORMULA.match(text) else text
 

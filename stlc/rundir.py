@@ -221,7 +221,7 @@ class RunDir:
         return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
-        """Remove all rows from a file of JSON lines for which `wanted` is False.
+        """Keep only the rows of a file of JSON lines for which `wanted` returns True; remove the others.
 
         A resumed run removes the rows after its checkpoint.
         """
@@ -306,7 +306,10 @@ def _spec_path(run: RunDir) -> Path | None:
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:
-    """Names by which a run can be called: folder name, number with and without leading zeros, words."""
+    """Return the names by which a run can be called: folder name, padded number, number, words.
+
+    For `0007-quiet-heron` these are `0007-quiet-heron`, `0007`, `7` and `quiet-heron`.
+    """
     number, _, words = run.name.partition("-")
     return run.name, number, str(int(number)), words
 

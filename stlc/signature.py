@@ -24,8 +24,8 @@ class Column:
         low: lower end of the range, in `unit`; None if unknown.
         high: upper end of the range, in `unit`; None if unknown.
         labels: (label, value) pairs of an enum.
-        fact: whether values outside of the range cannot occur (because of a clamp, or as the signal is a bool
-            or enum); otherwise the range is nominal.
+        fact: True if all values lie within the range: a clamp enforces it, or the signal is a bool or enum.
+            False if the range is only nominal.
     """
 
     name: str

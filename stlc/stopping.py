@@ -46,7 +46,7 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 def undoing(undo: Callable[[int], object]) -> int:
     """Register `undo` for the rest of the process: a forced exit calls it with the exit code.
 
-    Return the key under which it is registered.
+    Returns the number under which it is registered.
     """
     key = next(_numbers)
     _undone[key] = undo
@@ -75,10 +75,10 @@ def age() -> float:
 
 
 def finish(code: int) -> int:
-    """End an interrupted process at once with the exit code `code`, since libraries take long to unload.
+    """End an interrupted process immediately with the exit code `code`, since libraries take long to unload.
 
-    If the process was not interrupted, it is not ended, and `code` is returned. Later signals are then
-    ignored, so that they do not change the exit code.
+    If the process was not interrupted, return `code`, and ignore later signals so that they do not change the
+    exit code.
     """
     if not _asked and code not in (128 + signal.SIGINT, 128 + signal.SIGTERM):
         with suppress(ValueError):  # not the main thread

@@ -339,7 +339,7 @@ def _use(session: int) -> _Use | None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate all processes of a session; kill those that do not end in time."""
+    """Terminate all processes of the session that `process` leads; kill those that do not end in time."""
     if os.name != "posix":
         process.kill()
         process.wait()
@@ -356,6 +356,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill all processes of a session at once."""
+    """Kill all processes of the session that `process` leads."""
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)

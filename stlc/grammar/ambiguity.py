@@ -28,11 +28,11 @@ class Ambiguity:
     """Part of a formula that should be in parentheses, since other STL tools can parse it differently.
 
     Attributes:
-        span: its place in the source.
-        kind: reason: "scope": a temporal operator whose operand extends further in other tools; "mixed":
+        span: location of the part in the source.
+        kind: reason. "scope": a temporal operator whose operand extends further in other tools; "mixed":
             `and` next to `or`; "chain": consecutive implications; "until": `until` next to another
-            connective; "implication": `and` or `or` next to `->`, which most tools parse as this one does.
-        outer: the connective of which the part is an operand.
+            connective; "implication": `and` or `or` next to `->`, which most tools parse as stlc does.
+        outer: the connective that has the part as an operand.
     """
 
     span: Span
@@ -60,7 +60,8 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 class _Words:
     """Words and signs of a source text, to tell which operands have parentheses.
 
-    `parenthesised` are the (start, end) offsets of the parts that already were found to need parentheses.
+    `parenthesised` holds the (start, end) offsets of the parts that were already reported for lack of
+    parentheses.
     """
 
     def __init__(self, spec: ast.Spec) -> None:
@@ -69,7 +70,10 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """True if an operand has parentheses, or was found to need them; `left`: it is the left operand."""
+        """True if the operand `node` has parentheses, or was already reported for lack of them.
+
+        `left` tells whether it is the left operand.
+        """
         if (node.span.start, node.span.end) in self.parenthesised:
             return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)
@@ -79,7 +83,10 @@ class _Words:
 
 
 def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the operands of a connective that are connectives without parentheses and easily misread."""
+    """Yield the operands of a connective that other tools may read differently for lack of parentheses.
+
+    An example is `p and q` in `p and q or r`.
+    """
     for operand, left in ((node.left, True), (node.right, False)):
         if words.closed(operand, left=left):
             continue

@@ -26,7 +26,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Quantity(Node):
-    """Number with its unit: "" if none is written, "steps" for a number of time steps."""
+    """Number with its unit: "" for a number without a unit, "steps" for a number of time steps."""
 
     value: Fraction
     unit: str = ""
@@ -53,7 +53,7 @@ class Inf(Node):
 
 @dataclass(frozen=True, slots=True)
 class Name(Node):
-    """Name without backticks; `quoted` tells whether it had them."""
+    """A name in an expression, stored without backticks; `quoted` tells whether the source has them."""
 
     name: str
     quoted: bool = field(default=False, compare=False)
@@ -294,7 +294,7 @@ class Declaration(Node):
 
 @dataclass(frozen=True, slots=True)
 class Signal(Declaration):
-    """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`, one node per declared name."""
+    """Declaration `env signal x : Type [unit] in [lo, hi] from "column"`; each declared name gets a node."""
 
     role: Literal["input", "output", "state", "env"] | None
     type: TypeRef | None

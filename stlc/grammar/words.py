@@ -16,9 +16,9 @@ class TemporalOperator:
 
     Attributes:
         name: preferred spelling.
-        meaning: one sentence about it, for the editor.
-        english: phrase with the operands `{p}` and `{q}` and the window `{when}`; the operator is binary if
-            the phrase contains `{q}`.
+        meaning: one sentence about the operator, for the editor.
+        english: English phrase that contains the operands `{p}` and `{q}` and the window `{when}`; the
+            operator is binary if the phrase contains `{q}`.
         aliases: other spellings.
         past: whether the window lies in the past.
         mirror: past operator that corresponds to this future operator, such as `once` to `eventually`; named

@@ -119,9 +119,9 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The system for which a specification is linted: its interface and time grid, and the purpose.
+    """The system for which a specification is linted: its signals and functions, and its time grid.
 
-    The purpose states what the specification is compiled for, such as "train".
+    `purpose` is what the specification is compiled for, such as "train".
     """
 
     interface: Interface

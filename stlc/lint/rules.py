@@ -82,7 +82,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 def _own(item: Lexeme, following: Lexeme) -> str | None:
     """Return the spelling in this language of a word or sign of another tool, such as `always` for `alw`.
 
-    It is None if the lexeme `item` needs no replacement.
+    `item` is the word or sign, and `following` the one after it. None means that `item` is not replaced.
     """
     if item.kind == "sign":
         return _SIGNS.get(item.text)
@@ -94,7 +94,10 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if the word that replaces a sign would form one word with the word or number after it."""
+    """True if a word or number follows the sign `item` without a blank.
+
+    Replacing the sign by a word would then join the two: `!p` would become `notp`.
+    """
     return following.start == item.end and following.kind in ("word", "number")
 
 

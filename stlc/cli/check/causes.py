@@ -23,9 +23,10 @@ _WIDTH = 72
 
 
 def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> Answer[Explanation]:
-    """Judge a trace and explain every violation; the exit code states the verdict (0, 1 or 4).
+    """Judge the trace `name` with the options in `question`, and explain every violation.
 
-    With `talk`, remarks and warnings are printed to the standard error.
+    The exit code of the answer states the verdict: 0 satisfied, 1 violated, 4 inconclusive. With `talk`,
+    remarks and warnings are printed to the standard error. `runs` is the folder of all runs.
     """
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
@@ -51,7 +52,10 @@ def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> A
 
 
 def _lines(cause: Cause, result: Checked) -> Iterator[str]:
-    """Lines of output about one violation: its place in the source, and the tree of its causes."""
+    """Lines of output about one violation (`cause`): the formula in the source, and the tree of causes.
+
+    The tree leads from the requirement to the sub-formulas, instants and signal values that decide its value.
+    """
     from stlc.cli.framework.render import render_place
 
     judged = cause.judgement
@@ -114,7 +118,11 @@ def _readings(node: CauseNode, cause: Cause, result: Checked) -> list[str]:
 
 
 def _record(cause: Cause, result: Checked) -> ViolationCause:
-    """JSON record of the cause of a violation; its tree is a list of nodes, each with its depth."""
+    """JSON record of the cause of a violation in the judged trace `result`.
+
+    The tree of causes becomes a list of nodes, parents before their children, each with its depth in the
+    tree.
+    """
     subject = result.verdict.subject
     nodes: list[CauseNodeRecord] = [
         {

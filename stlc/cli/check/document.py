@@ -36,7 +36,10 @@ def document(outcomes: Sequence[Outcome]) -> documents.CheckResult:
 
 
 def result_record(result: Checked, end: str) -> documents.CheckedTrace:
-    """JSON record of a judged trace; `end` is the value of `--end`."""
+    """JSON record of a judged trace.
+
+    `end` is the value of the option `--end`: the treatment of traces that are too short.
+    """
     verdict = result.verdict
     return trace_record(
         result.trace.name,
@@ -121,10 +124,10 @@ def requirement_record(
     Args:
         rule: the requirement.
         cause: cause of its violation, if any.
-        margins: the entries of the record about the robustness: minimum, mean, bounds.
+        margins: key -> value of the entries on the robustness, such as its minimum, mean or bounds.
         trace: index of the trace with the least robustness.
         start: instant at which the robustness is least, in seconds.
-        found: the entries of the record for the verdict and the counts.
+        found: entries of the record on the verdict and the counts.
     """
     robustness = {
         **margins,

@@ -37,16 +37,16 @@ class Question:
         system: name of a system file.
         names: name of a signal in the specification -> its name in the trace.
         require: names of the judged requirements; all if empty.
-        at: instant at which judging starts: a sample, a time, or `all`; None: the instants that the
-            requirements imply.
-        end: treatment of traces that are too short: "open" (bounds), "strict" (an error) or "truncate" (cut
-            windows).
-        tolerance: a requirement is satisfied if its robustness is at least minus this.
-        resample: time step of the grid for resampling, in seconds.
-        overrides: constant -> its value, as text.
+        at: instant at which judging starts: a sample, a time, or `all`. None: the first sample; for
+            requirements over a planning window, every sample with a full window after it.
+        end: treatment of traces that are too short: "open" (report bounds), "strict" (an error) or "truncate"
+            (end time windows at the last sample).
+        tolerance: a requirement is satisfied if its robustness is at least `-tolerance`.
+        resample: new time step in seconds, to which traces are resampled; None: no resampling.
+        overrides: name of a constant -> its new value, as text.
         semantics: name of the semantics of the reported robustness, such as "exact".
-        dt: seconds between samples that have no clock.
-        max_gap: longest gap between samples, in seconds, in which signals are known.
+        dt: seconds between samples of a trace without times.
+        max_gap: longest time between two samples, in seconds, over which signals count as known.
     """
 
     spec: Path | None = None
@@ -135,7 +135,7 @@ def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
 
 
 def _options(question: Question) -> tuple[str, ...]:
-    """The command-line options that repeat how a trace was read and judged, as words."""
+    """The command-line options that read and judge a trace again as `question` says, as a list of words."""
     words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
@@ -147,7 +147,10 @@ def _options(question: Question) -> tuple[str, ...]:
 
 
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:
-    """Options for reading trace files: names and grid; with a monitor, also the types of its signals."""
+    """Options for reading trace files: names of signals, time steps, and the longest gap between samples.
+
+    With a monitor, they also include the types of the signals that its specification declares.
+    """
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
 
@@ -177,10 +180,10 @@ def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Sourc
 
 
 def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
-    """The monitor of a specification, cached for traces with the same specification.
+    """Return the monitor of the specification `source`; it is cached and used again for further traces.
 
-    `carried` holds the imported files and the changed constants that are stored in a trace; it is ignored if
-    the specification was given as a file.
+    `carried` is what a trace stores: imported files and new values of constants. It is used only if the
+    specification is also taken from the trace, that is, if `question` names no specification file.
     """
     library: Mapping[str, str] = {}
     changed = question.overrides

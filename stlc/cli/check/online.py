@@ -204,10 +204,13 @@ def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
 
 
 def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversion]:
-    """Conversions of recorded numbers to the declared units, where these differ.
+    """Return the unit conversions of the standard input: signal -> function that converts its values.
+
+    `units` gives the unit of each recorded signal. The values are converted to the unit that the
+    specification declares. A signal that needs no conversion is left out.
 
     Raises:
-        TraceError: E605, an invalid unit, or one of another dimension.
+        TraceError: E605, a unit is invalid, or has another dimension than the declared one.
     """
     from stlc.monitor.signals import conversion
     from stlc.units import CELSIUS, means_celsius, parse_unit
@@ -229,7 +232,10 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
 
 
 def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
-    """Sample with its values converted to the declared units; a missing time is added."""
+    """Return the sample with its values converted to the declared units by the functions in `changes`.
+
+    A sample without a time gets one: the number of samples before it, times the time step.
+    """
     converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}
 

@@ -91,12 +91,12 @@ class Outcome:
 
 
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
-    """Exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
+    """Return the exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
-    With `fail_under`, 0 means that all requirements hold at least at this share of the judged instants, 1
-    that this share cannot be reached, and 4 that this is undecided. A file that cannot be judged takes
-    precedence over every verdict. Traces to which the specification does not apply (out of scope) do not
-    count.
+    With `fail_under`, the share of the judged instants at which all requirements hold is compared with
+    `fail_under`. 0 means that the share is at least `fail_under`, 1 that it is below, whatever samples
+    follow, and 4 that this is undecided. A file that cannot be judged takes precedence over every verdict.
+    Traces to which the specification does not apply (out of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:

@@ -99,7 +99,7 @@ def signed(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A percentage; only 1 is shown as 100 %, and only 0 as 0 %."""
+    """A percentage; `100 %` stands only for a share of exactly 1, and `0 %` only for exactly 0."""
     percent = 100 * share
     if 0 < percent < 0.1 or 99.9 < percent < 100:
         return "< 0.1 %" if percent < 1 else "> 99.9 %"

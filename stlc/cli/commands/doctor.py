@@ -134,7 +134,10 @@ def _cache() -> InstallationFinding:
 
 
 def _compiler() -> InstallationFinding:
-    """Finding on the C compiler: if plans are evaluated in C or in torch, and recent compiler failures."""
+    """Entry of the report about the C compiler.
+
+    It says whether plans are evaluated in C or in torch, and names a recent failure of the compiler.
+    """
     from stlc.toolchain import compiler, remembered, works
 
     found = compiler()

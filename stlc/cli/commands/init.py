@@ -131,9 +131,10 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """Command to run next: training for the first specification in `files` that is meant for training.
+    """Command to run next: training for the first specification in `files` (path -> text).
 
-    A specification by which a system judges closed-loop runs is not meant for it.
+    A specification that a system file names as judge of closed-loop runs is skipped; no policy is trained for
+    it.
     """
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}

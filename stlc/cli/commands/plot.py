@@ -131,7 +131,7 @@ def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
-    """Return trace number `wanted` of a file with several traces; all of them if it is None."""
+    """Return trace number `wanted` of a file with several traces; if `wanted` is None, return all traces."""
     if wanted is None:
         return trace
     _require_trace(trace.traces, wanted)

@@ -149,7 +149,11 @@ def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:
 
 
 def _accuracy(record: Mapping[str, Any]) -> float | None:
-    """Share of the validation states (never used in training) whose plan satisfies the specification."""
+    """Return the accuracy stored in the record of a run, or None if the record has none.
+
+    The accuracy is the share of validation states (never used in training) for which the plan of the policy
+    satisfies the specification.
+    """
     result = record.get("result")
     value = result.get("accuracy") if isinstance(result, Mapping) else None
     return float(value) if isinstance(value, int | float) else None

@@ -124,12 +124,13 @@ def simulate(
 ) -> Answer[Simulation]:
     """Deploy a trained policy in the world of its system.
 
-    The newest run by default; with --method, a planner for the specification RUN, without training. With
-    --backup the paper's backup policy guards it, and the same seeds are simulated without it for comparison.
-    Trace, scene and figures are written to the run's folder. Drives (closed-loop runs, one agent over one
-    seed each) are judged by the specification that the system names (key `judge` of its section `test`).
-    Means over seeds have 95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and
-    noise, also with a percentage (mismatch-20); --scenario disturbed runs them all.
+    The newest run by default. With --method, RUN is a specification, and a planner controls the system
+    without training. With --backup the paper's backup policy guards the policy, and the same seeds are
+    simulated without it for comparison. Trace, scene and figures are written to the run's folder. Drives
+    (closed-loop runs, one agent over one seed each) are judged by the specification that the system names
+    (key `judge` of its section `test`). Means over seeds have 95 % intervals (Student's t). Every system has
+    the scenarios mismatch, disturb and noise, also with a percentage (mismatch-20); --scenario disturbed runs
+    them all.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
@@ -213,7 +214,10 @@ def _run_of(
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
-    """Warning W604 if a mission without an end is simulated for longer than the policy was validated for."""
+    """Return the warning W604 if a simulation of `steps` steps is longer than the missions in the validation.
+
+    It concerns requirements without an end: the validation of the policy says nothing about later times.
+    """
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
     seconds = steps * run.task.system.dt
@@ -304,7 +308,10 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _satisfied(document: Simulation, guard: Mode) -> float:
-    """Least share, over all scenarios, of closed-loop runs that satisfy all requirements."""
+    """Least share, over all scenarios in `document`, of closed-loop runs that satisfy all requirements.
+
+    Only the runs with the guard `guard` are counted.
+    """
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)
@@ -345,9 +352,10 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate with one kind of guard (`mode`) and show progress live.
+    """Simulate with one kind of guard (`mode`), and show the progress as `watching` says.
 
-    If the simulation fails or Ctrl-C ends it, the steps simulated until then are saved as a trace.
+    The closed-loop runs are judged by `rules`. If the simulation fails or Ctrl-C ends it, the steps simulated
+    until then are saved as a trace.
     """
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
@@ -363,7 +371,10 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
-    """Write traces, scene (data of the animation) and record of a simulation; return the record."""
+    """Write traces, scene (data of the animation) and record of a simulation; return the record.
+
+    `found` holds the results by kind of guard. The trace of the last one is saved as the main one.
+    """
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json

@@ -53,8 +53,8 @@ def check(
 ) -> Answer[documents.SystemFacts]:
     """Validate a system file with random rollouts.
 
-    With --steps 0 the file is only read, without torch; otherwise random rollouts find initial sets that
-    reject nearly all samples, and dynamics that diverge. Kinematics from a URDF are compared with
+    With --steps 0 the file is only read, without torch. Otherwise random rollouts find dynamics that diverge,
+    and sections `init` whose conditions reject nearly all states. Kinematics from a URDF are compared with
     pytorch-kinematics if that is installed.
     """
     decl = _load(system, parse_overrides(set_))

@@ -281,8 +281,8 @@ def _resume(
 ) -> Session:
     """Resume a run from its last checkpoint.
 
-    The training ends at `steps` steps in total, or after `more` seconds; if both are None, where it was
-    planned to end.
+    `steps` is the total number of steps after which the training ends; `more` is the time that it may still
+    take, in seconds. If both are None, the training ends where it was planned to end.
     """
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined

@@ -165,7 +165,10 @@ class Program:
         return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
 
     def made(self, only: str = "") -> typer.Typer:
-        """Return the typer application with the command `only`, or with all if there is no such one."""
+        """Return the typer application with the command `only`.
+
+        If no command is called `only`, all commands are included.
+        """
         names = self.names()
         app = typer.Typer(
             name=self.name,
@@ -348,9 +351,10 @@ _SLOT = "_runtime_param"
 
 
 def spare_adapters(command: Any) -> None:
-    """Replace typer's slow converters of parameters by ones that pass on values that need no conversion.
+    """Replace the converters of all parameters of a command, and of its subcommands, to save time.
 
-    The parameters of subcommands are included.
+    The converters of typer are slow to build. Their replacements return a value of the right type unchanged,
+    and build typer's converter only for other values.
     """
     for param in _params(command):
         if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
@@ -369,7 +373,10 @@ def _help_option(command: Any) -> list[Any]:
 
 
 class _AsGiven:
-    """Substitute for typer's converter of one parameter, which is built only if a value needs conversion."""
+    """Substitute for typer's converter of one parameter, which is slow to build.
+
+    Typer's converter is built only for a value that needs conversion.
+    """
 
     def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
         """Return the value of a parameter, converted to its annotated type."""

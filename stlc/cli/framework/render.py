@@ -44,7 +44,10 @@ class _Paint:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """A place in the source to underline; the primary mark shows the location of the finding itself."""
+    """A place in the source to underline, with the text beside it.
+
+    `primary` is True for the place of the finding itself, and False for further places that explain it.
+    """
 
     span: Span
     text: str

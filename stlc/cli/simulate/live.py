@@ -1,4 +1,4 @@
-"""Live view of a deployment: margins as bars, agents, and which part of the guard decided.
+"""Live view of a deployment: robustness margins as bars, agents, and the part of the guard that decided.
 
 Without a terminal it is ten lines of text.
 """
@@ -43,7 +43,7 @@ class LiveView:
     """Display of a running deployment: redrawn in place on a terminal, else ten lines of text in total.
 
     Args:
-        monitor: source of the margins and decisions.
+        monitor: computes the robustness margins of all agents and counts the decisions of the guard.
         title: name of the deployment.
         console: console to which the view is written.
         clock: function that returns the time in seconds, to limit the rate of redrawing.
@@ -95,7 +95,11 @@ class LiveView:
     # ------------------------------------------------------------------------- text
 
     def line(self) -> str:
-        """Present state of the deployment on one line: step, guard decisions, least margin, violations."""
+        """Present state of the deployment on one line.
+
+        It shows the step, how often the guard intervened, the least robustness, and the number of agents that
+        violate a requirement.
+        """
         worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
         name, agent = worst[0], int(worst[1].high.argmin())
         violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
@@ -139,7 +143,7 @@ class LiveView:
         return f"agent {agent}" + (f", seed {self.monitor.setting.seeds[seed]}" if several else "")
 
     def _bars(self, width: int) -> list[Text]:
-        """Lines with the least margin of each requirement over all agents, one line per requirement.
+        """Return one line for each requirement: a bar and the least robustness over all agents.
 
         In a narrow terminal the bars become shorter before the names are cut.
         """
@@ -162,7 +166,11 @@ class LiveView:
         return found
 
     def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
-        """Texts on a requirement: its least margin with the unit, the agent that has it, the violations."""
+        """Return three texts on a requirement, whose robustness for each agent is `margin`.
+
+        The texts are the least robustness with its unit, the agent that has it, and the number of agents that
+        violate the requirement.
+        """
         row = int(margin.high.argmin())
         open_ = margin.low[row] < margin.high[row]
         count = int((margin.violated > 0).sum())
@@ -170,9 +178,10 @@ class LiveView:
         return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:
-        """Bar for a margin: to the left of the middle if negative, else to the right.
+        """Bar for a robustness value: to the left of the middle if negative, else to the right.
 
-        A full bar (`half` characters) is the largest margin of the requirement until now.
+        A full bar has `half` characters. It stands for the largest absolute value shown until now for the
+        requirement `name`.
         """
         full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
         finite = abs(value) if np.isfinite(value) else 0.0
@@ -187,7 +196,7 @@ class LiveView:
     def _agents(self, width: int, most: int) -> list[Text]:
         """Lines with the state of each agent of the first seed, one line per agent.
 
-        If there are more than `most` agents, those with the least margins are shown.
+        If there are more than `most` agents, those with the least robustness are shown.
         """
         monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
@@ -231,12 +240,15 @@ def _shown(column: Column, value: float) -> str:
 
 
 def _signed(value: float) -> str:
-    """Text of a margin with its sign; a margin within rounding errors of zero is "0"."""
+    """Text of a robustness value with its sign; a value within rounding errors of zero is "0"."""
     return "0" if abs(value) <= TOLERANCE else signed(value)
 
 
 def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
-    """Upper bound on the least margin of each agent over all requirements, (agents of all seeds,)."""
+    """Least robustness of each agent over all requirements, (agents of all seeds,).
+
+    `margins` has bounds on the robustness by requirement; the upper bounds are used.
+    """
     least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
     return least
 

@@ -28,11 +28,11 @@ COMPARED = ("obeyed every rule", "plan accuracy")
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
-    """Lines of text that show the results of a simulation.
+    """Lines of text that show the results of a simulation, whose record is `document`.
 
-    Results on drives (closed-loop runs) come first; with `windows`, results on plans and start instants
-    follow. The latter are always shown if the system names no specification for drives, because drives are
-    then judged like plans.
+    Results on drives (closed-loop runs) come first. With `windows`, results on plans follow, and on the
+    instants at which requirements are evaluated. They are also shown if the system names no specification for
+    drives, because drives are then judged like plans.
     """
     from stlc.cli.framework.output import table
 
@@ -67,14 +67,17 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """Yield a line on the selection of initial states, if only some of the sampled ones were used."""
+    """Yield a line on the choice of initial states, such as "starts from which a safe plan is known".
+
+    No line is yielded if every sampled initial state was used.
+    """
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:
-    """Lines with the verdict on the drives (closed-loop runs), and with the number of lost ones.
+    """Lines with the verdict on the drives (closed-loop runs), and with the number of drives that are lost.
 
     A drive is lost if no satisfying plan was known at its start, or after an exogenous event.
     """
@@ -92,16 +95,20 @@ def _drives(document: Record) -> Iterator[str]:
 
 
 def _rules(document: Record) -> Iterator[tuple[str, ...]]:
-    """Rows (name of a rule, one cell per guard): number of drives (closed-loop runs) that obeyed the rule."""
+    """Table rows that show, for each requirement on drives (closed-loop runs), how many drives obeyed it.
+
+    A row is the name of the requirement, then one cell per guard, such as `37 of 40`.
+    """
     guards = [guard["drives"] for guard in document["guards"].values()]
     for name in guards[-1]["rules"]:
         yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
 
 
 def _broken(drives: Record) -> Iterator[str]:
-    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` on the first drives that broke a rule.
+    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` on drives that broke a requirement.
 
-    Viable drives come first: those for which a satisfying plan was known.
+    Only the first few drives (closed-loop runs) are listed. Viable drives, for which a satisfying plan was
+    known, come first.
     """
     from stlc.view.words import cause_words
 
@@ -136,8 +143,9 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
 def compared(document: Record) -> Iterator[str]:
     """Lines of a table that compares all scenarios, one row per scenario.
 
-    For each guard it shows the number of viable drives (a satisfying plan was known) that obeyed every rule,
-    and the accuracy of plans.
+    For each guard it shows two results. The first is the number of drives (closed-loop runs) that obeyed
+    every requirement, among those for which a satisfying plan was known. The second is the share of plans
+    that satisfy the specification.
     """
     from stlc.cli.framework.output import table
 
@@ -155,10 +163,11 @@ def compared(document: Record) -> Iterator[str]:
 
 
 def _both(guard: Record) -> list[str]:
-    """Cells for one guard in the comparison of scenarios.
+    """Return the two cells for one guard in a table that compares scenarios.
 
-    The first cell counts drives (closed-loop runs): `37 of 40` means that 40 were not lost and 37 obeyed
-    every rule. The second is the share of plans that satisfy the specification.
+    The first cell counts drives (closed-loop runs). `37 of 40` means that a satisfying plan was known for 40
+    drives, and that 37 of them obeyed every requirement. The second cell is the share of plans that satisfy
+    the specification.
     """
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
@@ -192,10 +201,9 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 
 
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
-    """Rows with the shares of satisfying plans and start instants, one column per guard.
+    """Table rows with shares, such as the share of satisfying plans; one column per guard.
 
-    With `safe`, shares of safe plans and start instants are included. `safe` tells whether a requirement has
-    the tag `@safety`.
+    With `safe`, rows on the requirements tagged `@safety` are included.
     """
     from stlc.controller.evaluation.metrics import METRICS
 
@@ -226,17 +234,20 @@ def _times(guards: Record) -> Iterator[tuple[str, ...]]:
 
 
 def _number(metric: Record, unit: str, digits: int) -> str:
-    """A mean and the half-width of its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
+    """Text of a mean and of the half-width of its 95 % interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`.
+
+    Without an interval only the mean is shown. `digits` is the number of decimals.
+    """
     mean, high = metric["mean"], metric["high"]
     text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
     return f"{text} {unit}".rstrip()
 
 
 def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
-    """Text on the agents that were not driven safely.
+    """Text on the agents whose closed-loop runs violated a requirement tagged `@safety`.
 
-    An example is `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`; an agent is viable if
-    a safe plan from its start is known.
+    An example is `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`. An agent is viable if
+    a plan that satisfies these requirements is known from its start.
     """
     if not unsafe:
         return f"all {agents} agents were driven safely"
@@ -263,8 +274,9 @@ def _listed(agents: Sequence[Record]) -> str:
 def _acted(decisions: Mapping[str, float]) -> str:
     """Text on how often the guard intervened, and by which means.
 
-    An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`. T0=2 means that the
-    backup policy chose the first 2 steps of the plan, and the policy the rest.
+    An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`. T0=2 means that a
+    search chose the first 2 steps of the plan, and the policy the rest. "Longest safe prefix" means that no
+    satisfying plan was found, and the plan that stays safe for longest was followed.
     """
     total = 1.0 - decisions["policy"]
     if total <= 0.0:

@@ -22,13 +22,7 @@ STANDARD_OUTPUT = "-"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """Options for the output while a deployment runs.
-
-    Attributes:
-        title: name of the deployment.
-        live: whether the live view is shown.
-        margins: file to which margins are written as JSON lines; `-` is the standard output; None: no file.
-    """
+    """Text of a share in percent; `0 %` stands only for exactly 0, and `100 %` only for exactly 1."""
 
     title: str
     live: bool = False
@@ -36,7 +30,10 @@ class Watching:
 
     @contextmanager
     def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
-        """Context that yields the function which updates the output after every step of the deployment."""
+        """Return a context that yields a function to be called after every step of the deployment.
+
+        The function updates the progress bar or the live view, and writes margins to the file.
+        """
         if not self.live and self.margins is None:
             with _bar(self.title) as watch:
                 yield watch
@@ -96,7 +93,7 @@ def _opened(where: str) -> TextIO:
 
 
 def _write(monitor: LiveMonitor, stream: TextIO) -> None:
-    """Write the present margins to a stream, as one JSON object and line per agent."""
+    """Write the present robustness margins to a stream: one JSON object for each agent, on its own line."""
     from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps
 
@@ -107,7 +104,10 @@ def _write(monitor: LiveMonitor, stream: TextIO) -> None:
 
 @contextmanager
 def _bar(title: str) -> Iterator[Watch]:
-    """Context with a progress bar on the standard error, if a terminal; yields its update function."""
+    """Context with a progress bar on the standard error, which is shown only if that is a terminal.
+
+    The context yields the function that updates the bar.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from stlc.cli.framework.output import console

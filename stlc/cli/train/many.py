@@ -73,7 +73,7 @@ class Many:
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
     def job(self, part: Part) -> Job:
-        """Job of one run: the arguments of `stlc train` and, on a cluster, the files that it reads."""
+        """Return the job of one run: the arguments of `stlc train`, and its files if it runs on a cluster."""
         from stlc.controller.parallel.jobs import Job
 
         config, launch = self.config, self.launch

@@ -275,13 +275,15 @@ def final_screen(
     unsolved: str = "",
     picture: str = "",
 ) -> list[str]:
-    """Lines printed at the end of a training; with a verdict, the last one is the command to run next.
+    """Lines printed at the end of a training.
+
+    If `result` has an assessment of the training, the last line is the command to run next.
 
     Args:
         result: record of the finished training.
         spark: bar chart of the accuracy in one line.
-        region: set of initial states in which the worst requirement fails, in words.
-        unsolved: initial states from which no satisfying plan is known, in words.
+        region: description of the initial states from which the requirement with most violations fails.
+        unsolved: description of the initial states from which no satisfying plan is known.
         picture: path of a picture of the failures.
     """
     low, high = result["interval"]

@@ -64,7 +64,10 @@ class Session:
 
     @property
     def watch(self) -> Watch:
-        """The functions that the training calls, such as after every row of results or to ask for a stop."""
+        """Functions that the training calls while it runs.
+
+        They store a row of results, ask whether to stop, and report the activity, among others.
+        """
         stop = lambda: bool(self._signals)  # noqa: E731
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
@@ -187,7 +190,11 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
 
 
 def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: bool) -> list[str]:
-    """The final lines, with the region of held-out initial states in which the worst requirement fails."""
+    """Return the lines printed at the end of a training.
+
+    They describe the held-out initial states (never used in training) from which the worst requirement fails.
+    With `pictures`, the path of their picture is added.
+    """
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
     folder = outcome.run.dir

@@ -300,7 +300,10 @@ def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign]
 
 
 def _timer_flow(name: str, keys: StateKeys, unit: Unit, cx: Context) -> tuple[Assign, ...]:
-    """Return the derivative (or next value) of one timer; empty if its condition `run` is invalid."""
+    """Return the assignment that advances one timer; the tuple is empty if its condition `run` is invalid.
+
+    The assigned value is the derivative of the timer, or its next value in a discrete-time system.
+    """
     where = f"the timer `{name}`"
     direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
     run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
@@ -371,7 +374,10 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 
 
 def _even(column: Column) -> tuple[ir.Num, str]:
-    """Return the uniform distribution over the values that a column can take, as expression and as text."""
+    """Return the uniform distribution over the values that a column can take.
+
+    It is returned twice: as an expression of the IR, and as text.
+    """
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
         return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"
@@ -382,10 +388,10 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Add a range to a column that declares none: the range in which nearly all of its random values lie.
+    """Return the column with a range added, if it declares none.
 
-    `assigns` holds the distribution of these values. A column that declares a range is returned unchanged.
-    So is a column for which nothing is known about the values.
+    The range covers nearly all random values that the column can get. `assigns` holds the distributions of
+    the columns. A column without a distribution is returned unchanged, and so is one that declares a range.
     """
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
@@ -423,7 +429,10 @@ def read_controls(node: Node | None, cx: Context) -> None:
 def read_levels(
     node: Node | None, where: str, unit: Unit, bounds: tuple[float, float], cx: Context
 ) -> tuple[float, ...]:
-    """Read `levels`: the values of a control that a search may try, which must lie within `bounds`."""
+    """Read `levels`: the values that a search may try for a control. They must lie within `bounds`.
+
+    `where` names the control in messages. Returns the values in `unit`.
+    """
     items = cx.reader.items(node, f"`levels` of {where}")
     levels = [cx.here.constant(item, f"a level of {where}", unit) for item in items]
     low, high = bounds

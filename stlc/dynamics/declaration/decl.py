@@ -117,26 +117,32 @@ class SystemDecl:
 
     @property
     def worlds(self) -> tuple[WorldRef, ...]:
-        """Every world (simulator in a Python file) that `test` and the scenarios of the file name."""
+        """The worlds that the section `test` and the scenarios refer to.
+
+        A world is a simulator in a Python file.
+        """
         named = (self.test.world, *(scenario.world for scenario in self.scenarios))
         return tuple(world for world in named if world is not None)
 
     @property
     def judges(self) -> tuple[JudgeRef, ...]:
-        """Every specification that `test` and the scenarios of the file name as judge of closed-loop runs."""
+        """References to the specifications by which closed-loop runs are judged.
+
+        They are given by the key `judge` in the section `test` and in scenarios.
+        """
         named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
         return tuple(judge for judge in named if judge is not None)
 
     def judges_by(self, spec: Path) -> bool:
-        """True if the file names `spec` as judge of closed-loop runs.
+        """True if the key `judge` of the section `test` or of a scenario refers to the file `spec`.
 
-        Such a specification is compiled for recorded traces, not for plans.
+        A specification that judges closed-loop runs is compiled for recorded traces, not for plans.
         """
         return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
 
     @property
     def grid(self) -> Grid:
-        """Time step and horizon of the system, for which formulas are compiled."""
+        """Time step and horizon of the system; formulas are compiled for them."""
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:

@@ -57,7 +57,8 @@ Starts = Literal["any", "savable", "feasible"]
 def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
     """Read `levels` of the section `backup`: name of a control -> values that the backup policy tries.
 
-    They replace the levels that the declaration of the control gives.
+    These values replace the `levels` in the declaration of the control. `label` names the section in
+    messages.
     """
     found = {}
     for entry in cx.reader.entries(node, label):
@@ -216,7 +217,10 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
 
 @reads(items_of({"type": "string"}))
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
-    """Read the names of uncertain constants; a vector is named as a whole, not by component."""
+    """Read the names of uncertain constants; a vector is named as a whole, not by component.
+
+    `label` names the list in messages. A name that is no constant is reported.
+    """
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
     items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]
     for item in items:
@@ -251,9 +255,9 @@ class TestDecl:
 class ErrorsDecl:
     """Errors of actuators, parameters and sensors in a scenario, as fractions (0.1 is 10 %).
 
-    For a control with squash `angle` (a direction) the error is a fraction of one radian. Parameters are the
-    numbers in the dynamics (see `stlc.dynamics.scenarios.perturbed`). States with the unit second are clocks
-    and have no error.
+    The error of a control that is a direction (`squash: angle`) is a fraction of one radian. Parameters are
+    the numbers in the dynamics (see `stlc.dynamics.scenarios.perturbed`). States with the unit second are
+    clocks and have no error.
     """
 
     actuator_gain: float = key(fraction, "constant relative error of every control of an agent", 0.0)
@@ -282,9 +286,10 @@ def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
 
 @reads(mapping_of(VECTOR))
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
-    """Read a disturbance: terms added to derivatives (or next values) of states.
+    """Read a disturbance: terms that are added to the derivatives (or next values) of states.
 
-    Terms of derivatives are in the unit of the state per second.
+    A term added to a derivative is in the unit of the state per second. `label` names the disturbance in
+    messages.
     """
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
@@ -322,7 +327,10 @@ class ScenarioDecl:
 
 
 def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
-    """Read the section `scenario` and return all scenarios, in order; those not applied are checked too."""
+    """Read the section `scenario` and return all scenarios, in order.
+
+    All of them are checked, although a simulation uses only one.
+    """
     return tuple(
         _scenario(entry, cx)
         for entry in cx.reader.entries(node, "`scenario`")

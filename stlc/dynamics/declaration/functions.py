@@ -45,10 +45,11 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """Return the IR expressions of the function, given the sizes that a specification declares.
+        """Return the IR expressions of the function; check the sizes that a specification declares.
 
         Args:
-            arguments: declared size of each argument; None for a number.
+            arguments: declared size of each argument, the number of components of a vector; None for a
+                number.
             result: declared size of the result; None for a number.
 
         Raises:

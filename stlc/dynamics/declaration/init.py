@@ -83,13 +83,13 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class InitDecl:
-    """Distribution of initial states: a mixture of situations, with rejection of states by conditions.
+    """Distribution of initial states: a mixture of situations (alternative ways to draw a state).
 
     Attributes:
         mixture: the situations; for every state one of them is drawn by weight.
         where: conditions that every state must meet; other states are rejected.
         where_text: source text of these conditions.
-        params: distributions of the parameters, drawn before a situation is; situations may draw them again.
+        params: distributions of the parameters. They are drawn first; a situation may draw a parameter again.
         override: assignments drawn last, which replace the values that situations draw.
         span: source location of the section, for messages.
     """
@@ -170,9 +170,10 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
 
 
 def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
-    """Read the situations of a mixture; report S103 if all weights are 0.
+    """Read the situations of a mixture (alternative ways to draw an initial state).
 
-    `outer` holds the assignments made before, which the situations may read.
+    S103 is reported if all weights are 0. `outer` holds the assignments made before a situation is drawn; a
+    situation may read their names.
     """
     situations = [_situation(item, outer) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
@@ -181,7 +182,10 @@ def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
 
 
 def _situation(node: Node, outer: _Draws) -> Situation:
-    """Read one situation, or one of its branches; `outer` holds the assignments made before it."""
+    """Read one situation (a way to draw an initial state), or one of its branches.
+
+    `outer` holds the assignments made before the situation is drawn; the situation may read their names.
+    """
     keys = read(SituationKeys, outer.cx, node, "a situation")
     draws = _Draws(outer.cx, outer.ready, outer.locals)
     draws.read(keys)
@@ -193,7 +197,9 @@ def _situation(node: Node, outer: _Draws) -> Situation:
 
 
 class _Draws:
-    """Reader of the assignments of one situation; a local name (from `let`) is drawn before its first use.
+    """Reader of the assignments of one situation (a way to draw an initial state), in order of drawing.
+
+    The assignment of a local name (from `let`) is placed before the first assignment that reads the name.
 
     Attributes:
         found: the assignments read, in the order in which they are drawn.
@@ -213,7 +219,7 @@ class _Draws:
 
     @property
     def drawing(self) -> Context:
-        """Context for random expressions that read only names that already have a value."""
+        """Context in which random expressions are read; they may use only names that already have a value."""
         return self.cx.drawing(self.locals, self.ready)
 
     def require_all(self, called: str, node: Node) -> None:
@@ -229,7 +235,10 @@ class _Draws:
             self.cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
 
     def read(self, keys: SituationKeys | InitKeys) -> None:
-        """Add the assignments of `let`, `draw` and `also`; a local name is assigned before it is used."""
+        """Read the entries `let`, `draw` and `also`, and append their assignments to `found`.
+
+        The assignment of a local name (from `let`) is placed before the first assignment that reads the name.
+        """
         reader = self.cx.reader
         before = len(reader.findings)
         for entry in reader.entries(keys.let, "`let`"):
@@ -258,7 +267,7 @@ class _Draws:
         self.ready |= {column.name for column in columns}
 
     def _needed(self, node: Node) -> None:
-        """Add the assignments of the local names (from `let`) that an expression mentions."""
+        """Append the assignments of the local names (from `let`) that the expression `node` mentions."""
         texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
         for name in list(self.unresolved):
             if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
@@ -290,9 +299,10 @@ class _Draws:
 
 
 def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
-    """Read initial states from a grid or a file.
+    """Read initial states from a grid or a file, as one situation (a way to draw an initial state).
 
-    Every state that the grid or the file does not contain must be drawn by `draw`, else S102 is reported.
+    States that the grid or the file does not contain must be given by `draw`; a missing one is reported as
+    S102. `node` is the location of the message.
     """
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}

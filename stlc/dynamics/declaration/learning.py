@@ -60,7 +60,10 @@ def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
 
 
 def _term_label(found: Mapping[str, Node]) -> str:
-    """Return the label of a performance term in messages: its name, or else its expression."""
+    """Return the name of a performance term in messages, such as "the term `effort`".
+
+    A term without a name is called by its expression. `found` holds the values of the term by key.
+    """
     name = found.get("name")
     shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
     return f"the term `{shown}`"
@@ -103,7 +106,10 @@ def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
 
 
 def _at_start(number: Number) -> Number:
-    """Return a number with its columns replaced by their values at the start of the plan."""
+    """Return a number in which each state is replaced by its value at the start of the plan.
+
+    The state `x` becomes the column `x_start`.
+    """
     table = {name: ir.Signal(name + START) for name in names_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 
@@ -215,9 +221,10 @@ def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
-    """Read one item of `observe`; return (input of the policy, its text) for each component.
+    """Read one item of `observe`, the list of inputs of the policy network.
 
-    An item is a number, a formula (observed as 0 or 1), or a vector.
+    An item is a number, a formula (observed as 0 or 1), or a vector. Returns a pair (expression, source text)
+    for each component; the tuple is empty if the item is invalid.
     """
     expr = cx.here.parse(node, "an observation")
     if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
@@ -232,10 +239,10 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 @reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the images of states and controls under a mirror symmetry; those not listed are unchanged.
+    """Read the mirror images of states and controls: an expression for each. The others are unchanged.
 
-    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`. The symmetry is checked before a training,
-    by `stlc.controller.training.diagnose.check_mirror`.
+    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`.
+    `stlc.controller.training.diagnose.check_mirror` checks before a training that the dynamics are symmetric.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)

@@ -384,9 +384,10 @@ def _value(key: str, text: str, reader: Reader) -> Node | None:
 
 
 def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
-    """Return `node` with the value at `path` replaced by `value`; keys that `path` lacks are added.
+    """Return `node` with the value at `path` replaced by `value`; missing keys are added.
 
-    `key` is the whole dotted key, for messages.
+    `path` is the list of keys from `node` down to the value, and `key` the whole dotted key of the option
+    `--set`, for messages.
     """
     head, rest = path[0], path[1:]
     match node:
@@ -403,7 +404,10 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
 
 
 def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
-    """Report S101 because `head`, a part of the dotted key `key`, does not exist in `node`; return `node`."""
+    """Report S101: `--set` names a field that does not exist. Return `node` unchanged.
+
+    `head` is the part of the dotted key `key` that `node` lacks. `value` gives the location of the message.
+    """
     keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
     near = closest(head, keys)
     guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
@@ -412,7 +416,10 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """Return `init` with the overrides of states: `x=3m`, or a distribution, replaces the value of `x`."""
+    """Return `init` with the initial values of states that `overrides` gives.
+
+    An entry such as `x=3m`, or `x` with a distribution, replaces the value that is drawn for `x`.
+    """
     params = {base_name(assign.name) for assign in init.params}
     found: list[Assign] = []
     for name, text in overrides.items():

@@ -108,9 +108,10 @@ def component_texts(node: Node, size: int) -> tuple[str, ...]:
 
 
 def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
-    """Read the value of one column: a member's name for an enum, a formula for a bool, else a number.
+    """Read the value of one column, and check its unit.
 
-    Units are checked. Returns None if the value is invalid.
+    The value of an enum is the name of a member, that of a bool a formula, and any other value a number.
+    Returns None if the value is invalid.
     """
     where = f"`{column.name}`"
     boolean, here = column.kind == "bool", cx.here
@@ -174,9 +175,9 @@ def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 
 @dataclass(frozen=True, slots=True)
 class JumpDecl:
-    """A jump: a guard and resets.
+    """A jump: a condition (`guard`) and new values of states (`resets`).
 
-    If the guard holds at the start of a step, the resets replace the flow in that step.
+    In a step at whose start the guard holds, the resets give the next values in place of the flow.
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -206,9 +207,9 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
 
 
 def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
-    """Declare a bool state for every jump with `once`, which becomes true when the jump happens.
+    """Declare a bool state for every jump with `once`: true after the jump has happened.
 
-    Returns the initial values of these states: false.
+    Returns assignments of their initial values, which are false.
     """
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
@@ -228,7 +229,7 @@ def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 
 
 def latch_name(jump: str) -> str:
-    """Name of the bool state that records whether a jump with `once` has happened."""
+    """Name of the bool state that records whether the jump called `jump` has happened."""
     return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
 
 
@@ -236,11 +237,11 @@ def latch_name(jump: str) -> str:
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """Return assignments in which a random number that several of them use is drawn only once.
+    """Return assignments in which a random number that occurs in several of them is drawn only once.
 
-    For a vector, `p: "uniform(0, 1) * [1, 2]"` gives two assignments that use the same `uniform(0, 1)`. An
-    assignment before them draws the number and stores it in a local name, which both read. In contrast, `p:
-    "uniform(low, high)"` with vectors `low` and `high` draws one random number per component.
+    For a vector, `p: "uniform(0, 1) * [1, 2]"` gives two assignments with the same `uniform(0, 1)`. A new
+    assignment before them draws the number and stores it in a local name; the two then read this name. In
+    contrast, `p: "uniform(low, high)"` with vectors `low` and `high` draws one random number per component.
     """
     if len(assigns) < 2:
         return tuple(assigns)
@@ -252,7 +253,7 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
     known: dict[int, ir.Num] = {}
 
     def rewritten(num: ir.Num) -> ir.Num:
-        """Return the number with every shared sampler replaced by the local name that holds its value."""
+        """Return the number with each sampler that is drawn once replaced by the local name of its value."""
         if id(num) not in known:
             changed = map_parts(num, rewritten)
             if id(num) in shared:

@@ -1,7 +1,7 @@
 """Random initial states, drawn with an explicit generator.
 
-A situation of the mixture is picked by its weight, its variables are drawn in order from samplers such as
-`uniform`, and states that violate a condition of `where` are rejected.
+A situation is one of several ways to draw a state. It is picked by its weight. Its variables are drawn in
+order from samplers such as `uniform`. States that violate a condition of `where` are rejected.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Source of random numbers: one number per row, for `count` rows (states to draw).
+    """Source of random numbers for drawing `count` states at once, one number per state.
 
     The numbers are float64, on the device of `generator`.
     """
@@ -53,7 +53,7 @@ class Rows:
         return self._drawn(torch.randn)
 
     def blank(self) -> Tensor:
-        """Zeros, (count,), to which constants are broadcast."""
+        """Zeros, (count,), for adding a constant so that it gets the shape of the random numbers."""
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
@@ -65,10 +65,12 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """One occurrence of a sampler in an expression; equal occurrences are drawn independently.
+    """One occurrence of a sampler, such as `uniform(0, 1)`, in an expression.
+
+    Two occurrences are drawn independently, even if they read the same.
 
     Attributes:
-        name: generated column that receives the numbers drawn.
+        name: name of the column that receives the drawn numbers; it replaces the sampler in the expression.
         sampler: name of the sampler, such as `uniform`.
         args: compiled arguments, with outputs "0", "1", ….
         arity: number of arguments.
@@ -81,7 +83,10 @@ class _Call:
 
 
 class Drawing:
-    """An assignment compiled for drawing: its samplers, and the expression that uses their values."""
+    """An assignment compiled for drawing.
+
+    First the samplers in its value are drawn, then the value is computed from the drawn numbers.
+    """
 
     def __init__(self, assign: Assign) -> None:
         self.name = assign.name
@@ -91,9 +96,9 @@ class Drawing:
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
-        """Return the assigned value in every row, (count,) float64.
+        """Return the assigned value of each state drawn, (count,) float64.
 
-        `env` maps the names that the assignment reads to their values (count,), and must hold at least one.
+        `env` maps the names that the assignment reads to their values (count,); it must not be empty.
         """
         if self._calls:
             env = dict(env)
@@ -104,7 +109,10 @@ class Drawing:
         return value.expand(rows.count)
 
     def _extract(self, num: ir.Num) -> ir.Num:
-        """Return a number with every sampler replaced by a column; append the samplers to `_calls`."""
+        """Return the number with each sampler, such as `uniform(0, 1)`, replaced by a column.
+
+        The samplers are appended to `_calls`.
+        """
         if id(num) in self._seen:
             return self._seen[id(num)]
         if isinstance(num, ir.Op) and num.name in _SAMPLERS:
@@ -119,7 +127,7 @@ class Drawing:
 
 
 def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
-    """Draw one number per row from the sampler of that name with arguments `args`."""
+    """Draw one random number per state from the sampler called `sampler`, with arguments `args`."""
     match sampler, args:
         case "uniform", [low, high]:
             return torch.lerp(low, high, rows.uniforms())
@@ -154,7 +162,7 @@ Table = dict[str, Tensor]
 
 
 class _Draws:
-    """A situation (component of the mixture of initial states) compiled for drawing."""
+    """A situation (one of several ways to draw an initial state), compiled for drawing."""
 
     def __init__(self, situation: Situation) -> None:
         self.weight = situation.weight
@@ -167,7 +175,11 @@ class _Draws:
             self.points = _File(situation.points)
 
     def __call__(self, table: Table, rows: Rows) -> Table:
-        """Draw this situation; return `table` (name -> values, (count,)) extended by the values drawn."""
+        """Draw `rows.count` states by this situation.
+
+        `table` maps the names drawn before to their values, (count,). It is returned with the new values
+        added.
+        """
         if self.points is not None:
             table = {**table, **self.points(rows)}
         for drawing in self.draws:
@@ -176,7 +188,10 @@ class _Draws:
 
 
 class _Mixture:
-    """Mixture of situations compiled for drawing; one situation is picked for every row."""
+    """Mixture of situations (ways to draw an initial state), compiled for drawing.
+
+    For every state one situation is picked at random, by weight.
+    """
 
     def __init__(self, situations: tuple[Situation, ...]) -> None:
         self.parts = tuple(_Draws(situation) for situation in situations)
@@ -304,9 +319,10 @@ class InitialStates:
 
 
 class _Grid:
-    """Random points of a grid of states.
+    """Source of initial states: random points of a grid.
 
-    A point is computed from its index (the last axis varies fastest), so the grid is never stored.
+    The grid itself is never stored. A point is computed from its index, in which the last axis varies
+    fastest.
     """
 
     def __init__(self, decl: GridDecl) -> None:
@@ -388,9 +404,9 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _picked(count: int, rows: Rows) -> Tensor:
-    """Return random indices from 0 to `count` - 1, one per row.
+    """Return random indices from 0 to `count` - 1, (rows.count,).
 
-    They are drawn evenly: any two indices occur equally often, or one of them once more.
+    They are drawn evenly: the numbers of times that two indices occur differ by at most one.
     """
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)

@@ -17,7 +17,10 @@ def names_in(node: ir.Num | ir.Formula) -> frozenset[str]:
 
 
 def map_parts(node: N, rewrite: Callable[[ir.Num], ir.Num]) -> N:
-    """Apply `rewrite` to the operands of a numeric expression, or of the predicates in a state formula."""
+    """Return `node` with `rewrite` applied to its direct operands.
+
+    For a state formula, `rewrite` is applied to the numeric expressions in its predicates.
+    """
     return map_children(node, numbers=rewrite, formulas=lambda part: map_parts(part, rewrite))
 
 

@@ -57,7 +57,7 @@ class Linear:
     Attributes:
         a: A, (n, n).
         b: B, (n, m).
-        rest: (n,), displacement by one step from (x0, u0).
+        rest: (n,), change of the state in one step from (x0, u0).
         scale: (n,), half the range of each moving state; 1 for a state without range.
         moving: names of the moving states.
     """
@@ -70,7 +70,7 @@ class Linear:
 
     @property
     def growth(self) -> float:
-        """Growth factor per step of the fastest mode: the spectral radius of A."""
+        """Growth factor per step of the fastest mode without feedback: the spectral radius of `a`."""
         return float(np.abs(np.linalg.eigvals(self.a)).max(initial=0.0))
 
 
@@ -111,9 +111,9 @@ def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
 def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubles]:
     """Return the operating point: state (n,) and control (m,), in the units of the columns.
 
-    A state that `around` does not give is 0, or the middle of its range if the range excludes 0. Controls
-    that `around` does not give are chosen within their ranges such that the state stays as constant as
-    possible.
+    `around` gives values of some states and controls. Any other state is 0, or the middle of its range if the
+    range excludes 0. The other controls are chosen within their ranges such that the state stays as constant
+    as possible.
     """
     state = np.array(
         [
@@ -137,15 +137,19 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask (n,) of the moving states that the dynamics depend on; the operating point keeps them constant."""
+    """Mask (n,) of the moving states that have an influence on the change of a state.
+
+    The operating point is chosen such that these states stay constant.
+    """
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
 
 def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
-    """Linearise the exact step at `state` (n,) and `control` (m,) by central differences.
+    """Linearise the step at `state` (n,) and `control` (m,) by central differences.
 
-    All values are in the units of the columns.
+    The step is that of the flow, without inner feedback, jumps and clamps. All values are in the units of the
+    columns.
     """
     columns, names = decl.signature.columns, decl.signature.names
     moved = {assign.name for assign in decl.flow}
@@ -180,7 +184,10 @@ def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
 
 
 def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
-    """Next states (k, n) of `points` (k, n + m), each a state and a control; exact step without feedback."""
+    """Return the states (k, n) one step after `points` (k, n + m), each a state and a control.
+
+    The step is that of the flow, without inner feedback, jumps and clamps.
+    """
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
     env = dict(zip(names, points.T, strict=True))
@@ -266,7 +273,7 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 def growth_of(decl: SystemDecl) -> float:
     """Factor by which the fastest mode grows over a horizon, linearised at the operating point.
 
-    With an inner feedback the closed loop is linearised. Returns 1 if the factor cannot be computed.
+    With an inner feedback it is that of the closed loop. Returns 1 if the factor cannot be computed.
     """
     feedback = decl.feedback
     try:

@@ -44,7 +44,7 @@ class Mirror:
         self.side = self._names.index(images[0].name)
 
     def states(self, x: Tensor) -> Tensor:
-        """Mirror images of states: (…, n) -> (…, n)."""
+        """Return the mirror images of states: (…, n) -> (…, n)."""
         return _applied(self._states, x, self._names)
 
     def plans(self, u: Tensor) -> Tensor:
@@ -61,7 +61,8 @@ class Mirror:
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map states (B, n) to their representatives (B, n).
 
-        Returns also a mask (B,) of the states that were replaced by their images.
+        Of a state and its mirror image, one is the representative. Returns the representatives, and a mask
+        (B,) of the states that were replaced by their mirror images.
         """
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
@@ -69,7 +70,7 @@ class Mirror:
 
 
 def _applied(program: ArrayProgram, x: Tensor, names: Sequence[str]) -> Tensor:
-    """Replace the columns of `x` that the program computes: (…, k) -> (…, k).
+    """Return `x` (…, k) with the columns replaced that the program computes.
 
     `names` are the names of all k columns.
     """

@@ -22,7 +22,7 @@ Columns = dict[str, Tensor]
 
 @dataclass
 class _Columns:
-    """Values of a rollout in progress of T steps.
+    """Values of a rollout of T steps while it is computed, for a batch of size B.
 
     Attributes:
         states: name of a state -> its T+1 samples, or its initial value (B,) before these are computed.
@@ -36,7 +36,7 @@ class _Columns:
     switch: Switch
 
     def run(self, program: ArrayProgram) -> Columns:
-        """Evaluate a program at all T steps at once, and return its outputs as tensors."""
+        """Evaluate a program for all T steps in one call; return name of an output -> tensor."""
         like = next(iter(self.states.values()))
         outputs = program(self.now, TORCH, self.switch)
         return {
@@ -49,11 +49,15 @@ class _Columns:
         self.now[name] = column[:-1]
 
     def full(self, values: Tensor) -> Tensor:
-        """Expand values, constant or not, to every step: (T, B)."""
+        """Expand values to every step: (T, B) or, if constant over time, (B,) -> (T, B)."""
         return values.expand(self.steps, self.batch)
 
     def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
-        """Split the values of `names`: constants by name, and (name, one tensor per step) for the others."""
+        """Split the values called `names` into constant ones and those that change over time.
+
+        Returns a mapping name -> tensor of the constant values, and pairs (name, one tensor per step) of the
+        others.
+        """
         fixed: dict[str, Tensor] = {}
         timed: list[tuple[str, Sequence[Tensor]]] = []
         for name in names:
@@ -99,7 +103,10 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """Compiled stage of a rollout: states and expressions that are computed together (`RolloutStage`)."""
+    """Compiled stage of a rollout (`RolloutStage`): states and expressions that are computed together.
+
+    A call computes them for all steps and stores them in the given `_Columns`.
+    """
 
     def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage

@@ -68,7 +68,11 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 
 
 class _StageWriter:
-    """Builder of one stage: all strongly connected groups at the same depth of the dependency graph."""
+    """Builder of one stage: states and expressions that are computed together.
+
+    Groups of names that depend on each other are added one by one. A stage takes the groups at the same depth
+    of the dependency graph, so no group depends on another one of the stage.
+    """
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
         self.numbers = numbers
@@ -82,7 +86,10 @@ class _StageWriter:
         self.lets: list[str] = []
 
     def add(self, group: Sequence[str]) -> None:
-        """Add one group of names that depend on each other (a strongly connected component)."""
+        """Add one group of states and expressions that depend on each other.
+
+        A group is a strongly connected component of the dependency graph, often a single name.
+        """
         name = group[0]
         if len(group) == 1 and name not in self.reads[name]:
             if name in self.numbers:
@@ -224,7 +231,10 @@ class Hoist:
         return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """Rewrite an if-then-else with a loop-invariant condition, which becomes a mask in `early`."""
+        """Rewrite an if-then-else (`cond`, `yes`, `no`) whose condition does not change within the loop.
+
+        The condition is computed before the loop, as a mask in `early`.
+        """
         if yes == ir.Const(0.0):
             keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))
@@ -250,7 +260,7 @@ class Hoist:
 
 
 def _terms(num: ir.Num, sign: int = 1) -> list[tuple[int, ir.Num]]:
-    """Return (sign, term) of the terms of a sum, nested sums expanded."""
+    """Return the terms of a sum as pairs (sign, term), with sign 1 or -1. Nested sums are expanded."""
     match num:
         case ir.Op("add", (left, right)):
             return [*_terms(left, sign), *_terms(right, sign)]

@@ -69,7 +69,7 @@ def commands(decl: SystemDecl) -> dict[str, ir.Num]:
 
 
 def _given(jump: JumpDecl, given: State) -> JumpDecl:
-    """Return the jump with its controls replaced by the actuator commands `given`."""
+    """Return the jump with each control in it replaced by the actuator command in `given`."""
     if not given:
         return jump
     resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)

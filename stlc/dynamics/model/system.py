@@ -77,9 +77,10 @@ class System:
 
     @cached_property
     def truth(self) -> System:
-        """The true system, which differs from this model if the scenario has a model mismatch.
+        """The true system: this model with the model mismatch of the scenario applied.
 
-        It has no parameters or timers of a specification in that case.
+        Without a mismatch it is this system itself. With one, it has no parameters or timers of a
+        specification.
         """
         real = truth(self.decl)
         return self if real is self.decl else System(real)
@@ -176,16 +177,16 @@ class System:
     def added_later(self, x: Tensor) -> Tensor:
         """Return the parameters and timers of the specification one step later: (B, n) -> (B, added).
 
-        They do not depend on the control.
+        No controls are given, because the parameters and timers do not depend on them.
         """
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
 
     def commanded(self, x: Tensor, u: Tensor) -> Tensor:
-        """Actuator commands (B, m) in states (B, n) for planned controls `u` (B, m).
+        """Return the actuator commands (B, m) in states `x` (B, n) for planned controls `u` (B, m).
 
-        These are `u` itself without inner feedback.
+        Without inner feedback they equal `u`.
         """
         if self._commands is None:
             return u
@@ -217,7 +218,10 @@ class System:
         return torch.stack([columns[name].t() for name in self.names], 2)
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
-        """Roll out as `rollout` does; return state -> (T+1, B), where constant states are expanded views."""
+        """Roll out from states (B, n) under plans (B, T, m); return state -> values over time, (T+1, B).
+
+        The tensor of a constant state is an expanded view.
+        """
         if (
             x0.shape[1:] != (len(self.names),)
             or u.shape[2:] != (len(self.decl.controls),)
@@ -239,7 +243,10 @@ class System:
         return {timer.name: after[timer.name] for timer in self.timers}
 
     def _timers_over_time(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """Roll out the timers from `start` (B,), given the other states over time, (T+1, B)."""
+        """Roll out the timers from their initial values in `start`, (B,) each.
+
+        `columns` has the other states over time, (T+1, B) each. Returns timer -> values over time, (T+1, B).
+        """
         if not self.timers:
             return {}
         with torch.no_grad():
@@ -300,7 +307,10 @@ class System:
     # -------------------------------------------------------------- policy, objective
 
     def observe(self, x: Tensor) -> Tensor:
-        """Inputs of the policy: (…, n) -> (…, k); added parameters and timers come last."""
+        """Compute the inputs of the policy network from states: (…, n) -> (…, k).
+
+        The parameters and timers of the specification come last.
+        """
         if self._observation is None:
             return x
         seen = self._observation(self._named(x), TORCH, HARD)
@@ -308,14 +318,17 @@ class System:
 
     @cached_property
     def observed(self) -> tuple[ir.Num, ...]:
-        """Inputs of the policy as expressions over the states; added parameters and timers come last."""
+        """Inputs of the policy network as expressions over the states.
+
+        The parameters and timers of the specification come last.
+        """
         states = (ir.Signal(name) for name in self.decl.signature.names)
         added = (ir.Signal(column.name) for column in self.added)
         return (*(self.decl.policy.observe or states), *added)
 
     @cached_property
     def _observation(self) -> ArrayProgram | None:
-        """Compiled inputs of the policy; None if they are the states themselves."""
+        """Compiled inputs of the policy network; None if the inputs are the states themselves."""
         seen = {str(i): num for i, num in enumerate(self.observed)}
         return ArrayProgram(seen) if self.decl.policy.observe else None
 

@@ -97,7 +97,7 @@ class PythonFunction:
     call: Callable[..., Array]
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Bound:
-        """Return the function for arguments and result of the sizes that a specification declares.
+        """Return the function with the sizes of arguments and result that a specification declares.
 
         A size is the number of components of a vector, or None for a number.
         """

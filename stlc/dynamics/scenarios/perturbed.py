@@ -53,10 +53,10 @@ class Uncertain:
 
 @dataclass(frozen=True, slots=True)
 class Perturbable:
-    """Declaration in which every uncertain number of `flow` and `jumps` is multiplied by a factor.
+    """Declaration of a system in which every uncertain number of the dynamics is multiplied by a factor.
 
     Attributes:
-        decl: the declaration, whose dynamics read the factors as columns.
+        decl: the declaration; the factors are columns that `flow` and `jumps` read.
         numbers: the uncertain numbers.
     """
 
@@ -93,7 +93,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """Return the declaration with guards, equations and resets replaced by those of `flow` and `jumps`.
+    """Return the declaration with the guards, equations and resets of `flow` and `jumps`.
 
     Only the equations and resets of real states are replaced; those of bool and enum states are kept.
     """
@@ -112,7 +112,10 @@ def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl
 
 
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
-    """Return the names of the states whose equations or jumps read the column `factor`."""
+    """Return the names of the states whose next value depends on the column `factor`.
+
+    Their equation, or a guard or reset that sets them, reads the column.
+    """
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
         guarded = factor in names_in(jump.guard)
@@ -159,9 +162,9 @@ _COMPUTED: Mapping[type[ast.Node], tuple[str, ...]] = {
 
 
 def _computed(node: ast.Node) -> tuple[str, ...]:
-    """Names of the fields of a syntax tree node that hold operands of arithmetic.
+    """Return the names of the fields of a syntax tree node that hold operands of arithmetic.
 
-    The fields of exponents, indices and conditions are left out.
+    Exponents, indices and conditions are not among them.
     """
     match node:
         case ast.Binary(op="%" | "^"):
@@ -179,8 +182,8 @@ class _UsedNumbers:
         names: declared names of the system file.
         constants: names of the constants.
         computed_with: constants found as operands of arithmetic.
-        compared: constants found in conditions, exponents and indices.
-        literals: name of a factor -> literal to be multiplied by it.
+        compared: constants found in conditions, exponents and indices; they count as exact.
+        literals: name of a factor -> the literal (number in the source) that it multiplies.
     """
 
     def __init__(self, names: Names) -> None:
@@ -196,13 +199,13 @@ class _UsedNumbers:
         return expr
 
     def rewritten(self, node: Any, *, called: bool = False) -> Any:
-        """Multiply each literal that an expression computes with by a factor; definitions are expanded.
+        """Return an expression with a factor at each literal: `2 * v` becomes `2 * factor * v`.
 
-        Records these literals, and the constants in the expression.
+        Names of definitions are replaced by their expressions. The literals and the constants are recorded.
 
         Args:
             node: an expression, or an argument of a call.
-            called: whether it is within a call, where literals are exact.
+            called: whether `node` is within a call, where literals are exact and get no factor.
         """
         match node:
             case ast.Quantity(span=span, value=value):
@@ -229,7 +232,7 @@ class _UsedNumbers:
         return replace(node, **changed)
 
     def _compare(self, part: ast.Node) -> None:
-        """Record the constants in a condition, an exponent or an index, which are exact."""
+        """Record the constants in `part`, a condition, an exponent or an index; they count as exact."""
         for node in descendants(part):
             if isinstance(node, ast.Name):
                 found = self.names.entries.get(node.name)

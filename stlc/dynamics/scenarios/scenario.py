@@ -32,7 +32,10 @@ _ERRORS = {
 
 
 def standard(name: str) -> ScenarioDecl | None:
-    """Return a standard scenario such as `mismatch-20`; None for any other name."""
+    """Return the standard scenario called `name`, such as `mismatch-20`; None for any other name.
+
+    The number is the size of the errors in percent; it may be omitted.
+    """
     found = _STANDARD.fullmatch(name)
     if found is None:
         return None

@@ -42,13 +42,13 @@ _SORTS_DIFFER = frozenset({"E201", "E202", "E205"})
 
 @dataclass(frozen=True, slots=True)
 class Expressions:
-    """Compiler of the expressions of a section.
+    """Compiler of the expressions in a section of a system file.
 
     Attributes:
         reader: collects the findings.
         scope: table of the names that expressions may use.
         ready: columns that already have a value; None means all. Reading another column is an error.
-        amounts: whether numbers are added to columns, as in a disturbance. 5 degC is then a temperature
+        amounts: True where numbers are added to columns, as in a disturbance. Then 5 degC is a temperature
             difference, otherwise a temperature.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
             nothing.
@@ -63,9 +63,10 @@ class Expressions:
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
-        """Return a compiler that knows more names, and with `samplers` also functions such as `uniform`.
+        """Return a compiler that also knows the names in `entries`.
 
-        `ready` are the columns that already have a value; None means all.
+        With `samplers`, functions such as `uniform` are known too. `ready` are the columns that already have
+        a value; None means all.
         """
         return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 
@@ -106,7 +107,7 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """Read a number and scale it to SI units; None if it is invalid.
+        """Read a number and scale it to SI units; None if it is invalid. `where` names it in messages.
 
         The zero of a temperature scale is not shifted: 20 degC becomes 20, not 293.15.
         """
@@ -116,7 +117,8 @@ class Expressions:
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
         """Read a number or a vector, written as one expression or as a list; return the components.
 
-        The components are converted as `number` does.
+        The components are scaled to SI units. Returns None if one is invalid. `where` names the value in
+        messages.
         """
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
@@ -126,12 +128,12 @@ class Expressions:
         return None if expr is None else self._typed(resolve_numbers, expr)
 
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
-        """Read the state formula in a field; None if it is invalid."""
+        """Read a state formula; return None if it is invalid. `where` names it in messages."""
         expr = self.parse(node, where)
         return None if expr is None else self.formula_of(expr)
 
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
-        """Return the state formula that an expression stands for; None if it is invalid."""
+        """Return the expression as a state formula; None if it is not one, which is reported."""
         return self._typed(resolve_state_formula, expr)
 
     def check(self, expr: ast.Expr) -> None:
@@ -156,10 +158,10 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """Resolve an expression with `resolve`, a function of the compiler, and return the result.
+        """Determine names, types and units of an expression by `resolve`, and return the result.
 
-        Returns None if `resolve` reports an error. Reports S202 and returns None if the result reads a column
-        that has no value yet.
+        Returns None if `resolve` reports an error. A result that reads a column without a value is reported
+        (S202) and also gives None.
         """
         sink: list[Diagnostic] = []
         try:
@@ -183,16 +185,20 @@ class Expressions:
     # --------------------------------------------------------------------- values
 
     def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
-        """Read a number and convert it to `unit`, the unit of the column in which it is stored."""
+        """Read a number and convert it to `unit`, the unit of the column in which it is stored.
+
+        Returns None if it is invalid. `where` names it in messages.
+        """
         number = self.number(node, where)
         if number is None or node is None:
             return None
         return self._in_unit(number, node, where, unit)
 
     def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
-        """Read a vector of length `size`; return its components, converted to `unit`, that of the columns.
+        """Read a vector of length `size`; return its components, converted to `unit`.
 
-        A single number is repeated for all components; a single random number is drawn anew for each.
+        A single number is repeated for all components; a single random number is drawn anew for each. Returns
+        None if the value is invalid. `where` names it in messages.
         """
         numbers = self.numbers(node, where)
         if numbers is None:
@@ -231,7 +237,10 @@ class Expressions:
         return None
 
     def truth(self, node: Node | None, where: str) -> ir.Num | None:
-        """Read a number or a formula as the value of a bool column: 0 or 1."""
+        """Read a number or a formula as the value of a bool column: an expression with the value 0 or 1.
+
+        Returns None if it is invalid. `where` names it in messages.
+        """
         expr = self.parse(node, where)
         match expr:
             case None:
@@ -245,18 +254,27 @@ class Expressions:
                 return self.stored(node, where, Unit())
 
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
-        """Read a constant that is known at compile time and convert it to `unit`, the unit of its column."""
+        """Read a constant known at compile time, and convert it to `unit`, the unit of its column.
+
+        Returns None if it is invalid. `where` names it in messages.
+        """
         value = self.stored(node, where, unit)
         found = None if value is None or node is None else self._constants((value,), node, where)
         return None if found is None else found[0]
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
-        """Read `size` constants known at compile time, converted to `unit`, the unit of their columns."""
+        """Read `size` constants known at compile time, and convert them to `unit`, the unit of their columns.
+
+        Returns None if one is invalid. `where` names them in messages.
+        """
         values = self.stored_each(node, where, unit, size)
         return None if values is None else self._constants(values, node, where)
 
     def _constants(self, values: tuple[ir.Num, ...], node: Node, where: str) -> tuple[float, ...] | None:
-        """Return the values of numbers; report and return None if one is not a constant."""
+        """Return the values of constant expressions; report and return None if one is not constant.
+
+        `where` names them in messages, which are located at `node`.
+        """
         found = tuple(value.value for value in values if isinstance(value, ir.Const))
         if len(found) < len(values):
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
@@ -264,7 +282,10 @@ class Expressions:
         return found
 
     def duration(self, node: Node | None, where: str) -> Fraction | None:
-        """Read an exact duration in seconds; a number without unit is in seconds."""
+        """Read an exact duration in seconds; a number without unit is in seconds.
+
+        Returns None if it is invalid. `where` names it in messages.
+        """
         number = self.number(node, where)
         if number is None or node is None:
             return None
@@ -274,7 +295,10 @@ class Expressions:
         return number.exact
 
     def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
-        """Read a number of steps: `25 steps`, `25`, or a time, which must be a multiple of the time step."""
+        """Read a number of steps: `25 steps`, `25`, or a time that is a multiple of the time step `dt`.
+
+        Returns None if it is invalid. `where` names it in messages.
+        """
         if node is None:
             return None
         expr = self.parse(node, where)

@@ -90,7 +90,7 @@ class Names:
     rewrite: Callable[[ast.Expr], ast.Expr] | None = None
 
     def expressions(self, reader: Reader) -> Expressions:
-        """Return a compiler of expressions that knows all names declared before."""
+        """Return a compiler of expressions that knows all names declared up to now."""
         scope = Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
         return Expressions(reader, scope, rewrite=self.rewrite)
 
@@ -114,7 +114,11 @@ class Names:
             self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
-        """Declare a name; if it is taken or not an identifier, report a finding and return False."""
+        """Declare the name in `key`; `what` describes the thing in messages, such as "parameter".
+
+        Returns True if the name is free and is an identifier. Otherwise a finding is reported, and the result
+        is False.
+        """
         first = self.places.get(key.text)
         if first is not None:
             message, advice = f"`{key.text}` is declared twice", "rename one of the two"
@@ -151,27 +155,36 @@ class Context:
 
     @staticmethod
     def of(reader: Reader, names: Names) -> Context:
-        """Context of a section whose expressions may read all names but draw no random numbers."""
+        """Return the context of a section whose expressions may read all names but draw no random numbers."""
         return Context(reader, names, names.expressions(reader))
 
     @property
     def plain(self) -> Context:
-        """The context reduced to the names that are declared now: without random numbers and local names."""
+        """This context without local names and without random numbers (samplers such as `uniform`).
+
+        All names declared in the system file up to now can be read.
+        """
         return replace(self, here=self.names.expressions(self.reader))
 
     @property
     def timed(self) -> Context:
-        """The context with random numbers, and with `t` as the time since the start of a deployment."""
+        """This context with functions such as `uniform`, which draw random numbers, and with the name `t`.
+
+        `t` is the time since the start of a deployment, in seconds.
+        """
         clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
         return self.drawing({} if "t" in self.names.places else {"t": clock})
 
     def drawing(self, entries: MappingType[str, Entry], ready: frozenset[str] | None = None) -> Context:
-        """Return the context with random numbers, and with the additional names `entries`.
+        """Return this context with functions such as `uniform`, and with the additional names `entries`.
 
-        `ready` are the columns that already have a value; None means all.
+        `ready` are the columns that already have a value, and may be read; None means all.
         """
         return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
 
     def amounts(self) -> Context:
-        """Return the context for numbers that are added to columns: 5 degC is a temperature difference."""
+        """Return this context for reading numbers that are added to columns, as in a disturbance.
+
+        5 degC is then a temperature difference, not a temperature.
+        """
         return replace(self, here=replace(self.here, amounts=True))

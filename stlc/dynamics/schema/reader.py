@@ -58,7 +58,10 @@ class Reader:
     # ------------------------------------------------------------------ collections
 
     def entries(self, node: Node | None, where: str) -> tuple[Entry, ...]:
-        """Read the entries of a mapping with arbitrary keys; empty for a missing or null node."""
+        """Read the entries of a mapping with arbitrary keys; empty for a missing or null node.
+
+        `where` names the mapping in messages.
+        """
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Mapping):
@@ -71,7 +74,8 @@ class Reader:
     ) -> dict[str, Node]:
         """Read a mapping with the keys `known`; return the values by key.
 
-        Unknown keys (S101) and missing keys among `required` (S102) are reported.
+        Unknown keys (S101) and missing keys among `required` (S102) are reported. `where` names the mapping
+        in messages.
         """
         found: dict[str, Node] = {}
         for entry in self.entries(node, where):
@@ -87,7 +91,10 @@ class Reader:
         return found
 
     def unknown(self, key: Scalar, where: str, known: Collection[str], code: str = "S101") -> None:
-        """Report a key that is not in `known`, with the most similar known key as advice."""
+        """Report the key `key`, which is not in `known`; the most similar known key is given as advice.
+
+        `where` names the mapping in the message.
+        """
         near = closest(key.text, known)
         guess = f"did you mean `{near}`?  " if near else ""
         self.report(
@@ -98,7 +105,7 @@ class Reader:
         )
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
-        """Read the items of a sequence; empty for a missing or null node."""
+        """Read the items of a list; empty for a missing or null node. `where` names the list in messages."""
         if node is None or (isinstance(node, Scalar) and node.is_null):
             return ()
         if not isinstance(node, Sequence):
@@ -111,7 +118,7 @@ class Reader:
         return node.items
 
     def _whole(self, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Report and drop entries that are only pieces of an expression; return the others.
+        """Return the entries without those that are only pieces of an expression; the pieces are reported.
 
         In `{x: min(a, b)}` YAML ends the value of `x` at the comma, and reads `b)` as a further key.
         """
@@ -140,21 +147,27 @@ class Reader:
     # ---------------------------------------------------------------------- scalars
 
     def wrong(self, node: Node, where: str, wanted: str, *help_: str) -> None:
-        """Report S103: the value is not `wanted`, a description of the accepted values in words."""
+        """Report S103: the value `where`, at `node`, is not `wanted`.
+
+        `wanted` describes the accepted values, such as "a list".
+        """
         self.report("S103", f"{where} must be {wanted}, this is {_kind(node)}", first_line(node.span), *help_)
 
     def text(self, node: Node | None, where: str) -> str | None:
-        """Read a value as text; it must not be null."""
+        """Read a value as text; it must not be null. `where` names it in messages."""
         found = node.text if isinstance(node, Scalar) and not node.is_null else None
         return self._valid(node, where, "a text", found)
 
     def name(self, node: Node | None, where: str) -> str | None:
-        """Read a text that can be a name: printable and not too long."""
+        """Read a text that can be a name: printable and not too long. `where` names it in messages."""
         text = self.text(node, where)
         return text if isinstance(node, Scalar) and text is not None and self.nameable(node, where) else None
 
     def nameable(self, node: Scalar, where: str) -> bool:
-        """True if a text can be a name: printable and not too long; otherwise reports the reason."""
+        """True if a text can be a name: printable and not too long. Otherwise the reason is reported.
+
+        `where` names the text in messages.
+        """
         hidden = unseen(node.text)
         if not hidden and len(node.text) <= MAX_NAME:
             return True
@@ -164,13 +177,13 @@ class Reader:
         return False
 
     def _valid(self, node: Node | None, where: str, wanted: str, value: V | None) -> V | None:
-        """Return `value`; if it is None, report that the node must be `wanted`."""
+        """Return `value`. If it is None, report that the value `where`, at `node`, is not `wanted`."""
         if node is not None and value is None:
             self.wrong(node, where, wanted)
         return value
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
-        """Read an integer between `low` and `high`."""
+        """Read an integer between `low` and `high`. `where` names it in messages."""
         value = as_int(node) if isinstance(node, Scalar) else None
         above = value is not None and value > high
         bounds = f"between {low} and {high}" if above else f"of at least {low}"
@@ -178,18 +191,18 @@ class Reader:
         return self._valid(node, where, f"a whole number {bounds}", value)
 
     def number(self, node: Node | None, where: str, *, low: float = 0.0) -> float | None:
-        """Read a finite number of at least `low`."""
+        """Read a finite number of at least `low`. `where` names it in messages."""
         value = as_float(node) if isinstance(node, Scalar) else None
         value = value if value is not None and value >= low else None
         return self._valid(node, where, f"a number of at least {low:g}", value)
 
     def flag(self, node: Node | None, where: str) -> bool | None:
-        """Read `true` or `false`."""
+        """Read `true` or `false`. `where` names the value in messages."""
         value = as_bool(node) if isinstance(node, Scalar) else None
         return self._valid(node, where, "`true` or `false`", value)
 
     def option(self, node: Node | None, where: str, options: Collection[str]) -> str | None:
-        """Read a word, which must be one of `options`."""
+        """Read a word, which must be one of `options`. `where` names it in messages."""
         word = self.text(node, where)
         if node is None or word is None or word in options:
             return word

@@ -110,9 +110,10 @@ def keys_of(record: type) -> Mapping[str, Key]:
 def values_of(
     record: type, cx: Context, node: Node | None, of: str, label: str = "`{name}`"
 ) -> dict[str, Any]:
-    """Read and check the values of a mapping; return those that are valid, by field of the record.
+    """Read and check the values of a mapping; return the valid ones, by name of the field of `record`.
 
-    `of` names the mapping in messages, and `label` each value whose key declares no label of its own.
+    `of` names the mapping in messages. `label` is the form of the name of a value in messages; it is used for
+    keys that declare no label of their own.
     """
     keys = keys_of(record)
     found = cx.reader.fields(node, of, tuple(keys), [name for name, each in keys.items() if each.required])
@@ -157,12 +158,16 @@ FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 
 
 def reads(schema: Mapping[str, Any], record: type | None = None) -> Callable[[_Read], Kind]:
-    """Return a decorator that makes a `Kind` from a function that reads a value."""
+    """Return a decorator that makes a `Kind` (a kind of value in a system file) from a reading function.
+
+    `schema` is the JSON Schema of the accepted values. `record` is the dataclass into which a value, or each
+    of its items, is read, if any.
+    """
     return lambda read: Kind(read, schema, record)
 
 
 def integer(low: int = 1, high: int = 10**9) -> Kind:
-    """Kind of an integer between `low` and `high`."""
+    """Return the kind of value that is an integer between `low` and `high`."""
     return Kind(
         lambda cx, node, label: cx.reader.integer(node, label, low=low, high=high),
         {"type": "integer", "minimum": low, "maximum": high},
@@ -170,16 +175,16 @@ def integer(low: int = 1, high: int = 10**9) -> Kind:
 
 
 def number(low: float = 0.0) -> Kind:
-    """Kind of a finite number of at least `low`."""
+    """Return the kind of value that is a finite number of at least `low`."""
     return Kind(
         lambda cx, node, label: cx.reader.number(node, label, low=low), {"type": "number", "minimum": low}
     )
 
 
 def word(options: Iterable[str]) -> Kind:
-    """Kind of a value that is one of a few words.
+    """Return the kind of value that is one of the words in `options`.
 
-    `options` may be the names of a registry, which are looked up at each reading.
+    If `options` are the names of a registry, they are looked up at each reading.
     """
     return Kind(
         lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
@@ -196,7 +201,10 @@ def fraction(cx: Context, node: Node, label: str) -> float | None:
 
 
 def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
-    """Kind of a value that is kept as YAML node, to be read later when more names are known."""
+    """Return the kind of value that is kept as YAML node, to be read later when more names are known.
+
+    `schema` is the JSON Schema of the value, and `record` the dataclass into which it will be read, if any.
+    """
     return Kind(lambda _cx, node, _label: node, schema, record)
 
 
@@ -217,7 +225,10 @@ def items_of(schema: Mapping[str, Any]) -> Json:
 
 
 def list_of(kind: Kind, label: str) -> Kind:
-    """Kind of a list, read as a tuple of its valid items; `label` names an item in messages."""
+    """Return the kind of value that is a list of values of the kind `kind`.
+
+    It is read as a tuple of the valid items; `label` names an item in messages.
+    """
 
     def items(cx: Context, node: Node, where: str) -> tuple[Any, ...]:
         each = [kind.read(cx, item, label) for item in cx.reader.items(node, where)]
@@ -227,15 +238,15 @@ def list_of(kind: Kind, label: str) -> Kind:
 
 
 def part(record: type) -> Kind:
-    """Kind of a mapping that is read into a record."""
+    """Return the kind of value that is a mapping, read into the dataclass `record`."""
     return Kind(lambda cx, node, label: read(record, cx, node, label), json_schema(record), record)
 
 
 def section(record: type, *, free: bool = False) -> Kind:
-    """Kind of a section of the file, kept as YAML node.
+    """Return the kind of value that is a section of the file, kept as YAML node to be read later.
 
-    The section contains one `record`. If `free`, it contains a `record` under each name, and any name is
-    allowed.
+    A section has the keys of the dataclass `record`. If `free`, its keys are arbitrary names, and each value
+    has the keys of `record`.
     """
     schema = json_schema(record)
     return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)

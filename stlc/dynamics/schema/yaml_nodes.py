@@ -305,7 +305,10 @@ class _Builder:
         return node
 
     def mapping(self, start: Any, depth: int) -> Mapping:
-        """Build a mapping up to its end event; entries written in it replace those of merge keys (`<<`)."""
+        """Build a mapping, up to the event that ends it.
+
+        An entry written in the mapping replaces an entry of the same key that a merge key (`<<`) adds.
+        """
         written: dict[str, Entry] = {}
         merged: dict[str, Entry] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):

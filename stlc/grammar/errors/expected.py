@@ -214,10 +214,10 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
 def _missing(
     failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
-    """Return the diagnostic for a missing sign, with the corrected line as help.
+    """Return the diagnostic for the missing sign `sign`, with the corrected line as help.
 
-    In that line `text` replaces the characters from offset `low` to `high`. If `sure`, an editor and
-    `stlc lint --fix` can apply this correction.
+    In the corrected line, `text` replaces the characters from offset `low` to `high`. With `sure`, an editor
+    and `stlc lint --fix` can apply this correction.
     """
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(

@@ -179,7 +179,10 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
 
 
 def _behind_interval(failure: ParseFailure, index: int) -> int:
-    """Return the index of the first lexeme after the operator at `index` and its interval."""
+    """Return the index of the first lexeme after a temporal operator and its interval.
+
+    `index` is the index of the operator. Without an interval, the next lexeme is meant.
+    """
     items = failure.lexemes
     last = len(items) - 1
     behind = min(index + 1, last)

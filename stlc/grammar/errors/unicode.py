@@ -68,7 +68,7 @@ def replacement(char: str) -> Replacement | None:
 
 
 def unexpected_character(lexeme: Lexeme) -> bool:
-    """True if the first character of a lexeme cannot begin a token of the language."""
+    """True if no token of the language begins with the first character of a lexeme."""
     if lexeme.kind == "sign":
         return lexeme.text[0] not in _OF_THE_LANGUAGE
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"

@@ -125,7 +125,10 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """Width of a layout element without a line break, in characters; 0 for a word below comments."""
+    """Width of a layout element in characters, if a line break is printed as a blank or as nothing.
+
+    The width is 0 for a word that has comments above it, because it begins a new line.
+    """
     match doc:
         case Word(text, before, _):
             return 0 if before else len(text)
@@ -251,8 +254,8 @@ def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
 def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[int]]:
     """Yield the indices of adjacent lines that are aligned with each other.
 
-    A tag belongs to the group of the declaration below it. With `by_kind`, all declarations of a group have
-    the same kind.
+    A tag belongs to the group of the declaration below it. With `by_kind`, a group has declarations of one
+    kind only, such as constants.
     """
     group: list[int] = []
     kind = ""

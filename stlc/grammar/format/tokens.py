@@ -174,10 +174,10 @@ def _holds_interval(text: Text, opening: int) -> bool:
 
 
 def level(text: Text, opening: int) -> list[int]:
-    """Return the indices of the tokens directly within a bracket, without those of inner brackets.
+    """Return the indices of the tokens directly within the bracket that begins at the index `opening`.
 
-    An inner bracket is represented by its opening token, and a binder such as `forall i in …:` by its first
-    token.
+    Of an inner bracket only its opening token is included. Of a head such as `forall i in …:` only the first
+    token is included.
     """
     found: list[int] = []
     index = opening + 1
@@ -190,7 +190,7 @@ def level(text: Text, opening: int) -> list[int]:
 def behind(text: Text, index: int) -> int:
     """Return the index of the next token after the one at `index`.
 
-    A bracket counts as one token, and so does a binder with its names, such as `forall i in …:`.
+    A bracket with its content counts as one token, and so does a head such as `forall i in …:`.
     """
     if index in text.roles:
         return text.partner[index] + 1

@@ -44,8 +44,8 @@ class BuildContext:
 
     Attributes:
         source: the whole text.
-        findings: errors found that the grammar cannot exclude (a number too large, an unknown unit).
-        documented: offset up to which all `##` comments already belong to a declaration.
+        findings: errors that the grammar cannot exclude, such as a number too large or an unknown unit.
+        documented: offset in the text. The `##` comments before it already belong to a declaration.
     """
 
     source: Source

@@ -184,8 +184,8 @@ def _inside(token: Token) -> tuple[Comment, ...]:
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
     """Attach a comment that follows a token on its line to this token; return the other comments.
 
-    Only the first of the comments `found` can be such a one. `index` is the index of the token before the
-    comments. If that token is `;`, the comment is attached to the token before the `;`.
+    `found` are the comments after the token, of which only the first can be on its line. `index` is the index
+    of the token. If the token is `;`, the comment is attached to the token before the `;`.
     """
     if not found or found[0].own_line or index < 0:
         return found
@@ -197,9 +197,9 @@ def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) 
 
 
 def _comments(text: str, start: int, end: int, *, first: bool) -> tuple[tuple[Comment, ...], bool]:
-    """Return the comments between two tokens, and whether an empty line follows them.
+    """Return the comments between the offsets `start` and `end`, and whether an empty line follows them.
 
-    `first`: there is no token before them, so that the first comment has its own line.
+    With `first`, no token precedes them; the first comment then stands on its own line.
     """
     found: list[Comment] = []
     offset = start

@@ -43,8 +43,8 @@ class Meanings:
     def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
         """Return (name, description) for each definition that a requirement uses, directly or indirectly.
 
-        A description may be returned again for another requirement, but only until the descriptions returned
-        by all calls exceed `REPEATED` characters in total.
+        A definition that several requirements use is described again for each of them. Once the descriptions
+        returned by all calls exceed `REPEATED` characters in total, only new definitions are described.
         """
         found: dict[str, str] = {}
         queue = deque(self._used(item.formula))

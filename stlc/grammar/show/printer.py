@@ -23,7 +23,7 @@ _PLAIN_DIGITS = 16
 class Level(IntEnum):
     """Precedence levels of expressions, from the connective that binds loosest to names and numbers.
 
-    An operand gets parentheses if its level is below the level that its operator requires there.
+    An operator requires a least level of each operand. An operand below that level gets parentheses.
     """
 
     IFF = 0
