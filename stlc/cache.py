@@ -91,7 +91,10 @@ class Cache:
         _warn(f"`{self.shown / name}` {why}", "it is made anew")
 
     def write(self, name: str, data: bytes) -> bool:
-        """Write a file atomically (temporary file, then rename); return whether that succeeded."""
+        """Write `data` to the file `name`; return False if that fails.
+
+        The file is written atomically: a temporary file is written, then renamed.
+        """
         beside = self.folder / f"{_UNFINISHED}{os.urandom(8).hex()}"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
         try:

@@ -422,7 +422,9 @@ _temporary: dict[str, Cache | None] = {}
 
 
 def _key(text: str, using: str) -> str:
-    """Hash of all inputs of a build (code, compiler, flags, processor), a part of the library's file name.
+    """Hash of all inputs of a build: C code (`text`), compiler (`using`), its flags, and the processor.
+
+    It is a part of the library's file name.
 
     Raises:
         CompilerError: the compiler cannot be used.
@@ -448,7 +450,10 @@ def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
 
 
 def _load(place: Cache, name: str) -> ctypes.CDLL | None:
-    """Load a library; None if the operating system refuses, as for a disk mounted with `noexec`."""
+    """Load the library `name` of the cache.
+
+    None is returned if the operating system refuses, as for a disk mounted with `noexec`.
+    """
     try:
         return ctypes.CDLL(str(place.folder / name))
     except OSError:
@@ -456,7 +461,9 @@ def _load(place: Cache, name: str) -> ctypes.CDLL | None:
 
 
 def _built(text: str, using: str, key: str) -> bytes | None:
-    """Compile C code to a library and return its bytes; None if the disk is full.
+    """Compile the C code `text` to a library and return its bytes; None if the disk is full.
+
+    `using` is the compiler. A failure is remembered under `key`.
 
     Raises:
         CompilerError: the compiler cannot be used, or fails for this code.
@@ -472,9 +479,10 @@ def _built(text: str, using: str, key: str) -> bytes | None:
 
 
 def _compile(using: str, source: Path, target: Path, key: str) -> None:
-    """Compile C code with optimisation, or without if that exceeds the compiler's time or memory limit.
+    """Compile the C file `source` to the library `target` with the compiler `using`.
 
-    A failure is remembered under `key`, so that it is not repeated soon.
+    It is compiled with optimisation, or without if that exceeds the compiler's time or memory limit. A
+    failure is remembered under `key`, so that it is not repeated soon.
 
     Raises:
         CompilerError: the compiler cannot be used, or fails for this code.
@@ -493,7 +501,7 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
 
 
 def _attempted(using: str, source: Path, target: Path, level: str) -> str:
-    """Compile C code with the option `level` (such as `-O3`).
+    """Compile the C file `source` to `target` with the option `level` (such as `-O3`).
 
     Vectorised functions such as sine are used if the system has them.
 

@@ -192,7 +192,7 @@ class RunDir:
     # ------------------------------------------------------------------ rows
 
     def append_row(self, row: Mapping[str, object], name: str = ROWS) -> None:
-        """Append one object to a file of JSON lines, in a single write.
+        """Append `row` to the file of JSON lines `name`, in a single write.
 
         An incomplete last line, left by a kill, is removed first.
         """

@@ -207,7 +207,7 @@ def nearest(value: Fraction | float) -> float:
 
 
 def same_dims(a: Unit, b: Unit) -> bool:
-    """True if quantities of these units can be added and compared, since their dimensions are equal."""
+    """True if the units have the same dimensions, so that their quantities can be added and compared."""
     return a.dims == b.dims
 
 

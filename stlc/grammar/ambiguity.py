@@ -109,10 +109,10 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the temporal operator, if any, with which the left operand of a connective ends.
+    """Yield the temporal operator, if any, at the end of the left operand of the connective `node`.
 
-    In other tools the operand of this temporal operator extends beyond the connective: they parse
-    `always p and q` as `always (p and q)`.
+    It has no parentheses. In other tools its operand extends beyond the connective: they parse `always p and
+    q` as `always (p and q)`.
     """
     part: ast.Node = node.left
     governed: ast.Node | None = None

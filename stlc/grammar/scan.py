@@ -55,9 +55,9 @@ class Bracket:
 
 
 def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """Yield the lexemes (words, numbers, strings, signs) of a part of a text; any text is accepted.
+    """Yield the lexemes (words, numbers, strings, signs) of a text from offset `start` to `end`.
 
-    Blanks and comments are left out.
+    Any text is accepted. Blanks and comments are left out.
     """
     for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
         kind = match.lastgroup
@@ -89,9 +89,9 @@ def declaration_starts(text: str) -> list[int]:
 
 
 def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
-    """True if `word` and the lexeme after it begin a pragma: `spec name`, `system "path"` or `time unit`.
+    """True if `word` and the next lexeme, `behind`, begin a pragma such as `spec name` or `time unit`.
 
-    A pragma stands at the start of a line; no expression contains such a pair of words.
+    A pragma stands at the start of a line. No expression contains these pairs of words.
     """
     if word.text not in PRAGMAS or (word.start and text[word.start - 1] != "\n"):
         return False
@@ -102,7 +102,8 @@ def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
 def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
     """Return all brackets that open in `items`, in order, each with the bracket that closes it.
 
-    An interval is closed by either `)` or `]`, any other bracket by its own kind.
+    The interval of a temporal operator is closed by `)` or `]`. Any other bracket is closed by the
+    counterpart of its opening sign.
     """
     found: list[Bracket] = []
     still_open: list[int] = []
@@ -124,5 +125,8 @@ def opens_interval(before: Lexeme) -> bool:
 
 
 def closes(bracket: Bracket, text: str) -> bool:
-    """True if the sign `text` closes the bracket: its counterpart, or for an interval also `)` or `]`."""
+    """True if the sign `text` closes the bracket: the counterpart of the opening sign.
+
+    The interval of a temporal operator is closed by `)` or `]`, whichever sign opens it.
+    """
     return text == CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

@@ -155,7 +155,10 @@ def lint(
 
 
 def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
-    """Return the findings of the compiler; without a system only names, types and units are checked."""
+    """Return the findings of the compiler in a specification.
+
+    Without a system (`within` is None), only names, types and units are checked.
+    """
     warnings: list[Diagnostic] = []
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)

@@ -86,7 +86,7 @@ def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
 
 
 def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
-    """Line of output about one sub-formula in a tree of causes.
+    """Line of output about one sub-formula, `node`, in the tree of causes of a violation.
 
     It shows the text of the sub-formula, its truth value and instant, the values of its signals, and its
     robustness.

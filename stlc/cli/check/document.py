@@ -215,8 +215,9 @@ def _attribute(text: str) -> str:
 def write_robustness(path: Path, result: Checked, question: Question) -> None:
     """Write the robustness of each requirement to the trace file `path`, one signal per requirement.
 
-    A signal has the shape (traces, samples). Its value at a sample is the robustness of the requirement
-    evaluated there, or NaN if that is not defined.
+    `result` is the judged trace, and `question` the options with which it was judged. A signal has the shape
+    (traces, samples). Its value at a sample is the robustness of the requirement evaluated there, or NaN if
+    that is not defined.
 
     Raises:
         MissingError: R201, the disk is full, or the user may not write there.

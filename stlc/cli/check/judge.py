@@ -101,7 +101,9 @@ def found(name: str, runs: Path) -> Path:
 
 
 def judge(name: str, question: Question, runs: Path) -> Checked:
-    """Load, judge and explain one trace.
+    """Load the trace called `name`, judge it with the options in `question`, and explain its violations.
+
+    The name is searched in the newest run below `runs` if there is no such file.
 
     Raises:
         StlcError: the trace or the specification is invalid, or they do not fit.

@@ -51,6 +51,15 @@ def _outcome(
 ) -> Outcome:
     """Finish the monitoring of a stream and return its outcome.
 
+    Args:
+        online: monitor that has received all samples.
+        name: name of the stream in the outcome.
+        source: text of the specification.
+        dt: time step in seconds.
+        color: whether the text of the outcome has colour codes.
+        remarks: messages for the user, copied to the outcome.
+        begun: time at which the monitoring began, in seconds.
+
     Raises:
         TraceError: E306, the trace is too short and `--end strict` was given; E605, there is no sample.
     """
@@ -241,7 +250,7 @@ def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online)
 
 
 def _tell(decision: Decision, online: Online) -> None:
-    """Print a decided verdict.
+    """Print the verdict `decision`, which the monitor `online` has just reached.
 
     For a requirement that is judged at many instants only violations are printed.
     """
@@ -261,7 +270,7 @@ CHUNK = 250_000
 
 
 def outcome_in_chunks(path: Path, work: Work) -> Outcome:
-    """Judge a file that is read in chunks of samples.
+    """Judge the file `path`, which is read in chunks of samples, with the options in `work`.
 
     Raises:
         UsageError: U101, an option needs the whole trace at once.
@@ -290,7 +299,10 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
 
 
 def _require_pieces(path: Path, work: Work) -> None:
-    """Raise UsageError (U101) if an option was given that needs all samples at once, such as `--resample`."""
+    """Raise UsageError (U101) if the options in `work` need all samples of the file `path` together.
+
+    An example is `--resample`.
+    """
     question = work.question
     whole = {
         "--resample": question.resample is not None,

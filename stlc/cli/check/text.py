@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 
 def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> str:
-    """Text that `stlc check` prints for one trace."""
+    """Text that `stlc check` prints for one judged trace: table, reasons of violations, and verdict.
+
+    `rows` are the rows of the table, one per requirement.
+    """
     trace, verdict = result.trace, result.verdict
     title = (
         f"{visible(result.source.name)} on {visible(trace.name)}    "

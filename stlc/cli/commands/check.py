@@ -142,7 +142,10 @@ def _print(outcomes: Sequence[Outcome]) -> None:
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
-    """Split the arguments into the specification (the option, or the first file if it is one) and traces."""
+    """Split the arguments `files` into a specification and traces; return (specification or None, traces).
+
+    The specification is the first file if it is one, else `spec`, the value of `--spec`.
+    """
     specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
     traces = [name for name in files if name not in specs]
     if len(specs) > 1 or (specs and spec is not None):

@@ -65,7 +65,11 @@ def compile_(
 def _trees(
     names: Sequence[str], show: Literal["ast", "dot"]
 ) -> Answer[documents.ParsedFile | documents.ParsedFiles]:
-    """Return the syntax trees of specifications; the syntax errors of all files are raised together."""
+    """Return the syntax trees of the specification files `names`, as the outcome of `stlc compile`.
+
+    The text printed is a tree, or with `show` "dot" a graph for Graphviz. The syntax errors of all files are
+    raised together.
+    """
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
@@ -108,9 +112,10 @@ def _compiled(
     set_: list[str] | None,
     show: Literal["all", "steps", "states", "ir"],
 ) -> Answer[documents.CompiledSpec]:
-    """Read the specification and the system file, and compile the specification, without importing torch.
+    """Compile the specification `path` for a system, without importing torch; print the part `show`.
 
-    A specification that is written to judge closed-loop runs of its system is compiled for recorded traces.
+    `system` is the system file of `--system`, and `set_` are the values of `--set`. If the system judges
+    closed-loop runs by this specification, it is compiled for recorded traces.
     """
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
@@ -191,9 +196,9 @@ def _requirement(rule: CompiledRequirement, dt: float) -> documents.RequirementI
 
 
 def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[documents.WrittenInterval]:
-    """Intervals of the temporal operators in a compiled formula, in seconds and in steps.
+    """Return the intervals of the temporal operators in `rule`, a requirement, in seconds and in steps.
 
-    An upper end of None is the end of the trace.
+    An upper end of None is the end of the trace. `dt` is the time step in seconds.
     """
     from stlc.compile.ir import nodes as ir
     from stlc.compile.ir.traverse import nodes

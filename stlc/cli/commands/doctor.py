@@ -40,7 +40,7 @@ def doctor(
 
 
 def _finding(name: str, state: Literal["ok", "missing", "off"], detail: str) -> InstallationFinding:
-    """One line of the report on the installation.
+    """Return one line of the report on the installation: the item `name`, its state, and details in words.
 
     The state "off" means that the item is missing, but only some commands need it.
     """

@@ -219,7 +219,8 @@ def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[doc
     """Compute lower bounds on the probability that the backup policy of a run finds a plan that works.
 
     There is one bound for each prefix length of its grid search and each assumed size of the set of plans
-    that work. The record that is returned also states the assumptions behind the bounds.
+    that work. The record that is returned also states the assumptions behind the bounds. `runs` is the folder
+    of all runs, and `overrides` gives new values of constants.
     """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances

@@ -187,9 +187,9 @@ def _template(name: str) -> str:
 
 
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
-    """Path and text of a new specification, which declares a signal for each state of a system.
+    """Path and text of a new specification in `folder`, which declares a signal for each state of a system.
 
-    Without a system (`from_` is None) it declares an example signal.
+    The system is the one called `from_`. Without it (None), the specification declares an example signal.
 
     Returns:
         Path -> text, and the command to run next.

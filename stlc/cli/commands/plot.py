@@ -141,9 +141,10 @@ def _one(trace: Trace, wanted: int | None) -> Trace:
 
 
 def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
-    """Picture of the paths over the regions of the requirements, such as `dock` in `[x, y] in dock`.
+    """Picture of paths over the regions of the requirements, such as `dock` in `[x, y] in dock`.
 
-    Raises UsageError (U101) if the requirements name no region.
+    `wanted` are the names of the requirements; all if it is empty. Raises UsageError (U101) if the
+    requirements name no region.
     """
     from stlc.view.region_map import draw_map, map_of
 

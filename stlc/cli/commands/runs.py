@@ -160,7 +160,10 @@ def _accuracy(record: Mapping[str, Any]) -> float | None:
 
 
 def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ...]:
-    """Texts of a run's row in the table of `stlc runs list`."""
+    """Texts of a run's row in the table of `stlc runs list`.
+
+    `record` is the content of `run.json`, and `status` the status of the run.
+    """
     accuracy, result = _accuracy(record), record.get("result")
     seconds = result.get("seconds") if isinstance(result, Mapping) else None
     return (

@@ -183,7 +183,7 @@ def simulate(
 def _planner(
     method: str | None, option: list[str] | None, budget: str | None, system: str | None
 ) -> PlannerChoice | None:
-    """Planner that `--method` selects; None without that option.
+    """Planner that `--method` selects, with the values of `--option` and `--budget`; None without `--method`.
 
     Raises:
         UsageError: U101, an option of planners is given without `--method`, or its value is invalid.
@@ -199,9 +199,10 @@ def _planner(
 def _run_of(
     run: str, choice: PlannerChoice | None, system: str | None, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """Return the name of the run to simulate: `run` itself, or with a planner the folder of a new run.
+    """Return the name of the run to simulate.
 
-    With a planner, `run` is the specification, and the folder is created.
+    Without a planner (`choice` is None) it is `run` itself. With a planner, `run` is a specification; a
+    folder for it is created below `runs`, and its name is returned.
     """
     if choice is None:
         return run

@@ -110,7 +110,7 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 
 
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
-    """Simulate random initial states under random controls; return the warnings.
+    """Simulate random initial states under random controls for `steps` steps; return the warnings.
 
     Raises SystemFileError if no initial states can be sampled, or if a simulated state is not finite.
     """

@@ -182,9 +182,10 @@ def train(
 
 
 def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object]) -> None:
-    """Raise UsageError (U101) for options that exclude each other or do not apply.
+    """Raise UsageError (U101) if options of `stlc train` exclude each other or do not apply.
 
-    Some do not apply to a single run, some not to several specifications, and some not to a cluster.
+    Some options do not apply to a single run, some not to several specifications, and some not to a cluster.
+    `given` maps the name of an option to its value, or to None if it is not given.
     """
     for one, other in (("--budget", "--steps"), ("--seed", "--seeds")):
         if given[one] is not None and given[other] is not None:
@@ -242,7 +243,10 @@ def _rate(value: float) -> float:
 
 
 def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
-    """Read and compile the specification, and print which system file is used."""
+    """Read and compile the specification for its system, and print which system file is used.
+
+    `overrides` gives new values of constants and of fields of the system file.
+    """
     from stlc.controller.problem.load import load_task
     from stlc.dynamics.model.feedback import unstable
 
@@ -261,7 +265,10 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
 
 def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | None) -> Session:
-    """Train in a new run folder."""
+    """Train the policy for `task` with the options `config`, in a new run folder.
+
+    `launch` gives the place and the name of the run folder; `logger` opens an additional logger, if any.
+    """
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder

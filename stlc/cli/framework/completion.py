@@ -16,9 +16,9 @@ _COMMENT = re.compile(r"(#|//).*")
 
 
 def run_names(context: typer.Context, incomplete: str) -> list[str]:
-    """Names that the shell proposes for a run below `--runs`.
+    """Names that the shell proposes for a run below `--runs`; they begin with the text `incomplete`.
 
-    They are `latest`, the names of all runs (newest first), and the names of their specifications.
+    Proposed are `latest`, the names of all runs (newest first), and the names of their specifications.
     """
     from stlc.rundir import LATEST, every_run
 
@@ -29,9 +29,10 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
-    """Names of requirements, for completion: those of the first specification found on the command line.
+    """Names of requirements that the shell proposes; they begin with the text `incomplete`.
 
-    If only a trace is given, the specification stored in it is used.
+    They are those of the first specification found on the command line. If only a trace is given, the
+    specification stored in it is used.
     """
     names: dict[str, None] = {}
     for path in _named(context):

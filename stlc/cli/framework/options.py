@@ -81,7 +81,10 @@ PlannerOptionsOption = Annotated[
 
 
 def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> PlannerChoice:
-    """Planner named by `--method`, with the values of `--option` and `--budget`. Raises UsageError (U101)."""
+    """Return the planner called `name` (`--method`), with the values of `--option` and `--budget`.
+
+    `pairs` are the values `NAME=VALUE` of `--option`. Raises UsageError (U101).
+    """
     from stlc.controller.training.config import PlannerChoice
 
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")

@@ -102,7 +102,10 @@ class Answer(Generic[R]):
     diagnostics: Iterable[Diagnostic] = ()
 
     def print(self, schema: str, *, as_json: bool) -> int:
-        """Print the outcome and return the exit code."""
+        """Print the outcome as text or, if `as_json`, as a JSON document; return the exit code.
+
+        `schema` names the JSON Schema of the document, such as "check/1".
+        """
         if as_json:
             ok, findings = self.code == 0, self.diagnostics
             emit_json(schema, ok=ok, exit_code=self.code, diagnostics=findings, result=self.result)
@@ -179,7 +182,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
     """Lay out rows of cells as a text table with two blanks between columns.
 
-    Numbers, and margins with a unit, are right-aligned.
+    Each line begins with `indent`. Numbers, and values with a sign and a unit, are right-aligned.
     """
     lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
     if not lines:
@@ -206,8 +209,8 @@ def _cell(text: str, width: int) -> str:
 class Pulse:
     """Progress message of a command that prints nothing for a while: current activity and elapsed time.
 
-    On a terminal, it is a line that appears after `IN_TERMINAL` seconds without output and is removed before
-    the next output; elsewhere, a new line is written every `IN_LOG` seconds.
+    On a terminal, the message is a line that appears after `IN_TERMINAL` seconds without output and is
+    removed before the next output. Elsewhere, a new line is written every `IN_LOG` seconds.
     """
 
     IN_TERMINAL, IN_LOG = 1.5, 28.0
@@ -222,7 +225,7 @@ class Pulse:
     def beating(self) -> Iterator[None]:
         """Context in which the progress message is shown.
 
-        It has no effect with `--quiet`, or inside another such context.
+        With `--quiet`, or inside another context of this kind, it has no effect.
         """
         stream = sys.stderr
         if self._doing or QUIET.get() or stream is None:

@@ -379,7 +379,7 @@ class _AsGiven:
     """
 
     def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
-        """Return the value of a parameter, converted to its annotated type."""
+        """Return `value` converted to the annotated type of the parameter `param`."""
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None

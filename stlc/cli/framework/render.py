@@ -111,9 +111,10 @@ def _marks(diagnostic: Diagnostic) -> list[_Mark]:
 
 
 def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
-    """Yield the lines of the source excerpts, one excerpt per file; that of the primary mark comes first.
+    """Yield the lines of the source excerpts, one excerpt per file.
 
-    `width` is the number of digits of the greatest line number.
+    The excerpt of the finding's own place comes first. `width` is the number of digits of the greatest line
+    number.
     """
     margin = " " * width
     for index, source in enumerate(dict.fromkeys(mark.span.source for mark in marks)):

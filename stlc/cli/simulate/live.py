@@ -220,7 +220,10 @@ class LiveView:
 
 
 def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
-    """Text table with as many columns as fit into `width` characters; `…` stands for omitted columns."""
+    """Text table of `cells` and `header` with as many columns as fit into `width` characters.
+
+    If columns are left out, `…` stands for them.
+    """
     for count in range(len(header), len(FIRST), -1):
         more = ["…"] if count < len(header) else []
         text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])

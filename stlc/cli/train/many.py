@@ -68,7 +68,10 @@ class Many:
         return [Part(spec, seed) for spec in self.specs for seed in self.seeds]
 
     def name(self, part: Part) -> str:
-        """Name of a run in messages: specification, seed, or both, whichever tells it from the other runs."""
+        """Name of a run in messages: its specification, its seed, or both.
+
+        Only the parts are named that tell it from the other runs.
+        """
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
@@ -154,7 +157,7 @@ def _line(ended: JobResult) -> str:
 
 
 def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
-    """Text table with a row for every run, and for each specification a row with the mean of its runs."""
+    """Text table of trained runs, one row per run; each specification has a row with the mean of its runs."""
     rows: list[tuple[str, ...]] = []
     for spec, group in groupby(records, key=lambda record: record["spec"]):
         own = list(group)

@@ -176,7 +176,10 @@ def read_definitions(node: Node | None, cx: Context) -> None:
 
 
 def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
-    """Read the section `state`, declare its columns as names, and return the keys of every state."""
+    """Read the section `state`: return the keys of every state, by name.
+
+    The columns of the states (one per scalar or vector component) are declared as names.
+    """
     reader, names = cx.reader, cx.names
     if node is None:
         reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
@@ -211,7 +214,10 @@ def name_columns(names: Names, about: str) -> None:
 
 
 def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) -> tuple[Column, ...]:
-    """Return the columns of one state or parameter, made from its keys."""
+    """Return the columns of the state or parameter `name`, made from its keys.
+
+    `where` names it in messages.
+    """
     called = component_names(name, keys.size)
     if keys.enum is not None:
         labels = _members(keys.enum, where, cx.reader)
@@ -229,7 +235,10 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
 
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
-    """Return (name, value) of each member of an enum, written `{stop: 0, light: 1}` or `[stop, light]`."""
+    """Return (name, value) of each member of an enum, written `{stop: 0, light: 1}` or `[stop, light]`.
+
+    `where` names the enum in messages.
+    """
     members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
         words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
@@ -246,9 +255,10 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
 
 
 def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
-    """Return (low, high) of every component, in its unit, read from `range: [low, high]`.
+    """Return (low, high) from `range: [low, high]`, in the unit of the state, parameter or control.
 
     Each of `low` and `high` is one number for all components, or a vector with one entry per component.
+    `where` names the declaration in messages.
     """
     node, reader, here = keys.ends, cx.reader, cx.here
     if node is None:

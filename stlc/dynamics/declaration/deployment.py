@@ -86,9 +86,9 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """Read the section `backup` of a file or of a scenario.
+    """Read the section `backup` of a file or of a scenario; `label` names it in messages.
 
-    Prefix lengths beyond the horizon are reported (S103) and dropped.
+    A prefix length is a number of steps. Lengths beyond the horizon are reported (S103) and dropped.
     """
     backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
@@ -107,7 +107,8 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
     """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` of a state formula.
 
-    Returns the fields `when` and `edge` of `EventDecl`; None if the text cannot be parsed.
+    Returns the fields `when` and `edge` of `EventDecl`; None if the text cannot be parsed. `label` names the
+    condition in messages.
     """
     expr = cx.here.parse(node, label)
     match expr:
@@ -121,7 +122,10 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 
 @reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """Read an instant of the deployment, as a time or in steps, and return it in steps; 0 is the start."""
+    """Read an instant of the deployment, given as a time or in steps; return it in steps from the start.
+
+    Returns None if it is invalid. `label` names it in messages.
+    """
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 
@@ -142,7 +146,10 @@ class EventDecl:
 
 @reads(items_of(json_schema(EventDecl)), EventDecl)
 def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
-    """Read a list of events; each has exactly one of the keys `when`, `at` and `every`."""
+    """Read a list of events, and return the valid ones; `label` names the list in messages.
+
+    Each event has exactly one of the keys `when`, `at` and `every`.
+    """
     found = []
     for index, item in enumerate(cx.reader.items(node, label)):
         event = read(EventDecl, cx, item, "an event")
@@ -268,7 +275,10 @@ class ErrorsDecl:
 
 @reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
-    """Read new values of constants: name of a constant -> text of its new value."""
+    """Read new values of constants: name of a constant -> text of its new value.
+
+    `label` names the mapping in messages.
+    """
     found: dict[str, str] = {}
     for entry in cx.reader.entries(node, label):
         name = entry.key.text

@@ -130,7 +130,8 @@ def _python(entry: Entry, keys: FunctionKeys, where: str, cx: Context) -> Functi
 def _kinematics(entry: Entry, keys: FunctionKeys, cx: Context) -> FunctionDecl | None:
     """Read the forward kinematics of one link from a URDF file.
 
-    Reports S208 and returns None if the file is unusable or no joint moves the link.
+    `entry` is the entry of the function, and `keys` are its values. Reports S208 and returns None if the file
+    is unusable or no joint moves the link.
     """
     file, tip, place = keys.file or "", keys.tip or "", entry.place("file")
     path = Path(place.source.name).parent / file

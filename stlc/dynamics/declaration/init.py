@@ -258,7 +258,10 @@ class _Draws:
         self.failed = len(reader.findings) > before
 
     def _draw(self, entry: Entry, where: str) -> None:
-        """Add the assignments that draw the initial value of one state."""
+        """Append the assignments that draw the initial value of one state (`entry`).
+
+        `where` names the section in messages.
+        """
         columns = states_of(entry, where, self.cx)
         if not columns:
             return
@@ -345,7 +348,7 @@ def _grid(node: Node, cx: Context) -> GridDecl:
 def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
     """Return the values of a column along its axis of the grid, in the unit of the column.
 
-    An invalid value is reported and becomes 0.
+    `entry` gives them as a list or as evenly spaced values. An invalid value is reported and becomes 0.
     """
     where = f"the values of `{column.name}`"
     if isinstance(entry.value, Mapping):
@@ -364,7 +367,10 @@ def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
 
 
 def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[float, ...]:
-    """Read `{from: 0, to: 1, count: 5}`: evenly spaced, including both ends."""
+    """Read `{from: 0, to: 1, count: 5}`: evenly spaced values of a column, including both ends.
+
+    If a key is missing or invalid, the only value is 0. `where` names the axis in messages.
+    """
     keys = read(AxisKeys, cx, node, where)
     low = cx.here.constant(keys.from_, f"`from` of {where}", column.unit)
     high = cx.here.constant(keys.to, f"`to` of {where}", column.unit)

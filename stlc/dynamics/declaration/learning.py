@@ -54,7 +54,10 @@ OUTCOME = {
 
 @reads(EXPRESSION)
 def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
-    """Read a number and convert it to SI units; a temperature in degC becomes kelvin, offset included."""
+    """Read a number and convert it to SI units; a temperature in degC becomes kelvin, offset included.
+
+    Returns None if the number is invalid. `label` names it in messages.
+    """
     value = cx.here.number(node, label)
     return None if value is None else absolute(value).num
 
@@ -80,7 +83,7 @@ class Term:
 
 @reads(items_of(json_schema(Term)), Term)
 def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
-    """Read the performance terms of the objective.
+    """Read the performance terms of the objective; `label` names the list in messages.
 
     A term may read the outcome of a plan (`sat`: satisfied, `rho`: robustness), the step `k`, the time `t` in
     seconds, and `x_start`, the value at the start of the plan, for each state `x`.
@@ -202,7 +205,7 @@ class FeedbackDecl:
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """Read the entry `feedback`: the word `lqr`, or a mapping of its settings.
 
-    Returns the fields `feedback` and `feedback_span` of `PolicyDecl`.
+    Returns the fields `feedback` and `feedback_span` of `PolicyDecl`. `label` names the entry in messages.
     """
     request = None
     if not isinstance(node, Scalar):

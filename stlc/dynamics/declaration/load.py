@@ -131,7 +131,10 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
 
 
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """Parse the text of a system file; relative paths in it start from the folder of `path`."""
+    """Parse the text of a system file; relative paths in it start from the folder of `path`.
+
+    `overrides` gives new values of fields, by dotted key such as `train.lr`, and of constants and parameters.
+    """
     reader = Reader(source)
     found, bases = _sections(source, overrides or {}, reader)
     version = reader.integer(found.stlc, "`stlc`")
@@ -174,7 +177,10 @@ def _sections(
 def _declaration(
     found: SystemKeys, reader: Reader, path: Path, overrides: MappingType[str, str]
 ) -> SystemDecl:
-    """Read all sections, those that declare names first, and return the declaration."""
+    """Return the declaration of a system, read from its sections (`found`).
+
+    Sections that declare names are read first.
+    """
     named = _named(found, reader)
     names, cx = named.cx.names, named.cx
     timer_flow, timer_jumps = read_timers(named.states, cx)
@@ -218,7 +224,7 @@ def _declaration(
 def _report_idle(
     node: Node | None, cx: Context, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
 ) -> None:
-    """Report W603 for controls that neither `flow` nor a jump reads."""
+    """Report W603 for controls that neither `flow` nor a jump reads; `node` is the section `control`."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
     used = {name for num in (*moved, *(jump.guard for jump in jumps)) for name in names_in(num)}
     known = {entry.key.text: entry.key.span for entry in cx.reader.entries(node, "`control`")}

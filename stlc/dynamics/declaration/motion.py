@@ -54,7 +54,10 @@ class Assign:
 
 
 def read_sets(cx: Context, node: Node | None, label: str) -> tuple[Assign, ...]:
-    """Read new values of states, as in `set` of an event, in order."""
+    """Read new values of states, as in the entry `set` of an event; return the assignments in order.
+
+    `label` names the mapping in messages.
+    """
     found: list[Assign] = []
     for entry in cx.reader.entries(node, label):
         found.extend(shared_draws(state_assigns(entry, label, cx)))
@@ -66,7 +69,10 @@ SETS = Kind(read_sets, mapping_of(VECTOR))
 
 
 def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
-    """Read the value of a state; return one assignment, or one per component of a vector."""
+    """Read the value of a state; return one assignment, or one per component of a vector.
+
+    The key of `entry` is the name of the state. `where` names the mapping in messages.
+    """
     columns = states_of(entry, where, cx)
     if not columns:
         return ()
@@ -89,7 +95,10 @@ def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
 def components(
     columns: tuple[Column, ...], node: Node, where: str, unit: Unit, cx: Context
 ) -> tuple[Assign, ...]:
-    """Read the value of a vector; return one assignment per component."""
+    """Read the value of a vector in `unit`; return one assignment for each of `columns`, its components.
+
+    The tuple is empty if the value is invalid. `where` names the vector in messages.
+    """
     values = cx.here.stored_each(node, where, unit, len(columns))
     if values is None:
         return ()
@@ -100,7 +109,10 @@ def components(
 
 
 def component_texts(node: Node, size: int) -> tuple[str, ...]:
-    """Return the source text of each component of a vector."""
+    """Return the source text of each of the `size` components of a vector.
+
+    For a vector in one expression, the texts are `(a + b)[0]`, `(a + b)[1]`, ….
+    """
     if isinstance(node, ListNode):
         return tuple(written(item) for item in node.items)
     text = written(node)
@@ -124,7 +136,10 @@ def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
 
 
 def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
-    """Return the columns of the state that a key names; report S202 if there is no such state."""
+    """Return the columns of the state that the key of `entry` names; report S202 if there is no such state.
+
+    `where` names the mapping in the message.
+    """
     name = entry.key.text
     columns = cx.names.group(name)
     if columns:

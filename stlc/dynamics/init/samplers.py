@@ -296,7 +296,7 @@ class InitialStates:
         )
 
     def _finding(self, code: str, message: str, label: str, note: tuple[str, ...] = ()) -> Diagnostic:
-        """Make a diagnostic located at the conditions of `where`."""
+        """Make a diagnostic located at the conditions of `where`, with the given code, message and label."""
         advice = "draw the states closer to what `where` asks for"
         return Diagnostic(code, message, self.decl.span, label, help=(advice,), note=note)
 

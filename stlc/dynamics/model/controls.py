@@ -53,7 +53,7 @@ def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
 def _affine(
     controls: tuple[ControlDecl, ...], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Midpoints and half-widths of the ranges, (m,) each."""
+    """Return the midpoints and the half-widths of the ranges of all controls, (m,) each."""
     low = torch.tensor([control.low for control in controls], dtype=torch.float64)
     high = torch.tensor([control.high for control in controls], dtype=torch.float64)
     return ((low + high) / 2).to(device, dtype), ((high - low) / 2).to(device, dtype)

@@ -75,9 +75,10 @@ class Linear:
 
 
 def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
-    """Return the declaration with the requested inner feedback; its controls become deviations.
+    """Return the declaration with the inner feedback that `request` describes.
 
-    Raises NoFeedbackError: an unstable mode is uncontrollable, or a control is an `angle`.
+    Its controls then are deviations from the commands of the feedback. Raises NoFeedbackError: an unstable
+    mode is uncontrollable, or a control is an `angle`.
     """
     turning = [control.name for control in decl.controls if control.squash == "angle"]
     if turning:
@@ -203,11 +204,11 @@ def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
 
 
 def _lqr(decl: SystemDecl, weights: Mapping[str, float], state: Doubles, control: Doubles) -> Doubles:
-    """Gain of the linear-quadratic regulator, (m, n), in the units of the columns.
+    """Gain of the linear-quadratic regulator at the operating point (`state`, `control`), (m, n).
 
-    The cost is the weighted sum of squares of deviations, each divided by half its range. A state that the
-    dynamics do not depend on (a position in an open field) has no cost unless `weights` names it, so that
-    plans can move it freely.
+    The gain is in the units of the columns. The cost is the weighted sum of squares of deviations, each
+    divided by half its range. A state that the dynamics do not depend on (a position in an open field) has no
+    cost unless `weights` names it, so that plans can move it freely.
     """
     linear = linearised(decl, state, control)
     held, names = _held(linear), decl.signature.names

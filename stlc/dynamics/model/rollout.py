@@ -44,7 +44,7 @@ class _Columns:
         }
 
     def enter(self, name: str, column: Tensor) -> None:
-        """Store the samples (T+1, B) of a state."""
+        """Store the samples (T+1, B) of the state `name`."""
         self.states[name] = column
         self.now[name] = column[:-1]
 
@@ -160,7 +160,10 @@ class Stepper:
         self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
-        """Return the states (B,) one step later, by name; a state that does not move keeps its tensor."""
+        """Return the states (B,) one step later, by name; a state that does not move keeps its tensor.
+
+        `switch` selects exact jumps or their smooth blends.
+        """
         env = {**state, **controls}
         for block in self.once:
             env.update(block(env, TORCH, switch))
@@ -173,7 +176,8 @@ class Stepper:
     def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
         """Roll out from states (B,) under controls (T, B), where T is `steps`; return state -> (T+1, B).
 
-        States that do not move are expanded views.
+        The tensors of states that do not move are expanded views. `switch` selects exact jumps or their
+        smooth blends.
         """
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}

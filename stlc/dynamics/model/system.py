@@ -147,9 +147,9 @@ class System:
     # -------------------------------------------------------------------- motion
 
     def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """Make one step from states (B, n) under planned controls (B, m); return the next states (B, n).
+        """Make one step from states `x` (B, n) under planned controls `u` (B, m).
 
-        `switch` selects exact jumps or their smooth blends.
+        Returns the next states (B, n). `switch` selects exact jumps or their smooth blends.
         """
         before = self._named(x)
         moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
@@ -213,14 +213,18 @@ class System:
         return ArrayProgram(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
-        """Roll out from states (B, n) under plans (B, T, m); return (B, T+1, n), initial state first."""
+        """Roll out from states `x0` (B, n) under plans `u` (B, T, m); return the states (B, T+1, n).
+
+        The initial state comes first. `switch` selects exact jumps or their smooth blends.
+        """
         columns = self.rollout_columns(x0, u, switch)
         return torch.stack([columns[name].t() for name in self.names], 2)
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
-        """Roll out from states (B, n) under plans (B, T, m); return state -> values over time, (T+1, B).
+        """Roll out from states `x0` (B, n) under plans `u` (B, T, m); return state -> values (T+1, B).
 
-        The tensor of a constant state is an expanded view.
+        The tensor of a constant state is an expanded view. `switch` selects exact jumps or their smooth
+        blends.
         """
         if (
             x0.shape[1:] != (len(self.names),)
@@ -399,7 +403,10 @@ class System:
         rho: Tensor,
         switch: Switch,
     ) -> Tensor:
-        """Mean over time of the output `cost` of a program, (B,); 0 without a program."""
+        """Mean over time of a sum of performance terms (`program`), (B,); 0 if `program` is None.
+
+        The terms read the states over time in `columns`, and the outcome `sat` and `rho`.
+        """
         if program is None:
             return torch.zeros_like(sat)
         like = next(iter(columns.values()))
@@ -417,7 +424,7 @@ class System:
 
     @cached_property
     def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
-        """Compiled programs of the two sums of `objective`; None where a sum is None."""
+        """Compiled programs of the two sums that `objective` returns; None in place of a sum that is None."""
         states, controlled = (
             None if total is None else ArrayProgram({"cost": total}) for total in self.objective
         )

@@ -90,7 +90,10 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 
 
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
-    """Positions in metres, computed by evaluating the IR expressions: (n, joints) -> (n, 3)."""
+    """Positions of a link in metres, (n, 3), at the joint positions `q`, (n, joints).
+
+    They are computed from `body`, the IR expressions of the kinematics.
+    """
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
     program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)

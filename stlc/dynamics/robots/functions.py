@@ -140,7 +140,11 @@ class Bound:
         return [found] if self.result is None else [found[..., i] for i in range(self.result)]
 
     def _checked(self, values: Sequence[Array], batch: tuple[int, ...]) -> Array:
-        """Return the result as one array of the declared shape, or raise SystemFileError (S208)."""
+        """Call the function on `values`; return the result as one array of the declared shape.
+
+        `batch` is the shape of a number. Raises SystemFileError (S208) if the call fails or the shape is
+        wrong.
+        """
         try:
             found = self.call(*values)
             shape = tuple(found.shape)

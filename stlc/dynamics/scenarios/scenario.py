@@ -66,15 +66,15 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the constants that a scenario changes: name -> text of the new value.
+    """Return the constants that the scenario `name` of the system file `path` changes: name -> new value.
 
-    They change in the specification as well as in the system.
+    The new value is a text. The constants change in the specification as well as in the system.
     """
     return find_scenario(load_system_decl(path, overrides), name).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:
-    """Return the declaration with a scenario applied.
+    """Return the declaration with the scenario called `name` applied.
 
     Of the scenario, only the constants (`const`) change the model with which controls are planned. Its model
     mismatch changes only the true system (`truth`).

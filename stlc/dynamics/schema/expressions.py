@@ -215,10 +215,10 @@ class Expressions:
         return kept if len(kept) == size else None
 
     def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
-        """Convert a number to `unit`, the unit of its column.
+        """Convert a number to `unit`, the unit of the column in which it is stored.
 
         Reports and returns None if the dimensions differ (E203), or if a temperature is mixed up with a
-        temperature difference.
+        temperature difference. `where` names the number in messages.
         """
         if self._fits(number, unit):
             place = first_line(node.span)

@@ -38,7 +38,11 @@ class Reader:
         label: str = "",
         labels: tuple[Label, ...] = (),
     ) -> None:
-        """Record a finding: an error or a warning at `span`, with lines of advice `help_`."""
+        """Record a finding (error or warning) with the given code and message.
+
+        `span` is its source location and `label` the text beside it; `labels` are further locations. `help_`
+        are lines of advice.
+        """
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:

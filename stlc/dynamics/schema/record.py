@@ -86,9 +86,11 @@ def key(
     spread: bool = False,
     shown: bool = True,
 ) -> Any:
-    """Make a dataclass field whose value is read from the key `name` (by default the name of the field).
+    """Make a field of a dataclass whose value is read from a key of a mapping in a system file.
 
-    With `shown=False` the field is left out of comparison and `repr`, for values that only the reader uses.
+    The key is called `name`, by default as the field. `kind` is the kind of its values, and `about` their
+    meaning for the documentation; see `Key` for the others. With `shown=False` the field is left out of
+    comparison and `repr`, for values that only the reader uses.
     """
     described = Key("", name, kind, about, label, required, spread)
     options: Json = {"default_factory": dict} if isinstance(default, dict) else {"default": default}
@@ -130,9 +132,10 @@ def values_of(
 
 
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
-    """Read a mapping into a record. A missing or invalid value is replaced by its default.
+    """Read a mapping into an object of the dataclass `record`.
 
-    Invalid values are reported.
+    A missing value is replaced by its default. So is an invalid one, which is reported. `of` names the
+    mapping in messages, and `label` is the form of the name of a value.
     """
     return record(**values_of(record, cx, node, of, label))
 
@@ -193,7 +196,7 @@ def word(options: Iterable[str]) -> Kind:
 
 @reads(EXPRESSION)
 def fraction(cx: Context, node: Node, label: str) -> float | None:
-    """Read a fraction: a number between 0 and 1, or a percentage."""
+    """Read a fraction: a number between 0 and 1, or a percentage. `label` names it in messages."""
     share = cx.here.constant(node, label, DIMENSIONLESS)
     if share is not None and not 0.0 <= share <= 1.0:
         cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
@@ -257,7 +260,8 @@ def by_name(
 ) -> dict[str, V]:
     """Read a mapping whose keys must be in `known`; return its valid values by key.
 
-    `read` takes the node of a value, its key, and the item of `known` at that key.
+    `read` takes the node of a value, its key, and the item of `known` at that key. `label` names the mapping
+    in messages.
     """
     found: dict[str, V] = {}
     for entry in cx.reader.entries(node, label):

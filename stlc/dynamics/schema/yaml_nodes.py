@@ -172,8 +172,8 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
     """Read a text that must be a single YAML document of any kind; None if the text is empty.
 
-    PyYAML's C parser, if available, is ten times faster. Errors are reported by the Python parser, whose
-    messages and locations are better.
+    Findings about duplicate keys are appended to `sink`. PyYAML's C parser, if available, is ten times
+    faster. Errors are reported by the Python parser, whose messages and locations are better.
     """
     found: list[Diagnostic] = []
     if _FAST is not None and not _LAX.search(source.text):
@@ -238,7 +238,7 @@ class _Builder:
         return root
 
     def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
-        """Return an S100 error located at an event."""
+        """Return an S100 error with the given message and advice, located at `event`."""
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, start: Any, end: Any = None) -> Span:

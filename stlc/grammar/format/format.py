@@ -97,7 +97,10 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Return the indices of the operators of the kinds `row` outside of brackets and of `if … else`."""
+    """Return the indices of the operators of the kinds `row` among the tokens from `start` to `end`.
+
+    Operators within brackets or within `if … else` are left out.
+    """
     found: list[int] = []
     index, conditions = start, 0
     while index < end:
@@ -112,7 +115,7 @@ def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
 def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
     """Return a group of operands with a possible line break before each operator.
 
-    `splits` are the indices of the operators.
+    The tokens are those from `start` to `end`; `splits` are the indices of the operators.
     """
     parts = [*expression(text, start, splits[0])]
     for at, following in zip(splits, [*splits[1:], end], strict=True):
@@ -126,7 +129,10 @@ def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
 
 
 def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout elements of a prefix operator (such as `not` or `always[a, b]`) and its operand."""
+    """Return the layout elements of the tokens from `start` to `end`: a prefix operator and its operand.
+
+    Examples of a prefix operator are `not` and `always[a, b]`.
+    """
     kind = text.tokens[start].kind
     if kind == "_IF":
         return (_condition(text, start, end),)
@@ -137,7 +143,10 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _condition(text: Text, start: int, end: int) -> Group:
-    """Return the group of `if … then … else …`; if it is too long for a line, each branch gets its own."""
+    """Return the group of `if … then … else …`, the tokens from `start` to `end`.
+
+    If it is too long for a line, each branch gets its own.
+    """
     marks: list[int] = []
     index, depth = start, 0
     while index < end and depth >= 0:
@@ -159,7 +168,10 @@ def _condition(text: Text, start: int, end: int) -> Group:
 
 
 def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout elements of consecutive tokens; lines can be broken only inside brackets."""
+    """Return the layout elements of the tokens from `start` to `end`.
+
+    Only brackets among them can be broken into lines.
+    """
     parts: list[Doc] = []
     index = start
     while index < end:
@@ -175,7 +187,10 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _bracket(text: Text, opening: int) -> Group:
-    """Return the group of a bracket; if it does not fit on a line, each entry gets its own line."""
+    """Return the group of the bracket that begins at the index `opening`.
+
+    If it does not fit on a line, each entry gets its own line.
+    """
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
     inside: list[Doc] = [edge]
@@ -192,7 +207,7 @@ def _bracket(text: Text, opening: int) -> Group:
 
 
 def _comma(text: Text, start: int, end: int) -> int:
-    """Return the index of the next comma outside of brackets; `end` without one."""
+    """Return the index of the first comma from `start` on that is outside of brackets; `end` without one."""
     index = start
     while index < end and text.tokens[index].text != ",":
         index = behind(text, index)
@@ -200,7 +215,10 @@ def _comma(text: Text, start: int, end: int) -> int:
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout elements of one entry of a bracket: an expression, or `name = expression`."""
+    """Return the layout elements of one entry of a bracket, the tokens from `start` to `end`.
+
+    An entry is an expression, or `name = expression`.
+    """
     if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
         return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
     return expression(text, start, end)
@@ -290,7 +308,7 @@ def _declaration(text: Text, rule: str, page: _Page, width: int) -> None:
 
 
 def _document(text: Text, rule: str) -> tuple[Doc, ...]:
-    """Return the layout elements of a declaration.
+    """Return the layout elements of a declaration; `rule` is its grammar rule.
 
     The part up to `=` or `:` stays on one line; the body after it may be broken into lines.
     """
@@ -305,7 +323,10 @@ def _document(text: Text, rule: str) -> tuple[Doc, ...]:
 
 
 def _body(text: Text, rule: str) -> int:
-    """Return the index of the first token after the `=` or `:` of a declaration."""
+    """Return the index of the first token after the `=` or `:` of a declaration.
+
+    `rule` is the grammar rule of the declaration. If it has no such sign, the number of tokens is returned.
+    """
     sign = "=" if rule in _DEFINED else ":" if rule in _REQUIRED else ""
     index = 0
     while index < len(text.tokens) and sign:
@@ -318,7 +339,8 @@ def _body(text: Text, rule: str) -> int:
 def _head(text: Text, rule: str) -> int:
     """Return the width of the first part of a declaration, such as `def NAME`, in characters.
 
-    Adjacent declarations of one kind are aligned after this part; the width is 0 if there is no such part.
+    The second parts of adjacent declarations of one kind begin in the same column. The width is 0 if a
+    declaration of the grammar rule `rule` is not divided.
     """
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0

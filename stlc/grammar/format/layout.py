@@ -139,7 +139,10 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True if the line ends at a layout element: a line break that is taken, or a word with a comment."""
+    """True if the line ends at a layout element: a word with a comment, or a line break.
+
+    With `flat`, the text is printed on one line, so possible line breaks do not count.
+    """
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat

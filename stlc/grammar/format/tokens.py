@@ -71,7 +71,10 @@ def prepare(tokens: Sequence[Token]) -> Text:
 
 
 def spelling(kind: str, text: str) -> str:
-    """Return the canonical spelling of a token: `always` for `G`, `and` for `&&`."""
+    """Return the canonical spelling of a token: `always` for `G`, `and` for `&&`.
+
+    `kind` is its terminal in the grammar, and `text` its spelling in the source.
+    """
     if kind.startswith(("UNARY", "BINARY")):
         match = _WORD.match(text)
         assert match is not None
@@ -118,7 +121,7 @@ def _typed(text: Text, index: int) -> bool:
 
 
 def _would_join(left: Token, right: Token) -> bool:
-    """True if two tokens without a blank would be read as other tokens: `1 .x`, `1. ..`, `m ^2`."""
+    """True if the tokens `left` and `right` would be read as other tokens without a blank: `1 .x`, `m ^2`."""
     if right.text == "^":
         return left.kind == "UNIT"
     if left.kind == "NUMBER":

@@ -199,9 +199,10 @@ def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
 
 
 def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[str, ast.Interval | None, str]:
-    """Return (name, interval or None, alias) of a temporal operator.
+    """Return (name, interval or None, alias) of a temporal operator; `token` is its word in the source.
 
-    The alias is the spelling in the source, such as `G`; "" if that is the preferred name.
+    `written` holds the interval, if there is one. The alias is the spelling in the source, such as `G`; "" if
+    that is the preferred name.
     """
     match = _LETTERS.match(token.text)
     assert match is not None

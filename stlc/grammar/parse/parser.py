@@ -62,9 +62,9 @@ def parse(source: Source) -> ast.Spec:
 
 
 def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
-    """Return the syntax tree of the expression between two offsets of a text.
+    """Return the syntax tree of the expression between the offsets `start` and `end` of a text.
 
-    Source locations refer to the whole text.
+    Source locations in the tree refer to the whole text.
 
     Raises:
         SpecError: the expression has an error in its syntax, a unit or a number.
@@ -90,7 +90,7 @@ class _PieceError(Exception):
 
 
 def _check_size(source: Source, start: int, end: int) -> None:
-    """Raise SpecError (E005) for a text that is so long that parsing it would take minutes."""
+    """Raise SpecError (E005) if the text from `start` to `end` is so long that parsing would take minutes."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
@@ -108,7 +108,7 @@ def _build(piece: Piece, context: BuildContext) -> Any:
 
 
 def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Return the offset in the whole text at which parsing failed."""
+    """Return the offset in the whole text at which the parsing of a part of it (`piece`) failed."""
     token = getattr(error, "token", None)
     if token is not None and token.type == "$END":
         return piece.end

@@ -98,9 +98,10 @@ def tokenize(source: Source) -> TokenLayout:
 def _read_piece(
     source: Source, start: int, end: int, tokens: list[Token], places: list[tuple[str, int, int]]
 ) -> None:
-    """Parse a part of a text; append its tokens to `tokens` and (rule, start, end) of items to `places`.
+    """Parse the part of a text from `start` to `end`.
 
-    Raises SpecError (E010) if the part does not parse.
+    Its tokens are appended to `tokens`. For each item (such as a declaration), (grammar rule, start, end) is
+    appended to `places`. Raises SpecError (E010) if the part does not parse.
     """
     interactive = load_parser().parse_interactive(source.text[start:end], start="start")
     last: LarkToken | None = None
