@@ -71,7 +71,7 @@ class Findings(list[Diagnostic]):
         self._indexed = 0
 
     def tell(self, finding: Diagnostic) -> None:
-        """Append a finding unless one with the same code, location and message is in the list."""
+        """Append a finding; one with the code, location and message of a finding in the list is dropped."""
         for known in self[self._indexed :]:
             self._known.add((known.code, known.span, known.message))
         key = (finding.code, finding.span, finding.message)
@@ -82,7 +82,10 @@ class Findings(list[Diagnostic]):
 
 
 def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
-    """Append a finding to a list unless one with the same code, location and message is in it."""
+    """Append a finding to the list `sink`.
+
+    It is dropped if the list has a finding with the same code, location and message.
+    """
     if isinstance(sink, Findings):
         sink.tell(finding)
         return

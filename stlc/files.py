@@ -160,7 +160,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 def reported(action: str) -> Iterator[None]:
     """Context that turns an error of the operating system into MissingError (R201).
 
-    Its message is "cannot " followed by `action`, such as "write `a.json`".
+    The message of the error is "cannot " and `action`, for example "cannot write `a.json`".
     """
     try:
         yield
@@ -207,7 +207,7 @@ def find_spec(name: Path | str) -> Path:
 def _straight(path: Path) -> Path:
     """Shorten a path such as `specs/../examples/car.yaml` to `examples/car.yaml`.
 
-    It is returned unchanged if the short path leads to another file because of a symbolic link.
+    Because of symbolic links, the short path may lead to another file. The path is then returned unchanged.
     """
     short = Path(os.path.normpath(path))
     return short if short.is_file() and short.samefile(path) else path
@@ -235,7 +235,10 @@ def _is_bag(path: Path) -> bool:
 
 
 def is_stored(path: Path) -> bool:
-    """True if a path is a storage file of a ROS 2 bag, compressed or not."""
+    """True if a path is a file in which a ROS 2 bag (a recording of messages) stores its messages.
+
+    The file may be compressed.
+    """
     return path.name.lower().removesuffix(".zstd").endswith((".db3", ".mcap")) and path.is_file()
 
 
@@ -259,8 +262,8 @@ def _shown(path: Path) -> str:
 def beside(home: Path, name: str) -> Path:
     """Return the path of the file `name` to which a file in the folder `home` refers.
 
-    For `systems/car.yaml` it is `home/systems/car.yaml` if that file exists, else `home/car.yaml`. The second
-    case occurs in run folders, which hold copies of such files without their subfolders.
+    For `systems/car.yaml` it is `home/systems/car.yaml`. If only `home/car.yaml` exists, it is that file: run
+    folders hold copies of the files without their subfolders.
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there

@@ -51,7 +51,7 @@ def _foreign(value: object) -> Json:
     """Convert an object to JSON data: a dataclass, or an array with a method `tolist` (NumPy, torch).
 
     Raises:
-        TypeError: the object is none of these.
+        TypeError: the object is neither.
     """
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}

@@ -1,8 +1,8 @@
 """Native kernels: C code compiled by the system's compiler on first use, cached, and loaded as a library.
 
-Without a working compiler there is no kernel, and its callers compute with NumPy or torch. The name of a
-cached library contains a hash of its inputs (C code, compiler, its version, flags, processor) and one of its
-content; a library whose content does not match is not loaded.
+Without a working compiler there is no kernel; results are then computed with NumPy or torch. The name of a
+cached library contains two hashes: one of its inputs (C code, compiler, its version, flags, processor), and
+one of its content. A library whose content does not match its name is not loaded.
 """
 
 from __future__ import annotations
@@ -336,7 +336,10 @@ class _Parts:
         self._next = self._batch
 
     def work(self, rows: Callable[[int, int], int]) -> None:
-        """Process ranges of rows until none are left; the time of one determines the size of the next."""
+        """Process ranges of rows until none are left.
+
+        A range takes about `PART` seconds: the time of one determines the number of rows of the next.
+        """
         grains = 1
         while not self.failed:
             with self._lock:

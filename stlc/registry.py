@@ -40,7 +40,10 @@ def closest(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def did_you_mean(name: str, candidates: Iterable[str], *otherwise: str) -> tuple[str, ...]:
-    """Advice that names the candidate most similar to a misspelt `name`; `otherwise` if none is similar."""
+    """Return advice that names the candidate most similar to a misspelt `name`.
+
+    If none is similar, the texts `otherwise` are returned.
+    """
     near = closest(name, candidates)
     return otherwise if near is None else (f"did you mean `{near}`?",)
 

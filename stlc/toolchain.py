@@ -122,7 +122,10 @@ def version(using: str) -> str:
 
 
 def _identity(using: str) -> str:
-    """Key under which failures of a compiler are remembered: a hash of its path, file size and time."""
+    """Key under which failures of the compiler `using` are stored.
+
+    It is a hash of the path, the size and the modification time of its file.
+    """
     try:
         found = Path(using).stat()
         facts = f"{using} {found.st_size} {found.st_mtime_ns} {found.st_ino}"
@@ -218,7 +221,7 @@ def _file(key: str) -> str:
 
 
 def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
-    """Run a program in its own session; kill it with its child processes if it exceeds the limits.
+    """Run a program in its own POSIX session; kill it with its child processes if it exceeds the limits.
 
     If the wait is interrupted, the program and its child processes are killed, too.
 
@@ -227,8 +230,8 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
         given: text on the standard input.
 
     Raises:
-        HangsError: the program used no processor time for `IDLE` seconds, more processor time than `BUSY`,
-            or more memory than `MEMORY`.
+        HangsError: the program used no processor time for `IDLE` seconds, more processor time than `BUSY`, or
+            more memory than `MEMORY`.
         OSError: the program cannot be started.
     """
     # files, not pipes: a surviving child process could keep a pipe open
@@ -323,7 +326,7 @@ class _Use:
 
 
 def _use(session: int) -> _Use | None:
-    """Resources used by the processes of POSIX session `session`, ended children included.
+    """Return the resources used by the processes of the POSIX session `session`, ended children included.
 
     The result is None if they are unknown, as on systems without `/proc`.
     """

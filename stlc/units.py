@@ -234,7 +234,7 @@ def _factors(text: str) -> list[tuple[str, int]]:
 
 
 def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
-    """Advice for a unit that is a product with `degC`: the same product with `K`."""
+    """Advice for a unit that is a product with `degC`, such as `W/degC`: the same product with `K`."""
     powers: dict[str, int] = {}
     for symbol, power in factors:
         known = SYMBOLS.get(symbol)

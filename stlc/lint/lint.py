@@ -80,7 +80,10 @@ def _apart(repairs: Iterable[Fix]) -> list[Fix]:
 
 
 def edited(text: str, edits: Iterable[Edit]) -> str:
-    """Return the text after non-overlapping edits, pairs of a source location and its replacement."""
+    """Return the text with edits applied; an edit is (source location, replacement).
+
+    The edits must not overlap.
+    """
     for start, end, new in sorted(((span.start, span.end, new) for span, new in edits), reverse=True):
         text = text[:start] + new + text[end:]
     return text
@@ -170,6 +173,6 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
-    """Return a sort key: findings in the text `source` come first, by position, then those in other files."""
+    """Return a key that sorts findings: first those in the text `source`, by position, then all others."""
     own = finding.span is not None and finding.span.source is source
     return not own, finding.span.start if own and finding.span else 0

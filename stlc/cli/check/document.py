@@ -144,7 +144,7 @@ def _least(values: NDArray[np.float64]) -> float | None:
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean of some values; None if there are none.
+    """Return the mean of `values`; None if there are none.
 
     The values are divided by their number before they are added, because their sum may overflow.
     """

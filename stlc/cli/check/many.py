@@ -133,7 +133,11 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
-    """Row shown for a file: a violated requirement, else an inconclusive one, else the least robust one."""
+    """Return the row that the summary shows for a file: that of its worst requirement.
+
+    A violated requirement comes before an inconclusive one, and that before a satisfied one. Of several, the
+    one with the least robustness is chosen.
+    """
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
     return min(rows, key=lambda row: (order[row.status], row.least))
 

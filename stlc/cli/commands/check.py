@@ -120,9 +120,10 @@ def check(
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
-    """Print a single result in full; of several results, print those not satisfied and a summary table.
+    """Print the results of the judged files, after remarks and warnings.
 
-    Remarks and warnings are printed first.
+    A single result is printed in full. Of several results, those that are not satisfied are printed in full,
+    and a summary table follows.
     """
     from stlc.cli.check.many import summary
 

@@ -76,7 +76,7 @@ def fmt(
 
 
 def _tell(record: FormattedFiles, alike: int) -> None:
-    """Print the differences or the names of changed files, then the number of unchanged files (`alike`)."""
+    """Print the differences or the names of changed files, then the number of unchanged files, `alike`."""
     if record.get("diff"):
         emit(record["diff"].rstrip("\n"))
     for name in record["changed"]:

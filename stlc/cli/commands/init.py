@@ -105,7 +105,7 @@ def init(
 
 
 def _require_new(paths: Iterable[Path], *, force: bool) -> None:
-    """Raise UsageError (U101) if one of the files exists, unless `force` is given."""
+    """Raise UsageError (U101) if one of the files exists; with `force`, do nothing."""
     there = [str(path) for path in paths if path.exists()]
     if there and not force:
         verb = "is" if len(there) == 1 else "are"

@@ -64,9 +64,9 @@ def plan(
     """Plan from initial states, without training.
 
     The best plan found is written as a trace that check and plot read. Every plan is judged exactly in
-    float64. If no satisfying plan is found from a start, there may still be one, unless the planner proves
-    the opposite (milp). Ctrl-C ends the search and keeps the best plans found. Without --fail-under, the exit
-    code is 1 if a plan violates the specification.
+    float64. If the search finds no satisfying plan from a start, one may still exist; only the planner milp
+    can prove that there is none. Ctrl-C ends the search and keeps the best plans found. Without --fail-under,
+    the exit code is 1 if a plan violates the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named
     from stlc.controller.planning.traces import starts_of, trace_of

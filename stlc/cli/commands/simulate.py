@@ -251,7 +251,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     Args:
         order: options of the simulation.
         name: scenario that is simulated; None for the system without a scenario.
-        writes: whether robustness margins are written to the file of `--robustness`.
+        writes: whether the robustness at every step is written to the file of `--robustness`.
     """
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of

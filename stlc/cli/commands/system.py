@@ -129,9 +129,9 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Compare the kinematics of robots read from URDF files with those that pytorch-kinematics computes.
+    """Check the kinematics of robots from URDF files against the package pytorch-kinematics.
 
-    Raises SystemFileError (S208) if they differ.
+    Returns one comparison per function. Raises SystemFileError (S208) if the two results differ.
     """
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:

@@ -215,14 +215,20 @@ def _logger(name: str | None) -> Opener | None:
 
 
 def _method(name: str) -> str:
-    """Return the name of a training method. Raises UsageError (U101) if there is no such method."""
+    """Check that there is a training method called `name`, and return the name.
+
+    Raises UsageError (U101) if there is none.
+    """
     if name not in METHODS:
         raise usage(f"there is no method `{name}`", METHODS.suggest(name))
     return name
 
 
 def _steps(text: str) -> int | StepSchedule:
-    """Parse a number of steps, or the recorded schedule of a run with a budget."""
+    """Parse the value of `--steps`: a number of steps, or a schedule that was recorded by another run.
+
+    A run with a budget records its schedule: the total numbers of steps that it planned.
+    """
     from stlc.controller.training.budget import StepSchedule
 
     if text.strip().isdecimal():
@@ -236,7 +242,7 @@ def _steps(text: str) -> int | StepSchedule:
 
 
 def _rate(value: float) -> float:
-    """Check that a learning rate is positive and finite, and return it. Raises UsageError (U101)."""
+    """Check that a learning rate is positive and finite, and return it. Raises UsageError (U101) if not."""
     if not 0.0 < value < math.inf:
         raise usage(f"`--lr {value:g}` is not a learning rate", "--lr 1e-3")
     return value
@@ -323,8 +329,8 @@ LOST = "R403"
 def one_voice() -> Iterator[None]:
     """Context for one of several training processes that `torchrun` started: only the first one prints.
 
-    The output of all other processes is dropped. Two kinds of errors are still printed: those of the first
-    process on each machine, and a missing package in any process.
+    The output of all other processes is dropped, with two exceptions. Errors of the first process on each
+    machine are printed, and so is a missing package in any process.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

@@ -752,9 +752,9 @@ def _object(kind: Any) -> dict[str, Any]:
 
 
 def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Schema of a value that matches one of `parts`.
+    """Return the JSON Schema of a value that matches one of the schemas `parts`.
 
-    Plain types, as in "string or null", are joined into one schema.
+    Schemas that consist of a type only are joined into one: `{"type": ["string", "null"]}`.
     """
     plain = [part["type"] for part in parts if part.keys() == {"type"}]
     rest = [part for part in parts if part.keys() != {"type"}]

@@ -46,9 +46,10 @@ def emit(text: str, *, styled: bool = False) -> None:
 
 
 def say(text: str, *, styled: bool = False) -> None:
-    """Write a line to the standard error, unless `--quiet` was given.
+    """Write a line to the standard error; with `--quiet`, write nothing.
 
-    A `styled` text may consist of several lines and contain colour codes, as in `emit`.
+    A `styled` text may consist of several lines and contain colour codes. Its caller must have applied
+    `stlc.escape.visible` to all names that come from files.
     """
     if not QUIET.get():
         _write(sys.stderr, screen(text, styled=True) if styled else visible(text))

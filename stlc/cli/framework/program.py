@@ -204,7 +204,7 @@ class Program:
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run a command line and return its exit code.
 
-        All exceptions of commands are caught here and become a message and an exit code; see
+        All exceptions of commands are caught here. They become a message and an exit code; see
         `stlc.cli.framework.errors`.
 
         Args:
@@ -331,7 +331,10 @@ def _params(command: Any) -> Iterator[Any]:
 
 
 def name_values(command: Any) -> None:
-    """Set the placeholders (metavars) of options that have none, so that help texts show no Python types."""
+    """Set the placeholders of options in help texts, such as `NAME`, so that no Python types are shown.
+
+    Only options without a placeholder (metavar) are changed. Those of subcommands are included.
+    """
     for param in _params(command):
         if hasattr(param, "display_type_rich") and param.param_type_name == "argument":
             param.display_type_rich = lambda **_: ""  # the metavar suffices

@@ -1,7 +1,7 @@
 """Diagnostics as text, with the source and carets under it, and as JSON.
 
-The primary place is underlined with `^`, the others with `-`, each label in a row of its own; then follow
-advice (`help`, `fix`) and reasons (`note`).
+The main source location is underlined with `^`, further ones with `-`. Each label has a line of its own. Then
+follow advice (`help`, `fix`) and reasons (`note`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ _STYLES = {
 
 @dataclass(frozen=True, slots=True)
 class _Paint:
-    """Function that adds the colour codes of a style to a text if `color`; else it returns the text."""
+    """Function that adds the colour codes of a style to a text.
+
+    If `color` is False, it returns the text unchanged.
+    """
 
     color: bool
 
@@ -162,7 +165,10 @@ class _Row:
             self.text += "…"
 
     def column(self, offset: int) -> int:
-        """Display column of the character at `offset` in the source, or of the nearest one displayed."""
+        """Display column of the character at `offset` in the source.
+
+        If the character is not displayed, it is the column of the nearest one that is.
+        """
         return self._columns[min(max(offset - self._first, 0), len(self._columns) - 1)]
 
     def underline(self, mark: _Mark) -> str:

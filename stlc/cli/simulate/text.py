@@ -214,7 +214,7 @@ def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
 
 
 def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
-    """Rows with the metrics that the world reports, such as a mean speed, one column per guard."""
+    """Table rows with the metrics of the simulated system, such as a mean speed; one column per guard."""
     from stlc.controller.evaluation.metrics import is_progress
 
     first = next(iter(guards.values()))

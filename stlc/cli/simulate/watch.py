@@ -1,4 +1,4 @@
-"""Output while a deployment runs: a progress bar, the live view, and margins as JSON lines."""
+"""Output while a deployment runs: a progress bar, the live view, and robustness as JSON lines."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def require_writable(where: str | None) -> None:
 
 @contextmanager
 def _lines(where: str) -> Iterator[TextIO]:
-    """Context that yields the stream for JSON lines: the file `where`, or the standard output for `-`."""
+    """Context that yields the stream for JSON lines: the file `where`; for `-`, the standard output."""
     if where == STANDARD_OUTPUT:
         yield sys.stdout
         return

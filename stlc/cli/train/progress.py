@@ -216,7 +216,10 @@ def _spread(left: str, right: str, width: int) -> tuple[str, ...]:
 
 
 def _packed(cells: list[str], width: int) -> list[str]:
-    """Return as few lines as possible, of at most `width` characters, with the `cells` side by side."""
+    """Put the texts `cells` side by side on as few lines as possible, of at most `width` characters.
+
+    The order is kept. Returns the lines.
+    """
     lines: list[str] = []
     for cell in cells:
         if lines and len(lines[-1]) + 3 + len(cell) <= width:
@@ -227,7 +230,7 @@ def _packed(cells: list[str], width: int) -> list[str]:
 
 
 def engine_text(engine: Mapping[str, Any]) -> str:
-    """Text of the options that the training selected: method, network, batch, learning rate and margin."""
+    """Text of the options that the training selected: method, network, batch, learning rate and others."""
     network = "x".join(map(str, engine["hidden"]))
     if "environments" in engine:  # one control a step, learned from rewards
         parts = (

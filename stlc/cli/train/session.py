@@ -39,8 +39,8 @@ FAILURES = "failures.png"
 class Session:
     """Progress display of a training, as a context manager that also handles Ctrl-C and SIGTERM.
 
-    During training steps, the first signal ends the training after the present step, with a checkpoint, and a
-    second one stops it at once; outside of the steps the first signal stops it at once.
+    During training steps, the first signal ends the training after the present step, with a checkpoint. A
+    second one stops it immediately. Outside of the steps the first signal stops it immediately.
 
     Attributes:
         folder: folder of the run.
@@ -72,7 +72,7 @@ class Session:
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
-        """Predict how many seconds longer than `budget` the run would take if the training used all of it.
+        """Predict by how many seconds the run would exceed `budget` if the training used all of the budget.
 
         The excess is due to other work, such as imports and pictures. It is estimated from the time that the
         imports took; a negative value means no excess.
@@ -180,7 +180,8 @@ class Session:
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     """The commands that the final lines suggest, for a run trained by `ranks` processes.
 
-    They contain the shortest name of the run: none for the newest run, no path for a run below `runs`.
+    They name the run as shortly as possible. The newest run is not named; a run below `runs` is named without
+    its path.
     """
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()

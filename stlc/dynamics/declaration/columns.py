@@ -286,8 +286,8 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
 def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
     """Read the timers: states with `timer: up` or `timer: down`.
 
-    Returns the flow of the timers and one jump per timer. A timer counts seconds while its condition `run`
-    holds; the jump resets it to the value of its key `to` when `reset_when` holds.
+    Returns the assignments of `flow` that advance the timers, and one jump per timer. A timer counts seconds
+    while its condition `run` holds. When `reset_when` holds, the jump sets it to the value of its key `to`.
     """
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []

@@ -162,7 +162,7 @@ Row = tuple[str, ...]
 
 
 def describe(decl: SystemDecl) -> str:
-    """Describe states, controls, flow, jumps, initial situations and scenarios as lines of text."""
+    """Describe a system as lines of text: states, controls, flow, jumps, initial states and scenarios."""
     head = visible(f"{decl.name}: {decl.doc}" if decl.doc else decl.name)
     substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
     kind = "discrete" if decl.discrete else decl.integrator

@@ -277,7 +277,10 @@ class _Draws:
                 self._let(name)
 
     def _let(self, name: str) -> None:
-        """Add the assignment of a local name (from `let`), after those of the local names that it reads."""
+        """Append the assignment of the local name `name` (from `let`).
+
+        The assignments of the local names that it reads are appended first.
+        """
         if name not in self.unresolved:
             return
         node = self.unresolved.pop(name)

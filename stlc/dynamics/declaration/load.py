@@ -286,7 +286,7 @@ class MovingParts:
 
 
 def moving_parts(decl: SystemDecl) -> MovingParts:
-    """Return the YAML nodes of `flow` and `jump` of a system, for reading these sections a second time."""
+    """Return the YAML nodes of `flow` and `jump` of a system, so that these sections can be read again."""
     reader = Reader(decl.source)
     found, _ = _sections(decl.source, decl.overrides, reader)
     return MovingParts(_named(found, reader).cx, found.flow, found.jump)
@@ -330,9 +330,10 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
-    """Merge the mapping `own` over the mapping `base`, entry by entry.
+    """Merge the mapping `own` over the mapping `base`: an entry of `own` replaces that of the same key.
 
-    With `sections`, values that are mappings in both are merged too, one level deep.
+    A null entry of `own` removes the entry. With `sections`, two mappings under the same key are merged in
+    the same way, one level deep.
     """
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
@@ -380,7 +381,7 @@ def _keys(node: Node | None) -> dict[str, Node]:
 
 
 def _value(key: str, text: str, reader: Reader) -> Node | None:
-    """Parse the text of one override as YAML; None if it is invalid."""
+    """Parse `text`, the new value of the field `key`, as YAML; None if it is invalid."""
     source = Source(f"--set {key}", text)
     try:
         return load_node(source, sink=reader.findings)

@@ -34,7 +34,10 @@ def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
 
 
 def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
-    """Map network outputs to controls on the scale [-1, 1], one tensor per control."""
+    """Map network outputs to controls on the scale [-1, 1], where ±1 are the ends of a control's range.
+
+    Returns one tensor per control.
+    """
     columns = iter(raw.unbind(-1))
     out: list[Tensor] = []
     for control in controls:

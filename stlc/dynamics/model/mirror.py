@@ -25,11 +25,13 @@ HARD = Hard()
 
 
 class Mirror:
-    """The symmetry that `policy: {mirror: …}` declares: a map of states and controls that is its own inverse.
+    """The mirror symmetry that `policy: {mirror: …}` declares: a map of states and of controls.
+
+    Applied twice, the map gives the original state.
 
     Attributes:
-        side: index of the column that tells a state from its mirror image. Of the two, the state with
-            the larger value is the representative: the one that the policy is evaluated in.
+        side: index of the column that tells a state from its mirror image. Of the two, the one with the
+            larger value is the representative: the state in which the policy is evaluated.
     """
 
     def __init__(
@@ -48,9 +50,9 @@ class Mirror:
         return _applied(self._states, x, self._names)
 
     def plans(self, u: Tensor) -> Tensor:
-        """Mirror images of controls: (…, m) -> (…, m).
+        """Return the mirror images of controls: (…, m) -> (…, m).
 
-        Angles are wrapped into one turn that begins at the lower end of their range.
+        An angle is wrapped into the turn that begins at the lower end of its range.
         """
         moved = _applied(self._inputs, u, [control.name for control in self._controls])
         for index, each in enumerate(self._controls):

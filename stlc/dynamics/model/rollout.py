@@ -129,7 +129,7 @@ class _StageRunner:
             self._loop(columns)
 
     def _loop(self, columns: _Columns) -> None:
-        """Step the states that depend on their own past, one time step after another."""
+        """Compute the states that depend on their own past, one time step after another."""
         stage = self.stage
         env, timed = columns.sliced(self.outside)
         kept = (*stage.stepped.values(), *stage.lets)

@@ -131,10 +131,12 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """Return the increment of a state if its next value is the state plus that increment, else None.
+    """Return the increment of a state if its next value is `state + increment`, else None.
+
+    The increment must not depend on the state.
 
     Args:
-        states: the states of a group, each with the name of its next value.
+        states: the states of a group -> name of the expression of their next value.
         body: the expressions of the group.
     """
     if len(states) != 1 or len(body) != 1:

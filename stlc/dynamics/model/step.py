@@ -79,7 +79,8 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
 def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> State:
     """Return the states after the flow of one step, integrated over all substeps.
 
-    Intermediate results are appended to `writer`; `given` are the actuator commands.
+    States are expressions by name. Intermediate results are appended to `writer`; `given` are the actuator
+    commands.
     """
 
     def named(at: State) -> State:

@@ -156,9 +156,9 @@ class System:
         return torch.stack([moved[name] for name in self.names], 1)
 
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """Append the columns that a specification adds: (B, n - added) -> (B, n).
+        """Append the parameters and timers of a specification to states: (B, n - added) -> (B, n).
 
-        The parameters of the specification are drawn; its timers get their initial values.
+        The parameters are drawn with `generator`; the timers get their initial values.
         """
         if not self.added:
             return states
@@ -261,7 +261,7 @@ class System:
 
     @cached_property
     def _timer_step(self) -> Stepper:
-        """Compiled update of the timers."""
+        """Compiled step of the timers: their next values as functions of the states."""
         return Stepper(ModelStep((), {timer.name: timer.update for timer in self.timers}))
 
     @cached_property
@@ -432,9 +432,10 @@ class System:
 
     @cached_property
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
-        """Two weighted sums of the performance terms: those that read no control, and those that read one.
+        """Two weighted sums of the performance terms, as expressions.
 
-        A sum without terms is None.
+        The first has the terms that read no control, the second those that read one. A sum without terms is
+        None.
         """
         sums: list[ir.Num | None] = [None, None]
         given = commands(self.decl)

@@ -115,9 +115,10 @@ class Bound:
     result: int | None
 
     def __call__(self, *components: Array) -> Sequence[Array]:
-        """Call the function on the components of its arguments; return the components of its result.
+        """Call the function; `components` are the components of all arguments, in order.
 
-        Raises SystemFileError (S208) if the call fails or the result has another shape.
+        Returns the components of the result. Raises SystemFileError (S208) if the call fails or the result
+        has another shape.
         """
         given = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
         wanted = given if self.decl.library is None else self.decl.library == "torch"

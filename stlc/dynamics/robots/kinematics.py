@@ -147,7 +147,10 @@ def _triple(element: ElementTree.Element | None, key: str, default: tuple[float,
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Doubles:
-    """Rz(yaw) Ry(pitch) Rx(roll), as in URDF; entries close to an integer are rounded."""
+    """Return the rotation matrix Rz(yaw) Ry(pitch) Rx(roll), as in URDF, (3, 3).
+
+    Entries close to an integer are rounded to it.
+    """
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll, pitch, yaw))
     found = np.array(
         [

@@ -38,9 +38,9 @@ class Uncertain:
     """An uncertain number of the dynamics.
 
     Attributes:
-        factor: name of the column that multiplies the number; with the value 1 the dynamics are the model's.
+        factor: name of the column by which the number is multiplied; it is 1 in the model.
         text: source text of the number, such as `vy` or `0.01 m/rad`.
-        states: names of the states whose equations or resets read it.
+        states: names of the states whose equations or resets read the number.
     """
 
     factor: str

@@ -88,7 +88,8 @@ def under(decl: SystemDecl, name: str) -> SystemDecl:
 def truth(decl: SystemDecl) -> SystemDecl:
     """Return the true system, which may differ from the model with which controls are planned.
 
-    It is the declaration with the model mismatch of its scenario. Without a mismatch it is `decl` itself.
+    It is the declaration `decl` with the model mismatch of its scenario. Without a mismatch it is `decl`
+    itself.
     """
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:

@@ -179,7 +179,7 @@ class Expressions:
         return found
 
     def _report(self, findings: Sequence[Diagnostic]) -> None:
-        """Report findings of the compiler, with their codes replaced by those of system files."""
+        """Report findings of the compiler; codes of specifications are replaced by those of system files."""
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     # --------------------------------------------------------------------- values

@@ -47,7 +47,7 @@ class ControlDecl:
 def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
     """Return the entry of a name with `change` applied to its number, or to each component of its vector.
 
-    An entry of another kind is returned unchanged.
+    An entry that stands for something else, such as a function, is returned unchanged.
     """
     match entry:
         case Known(value=Number() as number):
@@ -109,7 +109,7 @@ class Names:
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """Record, for the component columns of a vector, the source location of the vector's declaration."""
+        """Record the source location of the component columns of a vector: that of the vector `name`."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 

@@ -46,9 +46,10 @@ class Reader:
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
-        """Record findings, each once: one with equal code, source location and message is dropped.
+        """Record findings, each once.
 
-        An error in a value that is used twice through a YAML anchor is thus reported once.
+        A finding is dropped if one with the same code, source location and message is recorded. An error in a
+        value that is used twice through a YAML anchor is thus reported once.
         """
         for finding in findings:
             tell(self.findings, finding)

@@ -99,7 +99,10 @@ def key(
 
 @cache
 def keys_of(record: type) -> Mapping[str, Key]:
-    """Keys of the mapping that a record is read from, by name, in the order of the record's fields."""
+    """Return the keys that the mapping for the dataclass `record` may have: name -> key.
+
+    They are in the order of the fields of `record`.
+    """
     found = {}
     for each in dataclasses.fields(record):
         if _KEY in each.metadata:
@@ -277,7 +280,7 @@ def by_name(
 
 
 def json_schema(record: type) -> Json:
-    """JSON Schema (draft 2020-12) of the mapping that a record is read from."""
+    """Return the JSON Schema (draft 2020-12) of the mapping that is read into the dataclass `record`."""
     properties = {
         name: {**each.kind.schema, "description": each.about.replace("`", "")}
         for name, each in keys_of(record).items()
@@ -288,7 +291,10 @@ def json_schema(record: type) -> Json:
 
 
 def reference(record: type, title: str) -> Iterator[str]:
-    """Yield lines of Markdown: a table of the keys of a record, then tables of the records in its values."""
+    """Yield lines of Markdown: a table of the keys of `record`, then tables of the records in its values.
+
+    `title` is the heading of the first table.
+    """
     yield from (f"### {title}", "", "| key | value | default | meaning |", "|---|---|---|---|")
     fields = {each.name: each for each in dataclasses.fields(record)}
     inner: list[tuple[type, str]] = []

@@ -152,8 +152,8 @@ def as_float(node: Scalar) -> float | None:
 def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
     """Read a text that must be a single YAML document and a mapping.
 
-    Duplicate keys are appended to `sink` as S102; the first one is used. Raises SystemFileError (S100) if the
-    text is not such a document, or not safe to read.
+    For a duplicate key, S102 is appended to `sink`, and the first entry is used. Raises SystemFileError
+    (S100) if the text is no YAML mapping, or not safe to read.
     """
     node = load_node(source, sink=sink)
     if isinstance(node, Mapping):
@@ -242,9 +242,9 @@ class _Builder:
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, start: Any, end: Any = None) -> Span:
-        """Return the source location from event `start` to event `end`, less trailing blanks.
+        """Return the source location from event `start` to event `end`, without trailing blanks.
 
-        Without `end`, it is the location of `start`.
+        If `end` is None, it is the location of `start`.
         """
         first, last = start.start_mark.index, (end or start).end_mark.index
         last = first + len(self.source.text[first:last].rstrip())

@@ -74,7 +74,10 @@ def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
 
 
 def misspelt_operator(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise a misspelt operator whose correction parses: `alwyas[0, T] p`, `p adn q`."""
+    """Return the finding for a misspelt operator, such as `alwyas[0, T] p` or `p adn q`; else None.
+
+    The text must parse with the corrected operator.
+    """
     near_by = [x for x in (failure.found, *reversed(failure.before)) if x is not None and x.kind == "word"]
     for lexeme in near_by[:_NEAR_BY]:
         if lexeme.text in RESERVED or len(lexeme.text) < _LEAST_LETTERS:
@@ -98,7 +101,7 @@ _NEAR_BY, _LEAST_LETTERS = 4, 3
 
 
 def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise a number followed by a word that is no unit: `5 furlong`, `2 x`."""
+    """Return the finding for a number followed by a word that is no unit, such as `5 furlong`; else None."""
     found, previous = failure.found, failure.previous
     if found is None or previous is None or previous.kind != "number" or found.kind != "word":
         return None
@@ -111,7 +114,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
 
 
 def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise an unknown word where a declaration begins: `requre a: …`."""
+    """Return the finding for an unknown word where a declaration begins, as in `requre a: …`; else None."""
     found = failure.found
     if found is None or found.kind != "word" or found.text in RESERVED or "_REQUIRE" not in failure.accepts:
         return None
@@ -128,7 +131,7 @@ def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
 
 
 def wrong_name(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise a reserved word in place of a name: `def F = …`, `const in = 3`."""
+    """Return the finding for a reserved word in place of a name, as in `const in = 3`; else None."""
     if "NAME" not in failure.accepts or failure.wants_operand:
         return None
     found = failure.found
@@ -150,7 +153,7 @@ def wrong_name(failure: ParseFailure) -> Diagnostic | None:
 
 
 def stray_bracket(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise a closing bracket without a matching opening one."""
+    """Return the finding for a closing bracket without a matching opening one; else None."""
     found = failure.found
     if found is None or found.text not in (")", "]", "}"):
         return None
@@ -177,7 +180,10 @@ def _begins_line(failure: ParseFailure, lexeme: Lexeme) -> bool:
 
 
 def _repair(failure: ParseFailure) -> Diagnostic | None:
-    """Return the diagnostic of one missing or wrong sign, if the text parses with that sign; else None."""
+    """Return the diagnostic of a missing or wrong sign, such as a missing `)`; else None.
+
+    The text must parse once the sign is inserted or replaced.
+    """
     previous, found = failure.previous, failure.found
     if previous is None:
         return None
@@ -201,7 +207,10 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
-    """Recognise `def name: …` in place of `def name = …`, which the parser reads as a type."""
+    """Return the diagnostic for `def name: …` in place of `def name = …`; else None.
+
+    The parser reads the text after the colon as a type.
+    """
     declared = _declared(failure)
     sign = next((lexeme for lexeme in failure.before if lexeme.text == ":"), None)
     if declared is None or sign is None or declared[1] not in ("definition", "constant", "region"):
@@ -299,7 +308,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """Return the first name that a declaration declares, and the kind of declaration in words; else None."""
+    """Return (name, kind of declaration in words) for the first declaration before the error; else None."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]

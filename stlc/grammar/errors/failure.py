@@ -72,7 +72,7 @@ class ParseFailure:
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """First lexeme after the part, with which the next declaration begins.
+        """First lexeme (word, number, string or sign) after the part, with which the next declaration begins.
 
         It is None at the end of the text, or if the part is an expression.
         """

@@ -376,11 +376,10 @@ WIDTH = 100
 def format_text(source: Source) -> str:
     """Return the formatted text of a specification, ending with a line break.
 
-    If the text does not parse, symbols such as `□`, `≤`, `∧` are first replaced by their spelling in the
-    language.
+    If the text does not parse, it is tried again with symbols such as `□`, `≤`, `∧` spelled in the language.
 
     Raises:
-        SpecError: the text does not parse.
+        SpecError: the text does not parse either way.
     """
     source, spec = _read(source)
     formatted = lay_out(tokenize(source), tuple(ambiguities(spec)), width=WIDTH)
@@ -393,7 +392,7 @@ def format_text(source: Source) -> str:
 def _read(source: Source) -> tuple[Source, ast.Spec]:
     """Parse a source; return the source that was parsed, and its syntax tree.
 
-    If the given source does not parse, symbols such as `≤` are replaced, and the result is parsed.
+    If the given source does not parse, symbols such as `≤` are replaced, and the result is parsed instead.
 
     Raises:
         SpecError: neither text parses; the errors are those of the given text.

@@ -181,7 +181,7 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """End the current line, unless it is empty, and begin a new one indented by `level` blanks."""
+        """Begin a new line indented by `level` blanks; an empty current line is replaced by it."""
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -204,10 +204,10 @@ class AlignedColumn:
         text: the line without its comment.
         kind: grammar rule of the declaration on this line; "tag" or "comment"; "part" for a line of a
             declaration that takes several lines.
-        head: width in characters of its first part, such as `def NAME`, padded to be equal in adjacent lines
-            of one kind; 0 without such a part.
+        head: width of the first part of the line, such as `def NAME`, in characters; 0 without such a part.
+            It is padded to be equal in adjacent lines of one kind.
         comment: comment at the end of the line.
-        apart: whether an empty line precedes it.
+        apart: whether there is an empty line before this line.
     """
 
     text: str

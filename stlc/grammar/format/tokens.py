@@ -205,7 +205,10 @@ def behind(text: Text, index: int) -> int:
 
 
 def _doubled(text: Text) -> set[int]:
-    """Return the indices of redundant parentheses: of two directly nested pairs, those of the outer one."""
+    """Return the indices of redundant parentheses: the outer pair in `((p))`.
+
+    Parentheses with a comment are left out.
+    """
     found: set[int] = set()
     for opening, role in text.roles.items():
         inner = opening + 1
@@ -221,7 +224,7 @@ def _commented(token: Token) -> bool:
 
 
 def _without(text: Text, dropped: set[int]) -> Text:
-    """Return the text without the tokens at the indices `dropped`; tokens with a comment are kept."""
+    """Return the text without the tokens at the indices `dropped`; a token with a comment is kept."""
     kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
     return _paired(kept) if len(kept) < len(text.tokens) else text
 

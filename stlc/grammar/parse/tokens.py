@@ -28,8 +28,8 @@ class Comment:
 
     Attributes:
         text: text with its `#` or `//`.
-        own_line: whether only blanks precede it on its line.
-        apart: whether an empty line precedes it.
+        own_line: whether the comment is the first thing on its line.
+        apart: whether there is an empty line before the comment.
     """
 
     text: str
@@ -42,14 +42,14 @@ class Token:
     """Token of the source text, with the comments around it.
 
     Attributes:
-        kind: name of its terminal in the grammar.
-        text: its text in the source.
-        start: offset of its first character.
-        end: offset after its last character.
-        before: comments between the previous token and this one, except the comment that is `after` of the
+        kind: name of the token's terminal in the grammar.
+        text: text of the token in the source.
+        start: offset of the first character.
+        end: offset after the last character.
+        before: comments between the previous token and this one, without the comment that is `after` of the
             previous token.
-        after: comment after it on the same line.
-        apart: whether an empty line directly precedes it, that is, between its comments and the token.
+        after: comment after the token on the same line.
+        apart: whether there is an empty line between the comments in `before` and the token.
     """
 
     kind: str
@@ -146,9 +146,9 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 
 
 def _own(token: Token) -> tuple[Comment, ...]:
-    """Return the comments of a token that is not printed; each gets its own line.
+    """Return the comments of a token that is not printed itself; each gets its own line.
 
-    A `##` comment after the token gets another `#` in front, so that it does not document the next item.
+    A `##` comment after the token gets another `#` in front. Otherwise it would document the next item.
     """
     if token.after is None:
         return token.before
@@ -173,9 +173,10 @@ def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
 
 
 def _inside(token: Token) -> tuple[Comment, ...]:
-    """Return the comments inside a token, which are moved before it.
+    """Return the comments inside a token.
 
-    The tokens `always@` and `not in` may contain some: `always # … @`, `not # … in`.
+    Comments can occur in the tokens `always@` and `not in`: `always # … @`, `not # … in`. The formatter moves
+    them before the token.
     """
     if token.kind not in _WITH_BLANKS:
         return ()

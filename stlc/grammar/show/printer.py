@@ -73,7 +73,7 @@ def _quantity(expr: ast.Quantity) -> str:
 
 
 def _base(expr: ast.Expr) -> str:
-    """Return the text of an expression that stands before an index, a dot or an argument list.
+    """Return the text of an expression that is followed by an index, a dot or an argument list.
 
     A number gets parentheses, and so does an expression that binds more loosely than an index.
     """
