@@ -1,1 +1,1 @@
-"""Controllers: tasks, policies, methods, training, guards, deployment, evaluation."""
+"""Controllers: tasks, policies, training methods, guards (runtime filters), deployment, evaluation."""

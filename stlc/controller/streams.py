@@ -46,6 +46,6 @@ class Streams:
 
 
 def seeded(base: int, key: int) -> torch.Generator:
-    """Generator derived from a seed and a key, independent for different keys."""
+    """Generator derived from the seed `base` and the number `key`; different keys are independent."""
     seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

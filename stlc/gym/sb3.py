@@ -77,7 +77,10 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         return seen, reward.astype(np.float32), done, told
 
     def _told(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        """Info dictionaries of the environments at the end of their episodes, one per environment."""
+        """Info dictionaries of the environments at the end of their episodes, one per environment.
+
+        `info`: info that the vector environment returned for all of them.
+        """
         end = info["final_info"]
         rows = zip(info["final_obs"], self._earned, end["rho"], end["satisfied"], end["state"], strict=True)
         return [

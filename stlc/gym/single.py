@@ -56,8 +56,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
         world: whether the agent moves in the world of the system; None: only in longer episodes.
 
-    Raises UsageError (U101) if there is no such reward, or if `world` is False for an episode longer than a
-    plan.
+    Raises UsageError (U101) if no reward is named `reward`, if it is `task` and the system declares no
+    reward, or if `world` is False for an episode longer than a plan.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -134,7 +134,10 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self._seen(), self._earned(x, plan, info), over and whole, over and not whole, info
 
     def _earned(self, before: Tensor, plan: Tensor, info: Mapping[str, Any]) -> float:
-        """Reward of the last step, from the state `before`, (1, n), under the controls `plan`, (1, m)."""
+        """Reward of the last step, from the state `before`, (1, n), under the controls `plan`, (1, m).
+
+        `info`: info after the step; its entry `rho`, if present, is the robustness of the episode.
+        """
         if self.reward == "dense":
             earned, self._rho = info["rho"] - self._rho, info["rho"]
             return float(earned)

@@ -47,7 +47,8 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             observations and info of the end. With `NEXT_STEP` the last step returns the final observations;
             the following step ignores its actions, begins the next episodes and gives the reward 0.
 
-    Raises UsageError (U101) if there is no such reward, or another argument is wrong.
+    Raises UsageError (U101) if no reward is named `reward`, if it is `task` and the system declares no
+    reward, or if another argument is wrong.
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def _shown(self, seen: Tensor) -> Floats:
         """Clip and scale observations for the agent, (N, k).
 
-        The last entry of `seen` is the elapsed share of the episode, which is dropped unless it is observed.
+        The last entry of `seen` is the elapsed share of the episode. It is kept only if `time` is True.
         """
         values = seen.numpy() if self.time else seen[:, :-1].numpy()
         return self._bounds.shown(values, unit=self.normalised)

@@ -38,8 +38,9 @@ SURPRISE = 1e-6
 class Setting:
     """Options of a deployment.
 
-    Regardless of the replanning period, an agent replans at once when an exogenous signal (role `env` in the
-    system file) has changed.
+    An agent replans every `replan` steps. It also replans immediately when an exogenous signal (role `env` in
+    the system file) has changed. A guard judges plans at run time and replaces bad ones; "paper" and "full"
+    are two guards.
 
     Attributes:
         seeds: random seeds; each has a world of its own.
@@ -47,8 +48,8 @@ class Setting:
         steps: number of steps.
         replan: replanning period in steps.
         limit: time limit of a decision of the guard "full", in seconds per agent; None: no limit.
-        ceiling: number of visited states, over all seeds, whose feasibility is determined. Where the followed
-            plan fails, a search looks for a satisfying one.
+        ceiling: number of visited states, over all seeds, whose feasibility is estimated. A state counts as
+            feasible if the followed plan satisfies the specification, or if a search finds a plan that does.
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
         paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.
@@ -143,7 +144,8 @@ class Worlds:
 
         A world's states contain neither the parameters nor the timers of the specification: parameters stay
         constant, and timers are updated from the true states. Sets `eventless`, (rows,): True where no
-        exogenous event occurred, that is, the world's next state equals that of the true dynamics.
+        exogenous event occurred, that is, the next state in the world equals the state that the true dynamics
+        give.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -164,7 +166,7 @@ class Worlds:
         An option is an alternative, such as a goal, among which a world lets its agents choose.
 
         Returns:
-            (rows, k, n); None if the worlds offer no options.
+            (rows, k, n) for k options; None if the worlds offer none.
         """
         given = []
         for world in self.worlds:
@@ -231,7 +233,10 @@ class Worlds:
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays from which the first seed's world draws a picture; shapes are the same at every step."""
+        """Arrays from which a picture is drawn, given by the world of the first seed.
+
+        Every seed has a world of its own. The shapes of the arrays are the same at every step.
+        """
         world = self.worlds[0]
         with blamed(world, "snapshot", "give a snapshot"):
             given = world.snapshot()
@@ -240,7 +245,7 @@ class Worlds:
 
     @property
     def charting(self) -> bool:
-        """True if the world of the first seed can map planned states to picture coordinates."""
+        """True if the world of the first seed can map planned states to coordinates in a picture."""
         return isinstance(self.worlds[0], Charting)
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:

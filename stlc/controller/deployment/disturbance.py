@@ -82,13 +82,19 @@ class Disturbance:
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
-        """Random signs, 1 or -1, (rows, count); those of a seed come from its random stream `stream`."""
+        """Draw random signs, 1 or -1, (rows, count).
+
+        Every seed has several generators of random numbers; `stream` tells which of them draws.
+        """
         shape = (self._agents, count)
         drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
-        """Standard normal numbers, (rows, count); those of a seed come from its random stream `stream`."""
+        """Draw standard normal numbers, (rows, count).
+
+        Every seed has several generators of random numbers; `stream` tells which of them draws.
+        """
         shape = (self._agents, count)
         streams = self._streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
@@ -119,7 +125,7 @@ class Disturbance:
         return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
-        """Evaluate expressions of the scenario, which may draw random numbers: name -> values, (rows,).
+        """Evaluate the random expressions `drawings` of the scenario: name -> values, (rows,).
 
         The expressions read the states `x`, (rows, n), and the time at step number `step`. Each seed draws
         from its own generator.
@@ -228,10 +234,13 @@ class Events:
         self._names, self._dt = tuple(names), dt
 
     def apply(self, x: Tensor, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, int]]:
-        """Apply the events of a step to the states (agents, n).
+        """Apply the events of step number `step` to the states `x`, (agents, n).
+
+        `generator`: source of the random numbers in the events.
 
         Returns:
-            The states afterwards, (agents, n), and how often each event that has a condition fired.
+            The states afterwards, (agents, n), and for each event that has a condition, the number of agents
+            for which it occurred.
         """
         columns = dict(zip(self._names, x.unbind(1), strict=True))
         counts: dict[str, int] = {}

@@ -53,7 +53,10 @@ class LiveMonitor:
         return (self.moment.step if self.moment else 0) * self.task.system.dt
 
     def decided(self, row: int) -> str | None:
-        """Source of the plan that an agent follows: `policy`, `backup T0=2`, …; None after the last step."""
+        """Source of the plan that the agent in row `row` follows; None after the last step.
+
+        Examples: `policy`; `backup T0=2`, a plan of the backup policy with a prefix of 2 actions.
+        """
         decision = self.moment.decision if self.moment else None
         if decision is None:
             return None
@@ -61,7 +64,10 @@ class LiveMonitor:
         return f"{name} T0={t0}" if name == "backup" else name
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Yield one record per agent for the latest step, as `stlc simulate --robustness` writes them."""
+        """Yield, for the latest step, one JSON object per agent.
+
+        `stlc simulate --robustness` writes these objects.
+        """
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):

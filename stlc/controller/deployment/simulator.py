@@ -42,11 +42,11 @@ class DeploymentRecording:
         safe: (rows, steps), whether the followed plan satisfies the requirements tagged `@safety`.
         progress: task progress of each seed.
         units: units of the entries of `progress`.
-        scene: arrays for pictures of the first seed: the world's snapshots, stacked over time, and
+        scene: arrays for pictures of the first seed: the snapshots of its world, stacked over time, and
             `decision`, the source of each agent's plan, (frames, agents). If the world maps planned states to
-            picture coordinates, also `rejected`, the policy's plan that a guard replaced, and `taken`, the
-            plan followed instead: float32 (frames, agents, horizon + 1, 2 or 3), NaN where no plan was
-            replaced.
+            picture coordinates, there are two more arrays: `rejected`, the policy's plans that a guard
+            replaced, and `taken`, the plans followed instead. Both are float32, (frames, agents, horizon + 1,
+            2 or 3), and NaN where no plan was replaced.
         eventless: (rows, steps), whether there was no exogenous event; None if not recorded.
         options: (rows, steps, k, n), states under the options (alternatives that a world offers to its
             agents); None if there are none.
@@ -76,10 +76,10 @@ class DeploymentRecording:
 
 @dataclass
 class Recorder:
-    """Recorder of a deployment that stores every step at once, so that a failure loses no earlier step.
+    """Recorder of a deployment. It stores each step when it happens: a failure loses no earlier step.
 
-    `agents`: number of agents per seed. `pictured`: whether the plans that a guard replaces are recorded,
-    too, for pictures.
+    `agents`: number of agents per seed. `pictured`: whether to record also the plans that a guard replaces;
+    pictures show them.
     """
 
     agents: int
@@ -107,7 +107,7 @@ class Recorder:
         self.start(x, frame)
 
     def chosen(self, x: Tensor, options: Tensor) -> None:
-        """Record a choice among options: the states under all options, and those under the chosen ones.
+        """Record a choice among options (alternatives that a world offers to its agents).
 
         Args:
             x: states under the chosen options, (rows, n); they replace the latest recorded states.
@@ -173,7 +173,10 @@ Watch = Callable[[SimulationStep], None]
 
 
 class _Pilot:
-    """Decision logic of a simulation: the rows that replan at a step, their plans, and the plans' ages."""
+    """Decision logic of a simulation: the rows that replan at a step, their plans, and the plans' ages.
+
+    A row is one agent of one seed. The age of a plan is the number of its actions already executed.
+    """
 
     def __init__(self, guard: Guard, setting: Setting) -> None:
         self.guard, self.replan = guard, setting.replan
@@ -189,8 +192,8 @@ class _Pilot:
         exogenous signal has changed in its true state `x`, or the rest of its plan violates a safety
         requirement. The rest is checked only with the guard "full". The model predicts it from the measured
         state `seen`. If a plan ends before the next regular replanning, its last action is held in this
-        prediction. The last sample of a plan is not checked: a `sweep` predicate covers the segment to the
-        next sample, which is beyond the plan.
+        prediction. The last sample of a plan is not checked: a `sweep` predicate is evaluated between a
+        sample and the next one, and the plan has no next sample.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -228,8 +231,8 @@ class _Pilot:
         """Remainders of the previous plans of the rows in `due`, from the measured states `seen`, (rows, n).
 
         None at the first step. If `replan` > 1, the policy supplies the actions after the end of each plan.
-        Repeating the last action instead might violate the specification; then no previous plan would ever be
-        retained.
+        If the last action were repeated instead, the plan might violate the specification. Then the guard
+        would never retain a previous plan.
         """
         if self.decision is None:
             return None
@@ -245,8 +248,8 @@ def simulate(
     Raises:
         SystemFileError: S207, a method of a world raises an exception or returns a wrong type or shape; S211,
             a world cannot redraw an initial state; S302, its states are not finite.
-        RunError: R405, for an agent, no initial state is drawn from which a plan is known; R402, an action is
-            not finite.
+        RunError: R405, an agent gets no initial state from which a plan is known; R402, an action is not
+            finite.
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
@@ -306,7 +309,8 @@ def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None
     """Check that the actions to be executed, (rows, m), are finite.
 
     Raises:
-        RunError: R402, an action is not finite. The message contains the state of the first such row.
+        RunError: R402, an action is not finite. The message contains the state of the first row with such an
+            action.
     """
     broken = torch.nonzero(~torch.isfinite(action).all(1)).squeeze(1).tolist()
     if not broken:

@@ -32,12 +32,14 @@ if TYPE_CHECKING:
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
-    """Trace file's content for a deployment: one trace per agent and seed, with the decisions about plans.
+    """Content of the trace file of a deployment: one trace per agent and seed.
+
+    `rules`: specification of closed-loop runs; it is stored in the trace.
 
     The trace has further arrays of shape (traces, steps): `action.NAME`, the actuator command, for every
     control; `decision`, the source of the followed plan (0 policy, 1 backup, 2 safest, 3 polished); `t0`, its
     prefix length if it is a plan of the backup policy; `plan_rho`, its robustness; `policy_rho`, robustness
-    of the policy's plan; `foreseen`, 1 if the true next state equals that of the model. Arrays of shape
+    of the policy's plan; `foreseen`, 1 if the true next state equals the model's prediction. Arrays of shape
     (traces,): `seed`, `agent`.
     """
     system = run.task.system
@@ -95,9 +97,12 @@ def save_trace_of(
 def save_unguarded(
     run: Run, recording: DeploymentRecording | None, setting: Setting, rules: Rules | None = None
 ) -> None:
-    """Write the trace and the snapshots of the first seed of a deployment without guard into the run folder.
+    """Write the results of a deployment without guard into the run folder.
 
-    If `recording` is None, delete these files of an earlier deployment.
+    They are the trace, and the snapshots (arrays for pictures) of the first seed. `rules`: specification of
+    closed-loop runs; it is stored in the trace.
+
+    If `recording` is None, delete the files that an earlier deployment wrote.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -153,7 +158,7 @@ def _set_in(spec: str, run: Run) -> dict[str, str]:
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
-    """Write snapshots, stacked over time, as `.npz`.
+    """Write the snapshots `scene` (arrays for pictures, stacked over time) to the `.npz` file `path`.
 
     Raises:
         MissingError: R201, the file cannot be written.

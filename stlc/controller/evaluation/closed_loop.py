@@ -89,9 +89,10 @@ class Share:
         return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
-        """True if this share exceeds the other by more than `NEAR`.
+        """True if this share of satisfying runs exceeds that of `other` by more than `NEAR`.
 
-        With fewer than `LEAST` runs, this must hold with a probability of at least `SURE`.
+        If fewer than `LEAST` runs were made, a second condition must hold: the probability that the true
+        share is better by `NEAR` is at least `SURE`.
         """
         better = self.share > other.share + NEAR
         return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
@@ -119,7 +120,8 @@ class ClosedLoop:
     Attributes:
         shares: result of each simulated guard, the cheapest first; empty if no run was completed.
         steps: length of a run in steps.
-        judge: name of the specification that judges the runs; None if it is that of the plans.
+        judge: name of the specification that judges the runs; None if the specification of the plans judges
+            them.
         why: message of the error that prevented every run; empty if there was none.
     """
 
@@ -130,7 +132,9 @@ class ClosedLoop:
 
     @property
     def recommended(self) -> Share | None:
-        """The cheapest guard whose share of satisfying runs is at most `NEAR` below that of the best guard.
+        """The cheapest guard that is nearly as good as the best one: its share is at most `NEAR` lower.
+
+        The share is that of the runs that satisfy the mission.
 
         A more expensive guard with few runs is preferred only if it is better with high probability (see
         `Share.better_than`). None if there are no runs.
@@ -336,9 +340,10 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Masks of the runs that satisfy the mission, and of those that satisfy its safety requirements.
+        """Masks of the recorded runs that satisfy the mission, and of those that satisfy its safety part.
 
-        Both are (rows,). The second is None if no requirement is tagged `@safety`.
+        Both are (rows,). The safety part consists of the requirements tagged `@safety`; if there are none,
+        the second mask is None.
         """
         rows = len(recording.states)
         if self.rules is None:

@@ -66,8 +66,8 @@ class Deployment:
         metrics: name -> mean over seeds with its confidence interval; see `metrics.METRICS`. Further entries:
             `holds.NAME`, the share of start instants at which requirement NAME holds, and the world's
             progress.
-        decisions: source of the followed plan -> share of the decisions; "backup T0=1" counts the plans of
-            the backup policy with one prefix length.
+        decisions: source of the followed plan -> share of the decisions; "backup" counts all plans of the
+            backup policy, "backup T0=1" those with a prefix of 1 action.
         latency: time of one decision.
         unsafe: the agents with an unsafe trajectory.
         runs: verdicts on the closed-loop runs.
@@ -101,7 +101,8 @@ def deploy(
 ) -> Deployment:
     """Simulate a policy in the world of its system under a guard; `watch` is called at every step.
 
-    `rules`: specification that judges the closed-loop runs; None: the specification of the plans does.
+    `rules`: specification that judges the closed-loop runs; if None, the specification of the plans judges
+    them.
 
     Raises:
         InterruptedDeploymentError: the deployment ended early; `__cause__` is the SystemFileError or RunError
@@ -162,8 +163,8 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
     """Feasibility of `count` visited states, evenly spread over the recording: (rows, steps).
 
-    1: the followed plan satisfies the specification, or a search found one that does; 0: no such plan is
-    known; NaN: the state was not searched.
+    An entry is 1 if the followed plan satisfies the specification, or if a search found a plan that does. It
+    is 0 if no satisfying plan was found, and NaN if the state is not among the `count` states.
     """
     known = np.full(recording.rho.shape, math.nan)
     if count:
@@ -174,7 +175,10 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Source of the followed plan -> share of the decisions; see `Deployment.decisions`."""
+    """Source of the followed plan -> share of the decisions.
+
+    "backup" counts all plans of the backup policy, "backup T0=1" those with a prefix of 1 action.
+    """
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
     for length in np.unique(recording.t0[backup]).tolist():

@@ -38,8 +38,8 @@ class Executed:
     Attributes:
         rules: requirement -> whether it holds, (starts, rows); one start if it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        consistent: (starts, rows), whether all steps in the planning window from the start instant equal
-            those of the model.
+        consistent: (starts, rows), whether all steps in the planning window from the start instant equal the
+            predictions of the model.
         eventless: (starts, rows), whether no exogenous event occurs in the planning window, so that all steps
             equal those of the true dynamics (from which the model may differ); None if not recorded.
         viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
@@ -125,7 +125,10 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
 
 
 def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
-    """Mask of the steps whose recorded next state equals that of the model up to rounding, (rows, steps)."""
+    """Mask of the steps whose recorded next state equals the prediction of the model, (rows, steps).
+
+    Rounding errors are ignored.
+    """
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
@@ -133,7 +136,7 @@ def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
 
 
 def _throughout(right: Mask, task: Task, starts: int) -> Mask:
-    """Mask of the start instants from which `right` is True in all steps of a planning window.
+    """Mask of the start instants from which `right` is True in all steps of a plan's horizon.
 
     `right`: (rows, steps). `starts`: number of start instants. Returns (starts, rows).
     """

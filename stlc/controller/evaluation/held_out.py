@@ -112,8 +112,8 @@ def score(
         n: number of held-out states.
         seed: seed of their random numbers.
         enough: function that returns True to end the evaluation early. If that happens while plans are
-            judged, fewer than `n` states are judged. If it happens during the searches, the results of the
-            interrupted batch of states are discarded, unless it is the first batch.
+            judged, fewer than `n` states are judged. If it happens during the searches, the interrupted batch
+            of states counts as not searched; the first batch always counts as searched.
         report: function that receives the progress as a short text.
     """
     if task.compiled.timers:
@@ -183,9 +183,11 @@ def _judged(
 
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Explore from a few failing states for satisfying plans, and mark the solved states in `known`.
+    """Search by exploration from a few failing states, and mark the solved states in `known`.
 
-    `failing`: indices of the failing states, (k,); those at the start of a mission are taken first.
+    Exploration builds plans step by step from prefixes. `failing`: indices of the states at which the
+    policy's plan fails, (k,); those at the start of a mission are taken first. `enough` returns True to end
+    the search early.
     """
     clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
@@ -198,7 +200,9 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
     """Estimated share of the states from which a satisfying plan exists.
 
-    Only some failing states were searched. The share of these that were solved is assumed for the others.
+    `known`: mask of the states with a known satisfying plan. `searched`: mask of the states that the policy
+    solved or that were searched. `failing`: indices of the states at which the policy's plan fails. Only some
+    of these were searched. The share of them that was solved is assumed for the others.
     """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried

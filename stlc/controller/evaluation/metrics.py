@@ -27,8 +27,8 @@ Mask: TypeAlias = NDArray[np.bool_]
 class Seed:
     """Results of one seed as masks.
 
-    Masks of plans are (agents, steps). Masks of trajectories are (starts, agents), with an entry per start
-    instant.
+    Masks of plans are (agents, steps). Masks of trajectories are (starts, agents): a start instant is one
+    from which a whole planning window (the T steps of a plan) is recorded.
 
     Attributes:
         followed: whether the followed plan satisfies the specification.
@@ -60,7 +60,7 @@ class Seed:
 
     @property
     def of_viable(self) -> Mask:
-        """Mask of the start instants of viable agents."""
+        """Mask, (starts, agents): True at all start instants of the viable agents, else False."""
         return np.broadcast_to(self.viable, self.safe.shape)
 
 

@@ -60,7 +60,7 @@ class Rules:
 
     @property
     def name(self) -> str:
-        """Name of the specification, by default that of its file."""
+        """Name of the specification; by default the name of its file."""
         return self.spec.name or Path(self.path).stem
 
     @property
@@ -118,8 +118,8 @@ class RunVerdicts:
         rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the runs that broke a rule, in the order of their rows.
         viable: (rows,), mask of the runs that could have obeyed the rules, as far as is known. A run that
-            obeyed them counts. A run that broke a rule counts unless it was lost from the start or by an
-            exogenous event. An inconclusive run counts if a safe plan from the start is known.
+            obeyed them is True. A run that broke a rule is False if it was lost from the start or by an
+            exogenous event, else True. An inconclusive run is True if a safe plan from the start is known.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -194,7 +194,7 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 
 
 def rules_of(run: Run) -> Rules | None:
-    """Rules that judge the closed-loop runs of a trained run; None: the specification of the plans does.
+    """Rules for the closed-loop runs of a trained run; None if the specification of the plans judges them.
 
     The run folder contains a copy of the rules that the system file named at training; they are read from
     there. Rules that are named later (by the scenario or with `--set test.judge=…`) are read from their own

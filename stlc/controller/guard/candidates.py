@@ -32,7 +32,10 @@ POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Plans with their verdicts. The leading dimensions (…) are (agents,), or (agents, choices).
+    """Plans with their verdicts.
+
+    The leading dimensions (…) are (agents,), or (agents, choices) if every agent has several plans to choose
+    from.
 
     Attributes:
         plans: (…, T, m) float64, physical units.
@@ -58,7 +61,8 @@ class Candidates:
     ) -> Candidates:
         """Judge plans (agents, …, T, m) from states (agents, n) float64.
 
-        All get the given source and prefix length. `cost`: whether to compute performance costs.
+        `source` and `prefix_length` (see `Candidates`) are those of all plans. `cost`: whether to compute
+        performance costs.
         """
         shape, rows = plans.shape[:-2], plans.flatten(0, -3)
         starts = x.repeat_interleave(len(rows) // max(len(x), 1), 0)
@@ -95,7 +99,10 @@ class Candidates:
         return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def pick(self, choice: Tensor) -> Candidates:
-        """Select for each agent the choice with the index in `choice`, (agents,), from (agents, choices)."""
+        """Select one of the several plans of each agent: (agents, choices) -> (agents,).
+
+        `choice`: for each agent the index of its plan, (agents,).
+        """
         rows = torch.arange(len(choice), device=choice.device)
         return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
 
@@ -120,7 +127,7 @@ class Candidates:
         return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
 
     def beside(self, other: Candidates) -> Candidates:
-        """Join two sets of choices of the same agents: (agents, j) and (agents, k) -> (agents, j + k)."""
+        """Join two sets of plans of the same agents: (agents, j) and (agents, k) -> (agents, j + k)."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in _FIELDS)
         return Candidates(*(torch.cat(pair, 1) for pair in pairs))
 
@@ -153,7 +160,7 @@ def rank(plans: Candidates) -> Tensor:
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
-    """Best allowed choice per row: (rows, choices) -> (rows,) indices.
+    """Index of the best allowed choice in each row: (rows, choices) -> (rows,).
 
     `allowed`: mask of the choices. `keys`: values (rows, choices), larger is better; a later key decides
     between choices that are equal in all earlier ones. NaN is the smallest value.
@@ -191,6 +198,8 @@ class Deadline:
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Computational limits of a decision.
+
+    The guard "paper" searches for plans as Meng and Fan (2023) do; the guard "full" uses more methods.
 
     Attributes:
         seconds: time limit of the guard "full" per agent; the best plan found until then is taken. None: no

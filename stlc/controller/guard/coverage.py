@@ -51,7 +51,7 @@ class Axis:
     def bound(self, radius: float) -> float:
         """Lower bound of Theorem 1 on the covered share, (2 L - 4) radius / range, for L grid values.
 
-        It ignores the ends of the range.
+        The theorem does not account for the ends of the range, so the bound is 0 for 2 grid values or fewer.
         """
         return max(2 * len(self.values) - 4, 0) * radius / (self.high - self.low)
 
@@ -60,7 +60,9 @@ class Axis:
 class Chance:
     """Probability that the backup policy finds a satisfying plan, with prefixes of one length.
 
-    The assumptions, and the prefix u*, are explained at the top of the module.
+    A prefix is a sequence of T0 actions, the first of a plan. The backup policy tries the prefixes of a grid.
+    It is assumed that a prefix leads to a satisfying plan if each of its controls is within `radius` of that
+    of an unknown prefix u*. All values of u* within the control ranges are equally likely.
 
     Attributes:
         radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
@@ -93,10 +95,14 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
     """Compute the probability that the backup policy finds a satisfying plan with prefixes of one length.
 
-    The assumptions, and the prefix u*, are explained at the top of the module. If the grid has M > `samples`
-    prefixes, a sample of them is drawn with replacement. A certain prefix is then tried with probability 1 -
-    (1 - 1 / M)^samples; `bound` and `exact` are multiplied by this number. Both are then lower bounds, since
-    several prefixes may lead to a satisfying plan.
+    A prefix is a sequence of `length` actions, the first of a plan. The backup policy tries the prefixes of
+    the grid that `axes` describes. It is assumed that a prefix leads to a satisfying plan if each of its
+    controls is within `radius` of that of an unknown prefix u*. All values of u* within the control ranges
+    are equally likely.
+
+    If the grid has M > `samples` prefixes, a sample of them is drawn with replacement. A given prefix is then
+    tried with probability 1 - (1 - 1 / M)^samples; `bound` and `exact` are multiplied by this number. Both
+    are then lower bounds, since several prefixes may lead to a satisfying plan.
 
     Args:
         axes: the controls with their grid values.
@@ -124,9 +130,11 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
 
 
 def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
-    """Probability that the backup policy finds a satisfying plan, for each prefix length and each radius.
+    """Compute `chance` for each prefix length of `grid` and each radius in `radii`.
 
-    The lengths are those of the grid. The radii are shares of the control ranges.
+    The result is the probability that the backup policy finds a satisfying plan. It is assumed that a prefix
+    leads to a satisfying plan if each of its controls is within the radius, a share of the control's range,
+    of that of an unknown prefix.
     """
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

@@ -51,7 +51,7 @@ def solve(
         x0: states, (B, n).
         start: starting plans, (B, T, m); the middle of every control range if None.
         library: plans for later passes, (k, T, m); the search also copies parts of them into other plans.
-            None: those of `extremes`.
+            None: plans of 3 constant pieces at the ends and middles of the control ranges (see `extremes`).
         passes: maximum number of passes.
         tries: number of plans judged per pass and state.
         generator: random numbers of the search; a generator with seed 0 if None.
@@ -90,7 +90,7 @@ def solvable(task: Task, x0: Tensor) -> Tensor:
 def viable(task: Task, x0: Tensor) -> Tensor:
     """Mask of the states from which a search finds a safe plan: (B, n) -> (B,).
 
-    A plan is safe if it satisfies the requirements tagged `@safety`; without any, all entries are True.
+    A plan is safe if it satisfies the requirements tagged `@safety`. If there are none, all entries are True.
     """
     if not task.compiled.safety:
         return torch.ones(len(x0), dtype=torch.bool)
@@ -103,7 +103,10 @@ def safety_task(task: Task) -> Task:
 
 
 def extremes(task: Task, generator: torch.Generator) -> Tensor:
-    """Plans of 3 constant pieces, each control at the low end, middle or high end of its range: (k, T, m)."""
+    """Plans of 3 constant pieces, each control at the low end, middle or high end of its range: (k, T, m).
+
+    If there are too many of these plans, `generator` draws some of them.
+    """
     low, high = task.system.control_low, task.system.control_high
     levels = torch.stack((low, 0.5 * (low + high), high))
     shape = (PIECES, len(low))

@@ -36,7 +36,7 @@ class GuardDecision:
             from a grid; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
         safe: (agents,) bool, whether `plan` satisfies phi_safe (the requirements tagged `@safety`).
-        policy_rho: (agents,) float64, robustness of the policy's plan; -inf where that is not finite.
+        policy_rho: (agents,) float64, robustness of the policy's plan; -inf if this plan is not finite.
         proposed: (agents, T, m), the policy's plan, whether it is followed or not.
     """
 
@@ -62,7 +62,7 @@ class GuardDecision:
         return replace(self, plan=plan, action=plan[:, 0])
 
     def of(self, rows: Tensor) -> GuardDecision:
-        """Select agents, (k,) indices."""
+        """The decisions for the agents with the indices `rows`, (k,)."""
         return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
@@ -140,9 +140,9 @@ class Guard:
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
-        """The decision with robustness and verdicts of the task without margins.
+        """The same decision, with robustness and verdicts computed without robustness margins.
 
-        `fresh`: the policy's plans.
+        `x`: states, (agents, n). `fresh`: the policy's plans, (agents, T, m).
         """
         taken = self.task.judge(x, decision.plan, states=False)
         policy_rho = self.task.judge(x, fresh, states=False).rho
@@ -237,7 +237,11 @@ class Guard:
         return found
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Mask of the agents whose remaining plan increases the margin of a satisfied goal, (agents,)."""
+        """Mask of the agents whose remaining plan increases the margin of a goal in one step, (agents,).
+
+        Only goals count that the present state already satisfies, by less than the margin that plans are to
+        reach. `rest`: verdicts on the remaining plans.
+        """
         if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
         return self.task.pending_goals.deepened(rest.columns)

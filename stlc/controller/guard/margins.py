@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
     """Task with tightened safety requirements: the robustness of each is reduced by its margin.
 
-    Predicates on time and constants are unchanged: they decide truth, but their values are never the
-    robustness.
+    Predicates on time and constants are unchanged: they make a formula true or false, but their values never
+    become its robustness.
     """
     if not any(margin.values()):
         return task
@@ -128,11 +128,11 @@ class MarginRequest:
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
         """Return the requested margin of each safety requirement, without margins of 0.
 
-        A calibrated margin replaces `every`, and an entry of `named` replaces both. With the guard "none"
-        nothing is calibrated.
+        A calibrated margin replaces `every`, and an entry of `named` replaces both. `mode`: name of the
+        guard; with "none" nothing is calibrated. `replan`: steps between two decisions of the guard.
 
         Raises:
-            UsageError: U101, `named` contains a name that is not that of a safety requirement.
+            UsageError: U101, a name in `named` belongs to no safety requirement.
         """
         names = [rule.name for rule in task.compiled.safety]
         for name in self.named:

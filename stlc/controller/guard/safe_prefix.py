@@ -19,9 +19,10 @@ BEYOND = "#beyond"
 def open_ended(formula: ir.Formula) -> ir.Formula:
     """Formula whose robustness is an upper bound over all continuations of the known samples.
 
-    The column `BEYOND` must be positive at all samples after the known ones; there, every predicate is made
-    true. The formula must be in negation normal form, so that this never decreases the robustness. The bound
-    is negative exactly if the known samples already violate the formula.
+    At the samples after the known ones every predicate counts as true. The caller marks these samples by a
+    column named `BEYOND`: positive after the known samples, negative before. The formula must be in negation
+    normal form, so that a predicate made true never decreases the robustness. The bound is negative exactly
+    if the known samples already violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -29,10 +30,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """Formula in which predicates on the initial state decide truth, but never give the robustness.
+    """Formula in which predicates on the initial state count as true or false, whatever their value.
 
     Example: in `a -> always b`, let `a` depend on the initial state alone. It is then the same for all plans.
-    So plans that violate the formula are compared by their violation of `b`, not by the robustness of `a`.
+    So plans that violate the formula are compared by the robustness of `b`, not by that of `a`.
     """
     match formula:
         case ir.Predicate():
@@ -71,8 +72,8 @@ def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tens
 
     Returns:
         (time, batch); entry k is the bound over all continuations of the samples 0 to k, so entries do not
-        increase over time. Predicates on the initial state are treated as in `anchored`. +inf without
-        formulas.
+        increase over time. Predicates on the initial state make a formula true or false, but their values
+        never become the bound. Without formulas, all entries are +inf.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

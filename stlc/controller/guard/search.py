@@ -27,7 +27,7 @@ class StagedSearch:
 
     Args:
         task: specification and system.
-        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
+        policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
         guard: name of the guard: "paper" or "full".
         grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision; the defaults of `Limits` if None.
@@ -78,14 +78,14 @@ class StagedSearch:
 class RelaxedSearch:
     """Search of the guard "full" with robustness margins of safety requirements.
 
-    If no plan has the margins, the safe plan with the largest margin is taken. The alternative is a plan that
-    has the full margin for some steps and is then unsafe. It would be worse: a rover beside a wall can stay
-    there.
+    If no plan keeps the required margins, the safe plan with the largest margin is taken. Example: a rover
+    that is already too close to a wall may stay there. A plan that keeps the full margin for some steps and
+    then becomes unsafe would be worse.
 
     Args:
         task: specification without margins, and system.
         strict: the task with margins.
-        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
+        policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
         grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision.
     """
@@ -104,7 +104,7 @@ class RelaxedSearch:
 
     @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Search for better plans in states whose plan was rejected; verdicts are those with margins.
+        """Search for better plans in states whose plan was rejected; verdicts include the margins.
 
         Args:
             x: states, (agents, n) float64.
@@ -131,15 +131,18 @@ class RelaxedSearch:
         return found
 
     def _lacking(self, x: Tensor, plan: Tensor) -> Tensor:
-        """Mask of the agents whose present state has less than the required margin, (agents,)."""
+        """Mask of the agents whose present state has less than the required margin, (agents,).
+
+        `plan`: any plan from the states `x`; only its first sample, the present state, is judged.
+        """
         columns = self.task.system.rollout_columns(x, plan)
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
         """Plans of the stages, run without margins, for agents whose present state lacks the margin.
 
-        A search for the largest margin then starts from those plans that are safe. All other agents get
-        unjudged plans. `lacking`: mask of the agents, (agents,).
+        A search for the largest margin then starts from the safe ones of these plans. `lacking`: mask of the
+        agents whose present state lacks the margin, (agents,). All other agents get unjudged plans.
         """
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]
@@ -153,7 +156,7 @@ class RelaxedSearch:
         return found
 
     def _closer(self, found: Candidates, rows: Tensor, x: Tensor, start: Tensor) -> Tensor:
-        """Search from the plans `start` for safe plans with the largest margin, and put them into `found`.
+        """Search for safe plans with the largest margin, and put the safe plans found into `found`.
 
         Args:
             found: plans of all agents; changed in place.

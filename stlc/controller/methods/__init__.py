@@ -54,7 +54,11 @@ class Method(ABC):
         return self.learns is not None or type(self).learner is not Method.learner
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve the options of a run: those of the user, else of the system file, else of the method."""
+        """Resolve the options of a run.
+
+        An option that the user gave is taken first, then one in the system file, then the default of the
+        method.
+        """
         return base_config(task, config, kind=self.options)
 
     def learner(
@@ -95,7 +99,7 @@ class Validation:
         failing: number of states from which the last search started; 0 without a search.
         repaired: number of states for which the last search found a satisfying plan.
         explored: number of plans that exploration (search over plan prefixes) has found since the previous
-            validation. The remainders of a plan, from states that it passes, count as further plans.
+            validation. The remainder of a plan from a later state on its way counts as a further plan.
     """
 
     accuracy: float
@@ -191,9 +195,10 @@ class Learner(ABC):
         return Validation.of(self.policy.plan_judged(x0)[1]).mean(self.ranks)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly, bit for bit; on the first rank, those of all ranks.
+        """Tensors from which training resumes exactly, bit for bit.
 
-        All ranks (processes that train together) must call this at the same time.
+        All ranks (processes that train together) must call this at the same time. The first rank returns the
+        tensors of all ranks.
         """
         return {"generator": self.generator.get_state()}
 
@@ -222,12 +227,14 @@ class Learner(ABC):
     def torch_reasons(self) -> Mapping[str, str]:
         """Reasons why parts of the training run in torch: name of the part -> reason; "" if it runs in C.
 
-        See `Task.torch_reasons` for the parts.
+        The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
         """
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Explore plan prefixes for satisfying plans, if the last search found too few; by default not.
+        """Search for satisfying plans by exploration, if the last search found too few.
+
+        Exploration builds plans step by step from prefixes. This default method does nothing.
 
         Returns:
             False if `stop` ended the exploration early, else True.
@@ -239,4 +246,4 @@ class Learner(ABC):
         return True
 
     def close(self) -> None:  # noqa: B027
-        """End the work that runs concurrently with the steps."""
+        """End the work that runs concurrently with the training steps."""

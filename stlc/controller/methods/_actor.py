@@ -92,7 +92,10 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restore an optimiser from what `optimizer_tensors` returned, with the prefix removed from the names."""
+    """Restore an optimiser from the tensors that `optimizer_tensors` returned.
+
+    The names in `tensors` lack the prefix that `optimizer_tensors` added.
+    """
     layout = optimizer.state_dict()
     for key, value in tensors.items():
         index, name = key.split(".")

@@ -195,7 +195,10 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def variance(self, inputs: Tensor) -> Tensor:
-        """Variance of the change predicted by the elites, an equal mixture of their Gaussians.
+        """Variance of the predicted change of the state in one step.
+
+        The prediction is an equal mixture of the Gaussians of the elites (networks with the least validation
+        error).
 
         (B, inputs) -> (B, outputs), in squared physical units.
         """
@@ -205,7 +208,10 @@ class Ensemble(nn.Module):
         return found
 
     def predictor(self) -> Predictor:
-        """Make a predictor with a copy of the elites' present weights; it draws samples without gradient."""
+        """Make a predictor, which draws samples of the change of the state, without gradient.
+
+        It gets a copy of the present weights of the elites (networks with the least validation error).
+        """
         return Predictor(self)
 
     def _scaled(self, targets: Tensor) -> Tensor:
@@ -244,7 +250,7 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw a sample of the change for every input; elite number i predicts for `inputs[i]`.
+        """Draw a sample of the change of the state for every input; network i predicts for `inputs[i]`.
 
         Args:
             inputs: (k, B, inputs), where k is at most `elites`.
@@ -282,7 +288,7 @@ def train_ensemble(
     fit: Fit,
     generator: torch.Generator,
 ) -> float:
-    """Train all networks, each on its own bootstrap sample, and select the elites.
+    """Train all networks, each on its own bootstrap sample; select the best ones, the elites.
 
     If there are validation data, every network keeps the weights with the least validation error, and
     training ends once no network has improved by 1 % within `fit.patience` passes.
@@ -327,9 +333,10 @@ def train_ensemble(
 
 
 class _Best:
-    """Record of each network's weights with the least validation error, to which `restore` returns.
+    """Store of each network's best weights so far: those with the least validation error.
 
-    It counts the passes over the data since a network last improved.
+    The method `restore` sets the networks to these weights. The object also counts the passes over the data
+    since a network last improved.
     """
 
     def __init__(self, ensemble: Ensemble, errors: Tensor | None) -> None:

@@ -86,7 +86,9 @@ class ModelConfig(ActorConfig):
 
 
 def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor:
-    """Rewards of all steps of whole episodes, the same as those of `Environments`: (B, T).
+    """Rewards of all steps of whole episodes, (B, T).
+
+    They equal the rewards that the class `Environments` gives while it simulates the same episodes.
 
     Args:
         task: specification and system.
@@ -142,7 +144,10 @@ class Episodes:
         self.count = self.total = 0
 
     def add(self, states: Tensor, actions: Tensor, earned: Tensor) -> None:
-        """Store episodes: states (N, T+1, n), actions (N, T, m), rewards (N, T). The oldest are replaced."""
+        """Store episodes: `states` (N, T+1, n), `actions` (N, T, m), and their rewards `earned` (N, T).
+
+        If the memory is full, they replace the oldest episodes.
+        """
         at = (self.total + torch.arange(len(states))) % len(self.states)
         self.states[at], self.actions[at], self.rewards[at] = states, actions, earned
         self.total += len(states)
@@ -169,7 +174,10 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from what `tensors` returned, with `episodes.` removed from the names."""
+        """Restore the episodes from the tensors that the method `tensors` returned.
+
+        The names in the argument lack the prefix `episodes.`.
+        """
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
             getattr(self, name)[: self.count] = tensors[name]
@@ -214,10 +222,10 @@ class LearntModel:
 
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw the states one step later; the states `x[i]` are advanced by elite number i.
+        """Draw the states one step later; network number i predicts from the states `x[i]`.
 
         Args:
-            x: states, (k, B, n), where k is at most the number of elites.
+            x: states, (k, B, n), where k is at most the number of networks that predict.
             u: controls within their ranges, (k, B, m).
             generator: random numbers of the predictions.
 
@@ -243,7 +251,7 @@ class ModelLearner(Learner):
         episodes: the stored episodes.
         ensemble: the learnt model.
         fitted: number of episodes ever observed (`episodes.total`) at the latest training of the ensemble.
-        error: result of `train_ensemble` at that training; NaN before it.
+        error: validation error of the ensemble after its latest training; NaN before the first.
     """
 
     config: ModelConfig
@@ -254,8 +262,8 @@ class ModelLearner(Learner):
         """Make an untrained ensemble and an empty memory of episodes.
 
         Raises:
-            UsageError: U101, there are several ranks (processes), the device is not the CPU, there is no
-                such reward, or it is `task` and the system declares none.
+            UsageError: U101, there are several ranks (processes), the device is not the CPU, no reward is
+                named `config.reward`, or this name is `task` and the system declares no reward.
         """
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         if ranks.size > 1:
@@ -336,7 +344,7 @@ class ModelLearner(Learner):
 
 
 def ensemble_of(task: Task, config: ModelConfig) -> Ensemble:
-    """Make an ensemble whose initial weights depend only on the seed of the options."""
+    """Make an ensemble whose initial weights depend only on `config.seed`."""
     outputs = len(task.system.decl.signature.names)
     return Ensemble(
         outputs + len(task.system.control_names),

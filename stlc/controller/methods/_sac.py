@@ -39,7 +39,8 @@ class SacConfig(ActorConfig):
 class SacActor(nn.Module):
     """Network from observations to the most probable controls of the actor of stable-baselines3.
 
-    Its weights have the same names as in that actor, so that they can be copied; the package is not needed.
+    Its weights have the same names as in that actor, so that they can be copied. The package
+    stable-baselines3 is not needed to use this class.
 
     Attributes:
         centre: mean of the observations of initial states, (k,).
@@ -66,7 +67,7 @@ class SacActor(nn.Module):
         self.register_buffer("extent", 0.5 * (system.control_high - system.control_low).float())
 
     def normalised(self, observation: Tensor) -> Tensor:
-        """Observations less their mean, divided by their standard deviation, (B, k)."""
+        """Observations minus their mean, divided by their standard deviation, (B, k)."""
         return (observation - self.centre) / self.spread
 
     def controls(self, scaled: Tensor) -> Tensor:

@@ -134,7 +134,8 @@ class RandomState:
     def used(self) -> Iterator[None]:
         """Context in which the global generators continue from the states stored here.
 
-        At its end, the states that they have reached are stored, and their former states are restored.
+        At the end of the context, the states then reached are stored here. The global generators get back the
+        states that they had before the context.
         """
         others = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002 - the library's
         torch.set_rng_state(self.torch)

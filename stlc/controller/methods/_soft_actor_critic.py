@@ -1,6 +1,6 @@
 """Soft actor-critic (Haarnoja et al., arXiv 1812.05905), for methods that learn a model of the system.
 
-Such a method supplies the transitions; this module makes the gradient steps. All random numbers come from the
+The method supplies the transitions; this module makes the gradient steps. All random numbers come from the
 caller's generator, and a checkpoint holds the whole state.
 """
 
@@ -139,8 +139,8 @@ class SoftActorCritic(nn.Module):
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Make one gradient step of critics, actor and temperature; return the loss of the critics, ().
 
-        The losses are those of Equations 5, 7 and 18 of Haarnoja et al., in which the value of an action is
-        the smaller one of those of two critics.
+        The losses are those of Equations 5, 7 and 18 of Haarnoja et al., where the value of an action is the
+        smaller of the values that the two critics give.
         """
         seen, after = self._normalised(batch.seen), self._normalised(batch.after)
         weight = self.temperature.detach().exp()

@@ -25,8 +25,8 @@ class Gradient(NetworkMethod):
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
         """Resolve the options.
 
-        As in Meng and Fan (2023), every step uses newly drawn states, unless `train: {samples: N}` in the
-        system file asks for a fixed training set of N states.
+        As in Meng and Fan (2023), every step uses newly drawn states. With `train: {samples: N}` in the
+        system file, a fixed training set of N states is used instead.
         """
         found = base_config(task, config, kind=self.options, batch=512)
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)

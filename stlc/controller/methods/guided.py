@@ -40,9 +40,9 @@ class Guided(NetworkMethod):
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective with exact min and max, and a saturating hinge at the margin.
+        """Objective with exact min and max, and a saturating hinge at `learner.margin`.
 
-        The margin of the learner is a robustness that the search reaches on most states.
+        This margin is a robustness that the search for plans reaches on most states.
         """
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance

@@ -168,7 +168,7 @@ class MbpoLearner(ModelLearner):
         return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
 
     def _mixed(self, imagined: Batch) -> Batch:
-        """Draw a batch of transitions: the share `config.observed` is observed, the rest is imagined."""
+        """Draw a batch: a share `config.observed` of observed transitions, the rest from `imagined`."""
         size = self.config.batch
         real = min(size, round(self.config.observed * size))
         rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
@@ -272,7 +272,7 @@ class Mbpo(Method):
 
 
 def actor_critic_of(task: Task, config: MbpoConfig) -> SoftActorCritic:
-    """Make actor and critics whose initial weights depend only on the seed of the options."""
+    """Make actor and critics whose initial weights depend only on `config.seed`."""
     return SoftActorCritic(
         task.system.observed_count + 1,
         len(task.system.control_names),

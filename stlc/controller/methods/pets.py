@@ -146,10 +146,10 @@ class PetsPolicy(Policy):
         return torch.cat([self._climbed(part, steps, generator, start) for part, start in parts])
 
     def _climbed(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
-        """Search as `_optimised` does, for all states in one batch.
+        """Search for controls by the cross-entropy method, for all states in one batch.
 
-        Each round samples from a Gaussian, whose mean and variance follow those of the best sequences of the
-        round before.
+        The arguments and the result are those of `_optimised`. Each round samples from a Gaussian, whose mean
+        and variance follow those of the best sequences of the round before.
         """
         config, system = self._config, self.task.system
         low, high = system.control_low, system.control_high

@@ -26,7 +26,7 @@ class PlanConfig(ResolvedConfig):
 
     Attributes:
         planner: name of the planner.
-        options: options of the planner, name -> text, as JSON.
+        options: JSON object with the options of the planner, name -> text.
         seconds: processor time per plan, in seconds.
         evaluations: maximum number of plans judged to find one; 0 for no limit.
     """

@@ -144,7 +144,7 @@ class ActorCritic(nn.Module):
         self.observations, self.returns = Moments(width), Moments(1)
 
     def normalised(self, observation: Tensor) -> Tensor:
-        """Observations less their running mean, divided by their standard deviation, (B, k)."""
+        """Observations minus their running mean, divided by their standard deviation, (B, k)."""
         seen = self.observations
         return ((observation - seen.mean) / seen.spread).clamp(-MOST, MOST)
 
@@ -169,7 +169,9 @@ class ActorCritic(nn.Module):
         return self.density(self.actor(seen), noise, raw), values
 
     def drawn(self, noise: Tensor, white: Tensor) -> Tensor:
-        """Exploration noise of a step, (B, w), in standard deviations, correlated with the step before.
+        """Exploration noise of a step, (B, w), in standard deviations.
+
+        It is correlated with the noise of the step before.
 
         Args:
             noise: exploration noise of the step before, (B, w).
@@ -362,8 +364,8 @@ class PpoLearner(ActorLearner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly: random numbers, network, optimiser.
 
-        On the first rank the random numbers are those of all ranks (processes that train together); all ranks
-        must call this at the same time.
+        All ranks (processes that train together) must call this at the same time. On the first rank, the
+        result contains the random numbers of all ranks.
         """
         own = super().tensors()
         found = dict(own)
@@ -399,7 +401,7 @@ class Ppo(Method):
 
 
 def network_of(task: Task, config: PpoConfig) -> ActorCritic:
-    """Make a network whose initial weights depend only on the seed of the options."""
+    """Make a network whose initial weights depend only on `config.seed`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return ActorCritic(task, config)

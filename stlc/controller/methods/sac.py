@@ -47,8 +47,8 @@ class Sac(Method):
 
         Raises:
             MissingError: R301, stable-baselines3 is not installed.
-            UsageError: U101, there is no such reward, or it is `task` and the system declares none, or
-                several processes are to train together.
+            UsageError: U101, no reward is named `config.reward`; or this name is `task`, and the system
+                declares no reward; or several processes are to train together.
         """
         try:
             from stlc.controller.methods._sb3 import SacLearner

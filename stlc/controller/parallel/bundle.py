@@ -59,7 +59,10 @@ class JobBundle:
 
     @classmethod
     def of(cls, job: Job, cores: int) -> JobBundle:
-        """Pack a job's input files and create its probe file.
+        """Pack the input files of a job, and create its probe file.
+
+        The probe file can be seen only by machines that share the file system of this machine. Its deletion
+        asks them to stop the job.
 
         Raises:
             MissingError: R201, the folder of the job's runs cannot be written.
@@ -82,7 +85,7 @@ class JobBundle:
     def close(self) -> None:
         """Delete the probe file.
 
-        For a worker that shares the file system, this is the request to save and stop.
+        A worker that shares the file system saves and stops when the file is deleted.
         """
         with suppress(OSError):
             Path(self.probe).unlink(missing_ok=True)
@@ -95,7 +98,7 @@ class BundleResult:
     Attributes:
         code: exit code of the training.
         out: standard output of the training.
-        said: end of its standard error.
+        said: the last lines of the standard error of the training.
         cores: number of cores that the job had.
         run: path of the run on the caller's machine; None if nothing has to be transferred.
         files: archive of the run.
@@ -174,7 +177,7 @@ def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> Bund
 def _ran(
     arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
 ) -> BundleResult:
-    """Train in a subprocess and return its result, without files.
+    """Train in a subprocess on the cores `share`, and return its result, without the files of the run.
 
     After Ctrl-C, or once the file `probe` is deleted, the subprocess is asked to save and end.
     """

@@ -85,7 +85,7 @@ class Ranks:
         return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
 
     def agree(self, value: float) -> float:
-        """Broadcast the first rank's number and return it on every rank."""
+        """Broadcast the number `value` of the first rank, and return it on every rank."""
         return self._reduced([value if self.first else 0.0], dist.ReduceOp.SUM)[0]
 
     def agree_on(self, module: nn.Module) -> None:
@@ -95,7 +95,7 @@ class Ranks:
                 self._together(lambda part=part: dist.broadcast(part, 0))  # type: ignore[misc]
 
     def agree_text(self, text: str) -> str:
-        """Broadcast the first rank's text and return it on every rank."""
+        """Broadcast `text` of the first rank, and return it on every rank."""
         if self.size == 1:
             return text
         data = torch.tensor(list(text.encode()), dtype=torch.uint8)
@@ -135,7 +135,7 @@ class Ranks:
         return found
 
     def _together(self, talk: Callable[[], T]) -> T:
-        """Run a collective operation and return its result.
+        """Run the collective operation `talk` and return its result.
 
         Raises:
             MissingError: R403, another rank cannot be reached any more.
@@ -157,7 +157,7 @@ def expected() -> Ranks:
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """Context in which the ranks of this training are connected; yields that of this process.
+    """Context in which the ranks (processes) of this training are connected; yields this process's `Ranks`.
 
     Args:
         device: torch device; on `cuda` every rank of a machine takes a GPU of its own.

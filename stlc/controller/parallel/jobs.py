@@ -48,8 +48,8 @@ class JobResult:
         job: the job.
         code: exit code; negative if a signal ended the process.
         document: JSON object that `stlc train --json` printed; None if it printed none.
-        said: the last lines of its standard error.
-        cores: number of cores reserved for it.
+        said: the last lines of the standard error of the process.
+        cores: number of cores reserved for the job.
     """
 
     job: Job
@@ -65,7 +65,7 @@ class JobResult:
 
     @property
     def why(self) -> str:
-        """Cause of a failure: findings in the printed JSON object, else the last lines of standard error."""
+        """Cause of a failure: the findings that the job printed, else the end of its standard error."""
         findings = (self.document or {}).get("diagnostics") or []
         lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
         return "\n".join(lines) or self.said
@@ -102,7 +102,10 @@ class LocalExecutor:
     def run(
         self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
     ) -> Iterator[JobResult]:
-        """Run jobs and yield the result of each when it ends; `started` is called in another thread."""
+        """Run jobs and yield the result of each when it ends.
+
+        `started` is called with each job when it starts, in another thread.
+        """
         for share in core_shares(self.workers):
             self.shares.put(share)
         with ThreadPoolExecutor(self.workers) as pool, leaving(self.kill):
@@ -203,7 +206,7 @@ def core_shares(jobs: int) -> list[frozenset[int]]:
 
 
 def document_of(text: str) -> dict[str, Any] | None:
-    """JSON object that a process printed; None if `text` is not one."""
+    """Parse the output `text` of a process as a JSON object; None if it is not one."""
     with suppress(ValueError):
         found = json.loads(text)
         if isinstance(found, dict):

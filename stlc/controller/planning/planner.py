@@ -35,7 +35,7 @@ SECONDS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class PlanBudget:
-    """Limits of a search for plans; all but `stop` apply to each initial state by itself.
+    """Limits of a search for plans; except for `stop`, they apply to each initial state separately.
 
     Attributes:
         seconds: processor time in seconds; the time of a batch is shared evenly among its initial states.
@@ -127,8 +127,8 @@ class PlanSearch:
     def open(self) -> Tensor:
         """Indices of the initial states for which the search is to continue, (k,).
 
-        The robustness is below the target, the budget is not spent, the state is not proved infeasible, and
-        the planner has not ended its search.
+        For these states the best robustness is below the target, and some budget is left. The planner has
+        neither proved that no plan satisfies the specification, nor ended its search.
         """
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
@@ -180,7 +180,7 @@ class PlanSearch:
 
     @contextmanager
     def charged(self, rows: Tensor) -> Iterator[None]:
-        """Context that adds its processor time to `seconds`, in equal parts for the states `rows`, (k,).
+        """Context whose processor time is added to `seconds`, in equal parts for the states `rows`, (k,).
 
         At its end, the search's function `progress` is called.
         """

@@ -59,7 +59,7 @@ class Policy(ABC):
         return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans from the states at the ends of many prefixes (first actions of plans): (B, n) -> (B, T, m).
+        """Plans from the states to which many prefixes (first actions of plans) lead: (B, n) -> (B, T, m).
 
         By default these are the plans of `plan`. A policy whose `plan` is slow returns plans that are cheaper
         to compute.

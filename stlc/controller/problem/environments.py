@@ -31,7 +31,10 @@ MOST = 10.0
 
 
 def require_reward(task: Task, reward: str) -> None:
-    """Raise UsageError (U101) if no reward has that name, or it is `task` and the system declares none."""
+    """Raise UsageError (U101) if no reward has the name `reward`.
+
+    The error is also raised if the name is `task`, but the system declares no reward.
+    """
     if reward not in REWARDS:
         raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(REWARDS)}")
     if reward == "task":
@@ -97,7 +100,8 @@ class Environments:
         ahead: number of initial states that are drawn at a time, since drawing few is slow; 0: `count`.
 
     Raises:
-        UsageError: U101, there is no such reward, or it is `task` and the system declares none.
+        UsageError: U101, no reward is named `reward`, or this name is `task` and the system declares no
+            reward.
 
     Attributes:
         task: specification and system.

@@ -178,7 +178,8 @@ class NativeGradient:
         Args:
             x0: initial states, (B, n), not differentiated.
             u: plans in physical units, (B, T, m).
-            slope: slope, per unit, that replaces the derivative of jumps and conditions.
+            slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions at
+                distance x.
         """
         each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
         return each, dict(zip(self.judge.names, columns.unbind(0), strict=True))

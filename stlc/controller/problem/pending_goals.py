@@ -39,7 +39,7 @@ class PendingGoal:
     """Goal `eventually@[a, b]`: a state formula to be satisfied once in steps a to b of a mission.
 
     Attributes:
-        status: name of the state that records whether the goal is satisfied, violated or pending (near 0).
+        status: name of the state that records the status of the goal; it is near 0 while the goal is pending.
         body: the state formula.
         first: first step of the mission at which satisfaction counts.
         last: last step of the mission at which satisfaction counts.
@@ -72,9 +72,11 @@ class PendingGoals:
         self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Margin that a plan lacks, summed over the goals that are pending at the first sample: (batch,).
+        """Shortfall of plans below the margin gamma, over the goals pending at the first sample: (batch,).
 
-        At one goal, a plan lacks gamma minus the margin that it reaches, limited to values from 0 to gamma.
+        gamma is the margin that plans are to reach. At one goal the shortfall is gamma minus the largest
+        margin that the plan reaches there, clipped to the range from 0 to gamma. The shortfalls at all
+        pending goals are added.
 
         Args:
             columns: predicted states, name -> (time, batch); the result is differentiable with respect to
@@ -90,9 +92,10 @@ class PendingGoals:
         return lack
 
     def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Mask of the plans whose first step increases the margin of a goal that the present state satisfies.
+        """Mask of the plans whose first step increases the margin of a goal that the first sample satisfies.
 
-        Only margins below gamma count. The mask is (batch,).
+        A goal counts only if its margin at the first sample is below gamma, the margin that plans are to
+        reach. The mask is (batch,).
 
         Args:
             columns: predicted states, name -> (time, batch).

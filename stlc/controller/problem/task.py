@@ -324,7 +324,10 @@ class Task:
 
     @cached_property
     def _guidance(self) -> ArrayProgram | None:
-        """Program for the guidance cost `gap` (distance to the next goal) at each sample; None: no goals."""
+        """Program that computes the guidance cost (distance to the next goal) at each sample.
+
+        Its output has the name `gap`. None if the specification has no goals.
+        """
         return (
             None
             if self.compiled.guidance_cost is None

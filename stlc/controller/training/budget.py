@@ -68,12 +68,12 @@ def clock_of(name: Clock) -> Callable[[], float]:
 
 
 def verdict_reserve(seconds: float) -> float:
-    """Seconds of a budget reserved for the evaluation on held-out states."""
+    """Part of a budget of `seconds` that is reserved for the evaluation on held-out states, in seconds."""
     return min(0.08 * seconds, 3.0 + 0.02 * seconds)
 
 
 def simulation_reserve(seconds: float) -> float:
-    """Seconds of a budget reserved for closed-loop simulations."""
+    """Part of a budget of `seconds` that is reserved for closed-loop simulations, in seconds."""
     return min(0.15 * seconds, 3.0 + 0.08 * seconds)
 
 
@@ -83,7 +83,7 @@ class TimeBudget:
 
     Attributes:
         now: function that reads the clock, in seconds.
-        started: clock reading at the start, reduced by the time of earlier sessions of a resumed run.
+        started: clock reading at the start, reduced by the time that a resumed run took before.
         allowed: the user's budget in seconds; 0: unlimited.
         seconds: part of the budget that is available to the training.
     """
@@ -101,7 +101,7 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Make the budget of a training; the training may use what other work leaves, but at least half.
+        """Make the budget of a training: the time that other work leaves, but at least half of `allowed`.
 
         Args:
             now: function that reads the clock, in seconds.
@@ -121,7 +121,7 @@ class TimeBudget:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """Entry of a schedule: after step `step`, a total of `steps` steps is planned for the run."""
+    """Entry of a schedule: from step `step` on, the planned total number of steps of the run is `steps`."""
 
     step: int
     steps: int
@@ -318,6 +318,7 @@ class Pace:
         """True once the number of steps is to be planned again.
 
         It is planned once enough steps were timed, and then whenever a share of the budget has passed.
+        `left`: remaining seconds.
         """
         if self._left is None:
             first = self._marks[0][1]

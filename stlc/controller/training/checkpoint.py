@@ -153,7 +153,7 @@ def _shown(folder: Path) -> str:
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
-    """Weights of one module: the tensors whose names begin with `prefix.`, under names without it."""
+    """Weights of one module: tensors whose names begin with `prefix.`, under names without this prefix."""
     return below(checkpoint.tensors, prefix)
 
 

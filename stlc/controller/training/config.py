@@ -116,7 +116,7 @@ class ResolvedConfig:
         pool: number of fresh states judged per search round.
         every: steps between search rounds.
         most: maximum number of hard states from which a search round searches.
-        slope: slope, per unit, that replaces the derivative of jumps and conditions of the system.
+        slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions at distance x.
         imitation: weight of the imitation loss, the distance to the plan that the search found.
         share: weight of the mean loss of all plans of a state; it is added to the loss of the best plan.
         performance: weight of the performance terms in the loss.
@@ -209,7 +209,9 @@ def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
 
 
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
-    """Resolve the options of a run: those of the user, else of the system file, else of the method.
+    """Resolve the options of a run.
+
+    An option that the user gave is taken first, then one in the system file, then the default of the method.
 
     Raises:
         UsageError: U101, there is no such method or option, or a value is invalid.
@@ -264,7 +266,9 @@ def base_config(
     rate: float = 1e-3,
     searches: bool = False,
 ) -> Options:
-    """Resolve the options that all methods have: those of the user, else of the system file, else defaults.
+    """Resolve the options that all methods have.
+
+    An option that the user gave is taken first, then one in the system file, then the default.
 
     Args:
         task: problem to train for.
@@ -297,6 +301,9 @@ def base_config(
 
 
 def _threads(*, searching: bool) -> int:
-    """Number of threads of torch: as set, or all cores but one if a search runs concurrently."""
+    """Number of threads of torch: unchanged, or at most the number of cores less one if `searching`.
+
+    `searching`: whether a search runs concurrently; one core is left to it.
+    """
     most = int(torch.get_num_threads())
     return max(1, min(most, cores() - 1)) if searching else most

@@ -134,7 +134,8 @@ def _motion(step: TrainingStep) -> StlcError | None:
 def _robustness(step: TrainingStep) -> StlcError | None:
     """Error for a requirement whose robustness or gradient is not finite for finite states; None if none.
 
-    The values of all requirements are checked first, since an infinite one spoils the gradients of all.
+    The values of all requirements are checked before the gradients, since one infinite value makes the
+    gradients of all requirements infinite or NaN.
     """
     checks = [
         _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
@@ -185,7 +186,7 @@ def _cost(step: TrainingStep) -> StlcError | None:
 
 
 def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness per requirement (B, R), and states name -> (T+1, B).
+    """Robustness of the plans `u` per requirement (B, R), and states name -> (T+1, B).
 
     Both are differentiable with respect to `u`, in the same way as in training.
     """
@@ -198,7 +199,10 @@ def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Values `value_of` of the plans, (B,), and their gradients with respect to the plans, (B, T, m)."""
+    """Values of the plans, (B,), and gradients of the values with respect to the plans, (B, T, m).
+
+    `value_of`: function from plans to values.
+    """
     u = step.u.detach().requires_grad_()
     value = value_of(u)
     if not value.requires_grad:
@@ -252,9 +256,9 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     """Diagnostic R404, which names requirements that no plan was found to satisfy together.
 
     If bounds prove for a requirement that no plan satisfies it, the first such requirement is named.
-    Otherwise the requirements are tested in turn: a requirement is removed if no plan is found for the
-    remaining ones without it. Those that are left in the end are named. The tests end once `enough` returns
-    True.
+    Otherwise the requirements are tested one after the other. If no plan is found even without the tested
+    requirement, it is removed, because the others already conflict. The requirements left in the end are
+    named. The tests end once `enough` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -341,7 +345,10 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Note of the diagnostic on the extent of the search, since a search without result proves nothing."""
+    """Sentence that says how many plans were tried, since a search without result proves nothing.
+
+    `core`: the conflicting requirements.
+    """
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
@@ -435,7 +442,7 @@ ODD = 0.02
 
 
 def check_mirror(task: Task) -> None:
-    """Check the mirror symmetry of a task on random states and their mirror images.
+    """Check the mirror symmetry that a system file declares, on random states and plans.
 
     Raises:
         SystemFileError: S304, system or specification are not symmetric.
@@ -461,7 +468,9 @@ def check_mirror(task: Task) -> None:
 
 
 def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:
-    """Raise SystemFileError (S304) if two arrays differ in more rows than near-ties explain.
+    """Raise SystemFileError (S304) if two arrays differ in more than a small share of the rows.
+
+    A few rows may differ, because rounding decides conditions that are nearly tied.
 
     Args:
         task: specification and system.

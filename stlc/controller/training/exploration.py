@@ -1,4 +1,4 @@
-"""Search for plans by exploration: a tree of plan prefixes, extended from those that reached new cells.
+"""Search for plans by exploration: plans are built step by step from prefixes (their first actions).
 
 Local search changes whole plans; where many goals have to be reached in order, hardly any change reaches one
 more without losing others. Therefore plans are built from prefixes here. For every prefix, bounds over all
@@ -186,11 +186,11 @@ class Exploration:
         spare: float,
         enough: Callable[[], bool] = lambda: False,
     ) -> SearchResult:
-        """Find satisfying plans from some of the initial states, and from states that these plans pass.
+        """Find satisfying plans from some of the initial states, and from states on the way of these plans.
 
         The states are tried in order while sweeps remain. If the specification adds timers to the state, some
-        states that a plan passes serve as further initial states, since the remainder of the plan may satisfy
-        the specification from there.
+        states on the way of a plan serve as further initial states, since the remainder of the plan may
+        satisfy the specification from there.
 
         Args:
             starts: initial states, (k, n).
@@ -251,7 +251,7 @@ class Exploration:
     # ------------------------------------------------------------------ prefixes
 
     def _grown(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Extend some prefixes of a layer, all by the same random number of steps.
+        """Extend some prefixes (first actions of plans) of a layer, all by the same random number of steps.
 
         Returns:
             Layer of the longer prefixes that may still satisfy the specification.
@@ -266,7 +266,9 @@ class Exploration:
         return self._layer(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _layer(self, states: Numbers, plans: Numbers) -> Layer:
-        """Layer of the prefixes that may still satisfy the specification, out of those given.
+        """Make a layer of the given prefixes that may still satisfy the specification.
+
+        A prefix is a sequence of the first actions of a plan.
 
         Args:
             states: trajectories under the prefixes, (rows, steps + 1, n).
@@ -286,7 +288,9 @@ class Exploration:
         return Layer(states, plans, met, kind, worth, np.zeros(len(worth)))
 
     def _bounds(self, states: Numbers, end: Boundary) -> Numbers:
-        """Bounds on the robustness of every piece over all continuations of trajectories: (rows, pieces).
+        """Bounds on the robustness over all continuations of trajectories, (rows, pieces).
+
+        A piece is a conjunct of the specification; there is one bound per trajectory and piece.
 
         Args:
             states: trajectories, (rows, samples, n).
@@ -302,7 +306,8 @@ class Exploration:
     def _chosen(self, layer: Layer, random: np.random.Generator) -> NDArray[np.int64]:
         """Draw indices of prefixes to extend, (CHILDREN,).
 
-        Prefixes with many satisfied pieces, high worth or few visits are preferred.
+        Prefixes with many satisfied pieces (conjuncts of the specification), high worth or few visits are
+        preferred; see `Layer`.
         """
         kind = _numbered(layer.kind)
         rank = np.empty(len(layer))
@@ -337,8 +342,9 @@ class Exploration:
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
         """Keep the prefix of greatest worth in each cell, and of these at most `KEPT`.
 
-        If there are more, `KEPT` of them are drawn at random, such that all kinds (see `Layer.kind`) have
-        about equal shares.
+        Prefixes are in the same cell if they are of the same kind (see `Layer.kind`) and end in the same
+        region of the state space. If there are more than `KEPT` cells, `KEPT` prefixes are drawn at random,
+        such that all kinds have about equal shares.
         """
         if not len(layer):
             return layer

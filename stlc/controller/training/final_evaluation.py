@@ -64,7 +64,7 @@ class FinalEvaluation:
         config: resolved options of the run.
         time: budget of the training.
         report: called with the progress as a short text.
-        trained: clock reading at the start of the evaluation.
+        trained: clock reading at the end of the training, when the evaluation begins.
     """
 
     writer: RunWriter
@@ -122,7 +122,10 @@ class FinalEvaluation:
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once the diagnosis of conflicts has to end: after twice the time for held-out states."""
+        """True once the diagnosis of conflicting requirements has to end.
+
+        The limit is twice the time for the evaluation on held-out states.
+        """
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property

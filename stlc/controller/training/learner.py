@@ -122,7 +122,7 @@ class Trainer(Learner):
 
     @property
     def rate(self) -> float:
-        """Learning rate of the next step: linear rise, constant peak, half a cosine to 0."""
+        """Learning rate of the next step: it rises linearly, stays constant, and falls to 0 like a cosine."""
         config, hold = self.config, self.config.hold
         rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, config.warmup * self.steps)))
         fallen = max(0.0, self.step / self.steps - hold) / (1.0 - hold)
@@ -145,7 +145,7 @@ class Trainer(Learner):
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reasons why parts of the training run in torch, see `Task.torch_reasons`."""
+        """Reasons why parts of the training run in torch: name of the part -> reason; "" if it runs in C."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
@@ -167,9 +167,10 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Explore plan prefixes for satisfying plans, if the last local search solved hardly any state.
+        """Search for satisfying plans by exploration, if the last local search solved hardly any state.
 
-        The plans found are imitated from then on. If there are none, the next exploration is longer.
+        Exploration builds plans step by step from prefixes. The plans found are imitated from then on. If
+        there are none, the next exploration is longer.
 
         Returns:
             False if `stop` ended the exploration early, which then has no effect; else True.
@@ -193,7 +194,10 @@ class Trainer(Learner):
 
     @property
     def exhausted(self) -> bool:  # type: ignore[override]
-        """True once exploration with the largest effort has found nothing."""
+        """True once exploration with the largest effort has found no plan.
+
+        Exploration builds plans step by step from prefixes.
+        """
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()
@@ -222,7 +226,10 @@ class Trainer(Learner):
         return found.mean(self.ranks)
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
-        """Start a search for better plans, which runs until the next validation."""
+        """Start a search for better plans than `plans` from states `x0`; it runs until the next validation.
+
+        `seed`: seed of its random numbers.
+        """
         tries, steps = self._effort[1], self.config.every
         return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
 
@@ -314,10 +321,11 @@ class Trainer(Learner):
         return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
-        """Margin gamma for the loss, such that plans can reach it.
+        """Margin gamma for the loss: a robustness that plans can reach.
 
-        A search looks for plans from random states. The margin is a share of the median robustness of those
-        that satisfy the specification, clipped to `MARGIN_RANGE`.
+        A search from random states maximises the robustness of plans. The margin is a share of the median
+        robustness of the plans that satisfy the specification, clipped to `MARGIN_RANGE`. If there are none,
+        it is the lower end of this range.
         """
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
@@ -341,7 +349,7 @@ class Trainer(Learner):
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
     def _network(self) -> PlanNetwork:
-        """Make a network whose initial weights depend on the seed of the options alone."""
+        """Make a network whose initial weights depend only on `config.seed`."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
             return self.method.network(self.task, self.config).to(self.device)
@@ -349,9 +357,10 @@ class Trainer(Learner):
     # ------------------------------------------------------------- checkpoints
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors from which training resumes exactly, bit for bit; on the first rank, those of all ranks.
+        """Tensors from which training resumes exactly, bit for bit.
 
-        All ranks (processes that train together) must call this at the same time.
+        All ranks (processes that train together) must call this at the same time. The first rank returns the
+        tensors of all ranks.
         """
         found: dict[str, Tensor] = self._own()
         for index, theirs in enumerate(self.ranks.gather(found), start=1):
@@ -456,7 +465,7 @@ class NetworkMethod(Method):
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
-        """Parameters of the method's loss, with `learner.margin` if the method adapts the margin."""
+        """Parameters of the method's loss; a method that adapts the margin takes it from `learner.margin`."""
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
         """Make a network with random weights, drawn from torch's global generator."""

@@ -91,12 +91,15 @@ class Search:
         return search
 
     def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
-        """Start the search `climb`, whose argument is its stop condition, on a thread; return this object."""
+        """Start the search function `climb` on a thread of `pool`; return this object.
+
+        `climb` receives the stop condition of the search.
+        """
         self._found = pool.submit(climb, self._cancelled.is_set)
         return self
 
     def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
-        """Set up `climb` to run in `steps` equal parts, one per call of `advance`; return this object."""
+        """Let the search `climb` run in `steps` equal parts, one per call of `advance`; return `self`."""
         self._climb, self._share = climb, -(-climb.left // max(1, steps))
         return self
 
@@ -105,7 +108,7 @@ class Search:
         return self._found.done()
 
     def advance(self) -> None:
-        """Do one part of a search in torch; nothing if a thread of its own runs the search."""
+        """Do the next part of a search in torch; do nothing for a search that runs on a thread of its own."""
         if self._climb is not None and not self.done():
             for _ in range(self._share):
                 if not self._climb.generation():
@@ -154,7 +157,9 @@ class Searcher:
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
     ) -> SearchResult:
-        """Improve plans until their robustness is `enough` or `tries` plans per state were judged.
+        """Improve plans until they reach the target robustness, or until `tries` plans per state were judged.
+
+        The target is the number `enough` that the constructor received.
 
         Args:
             x0: states, (B, n).
@@ -178,9 +183,10 @@ class Searcher:
         steps: int = 1,
         seed: int | None = None,
     ) -> Search:
-        """Start `repair` as a search that runs concurrently with other work.
+        """Start the search that `repair` describes, concurrently with other work; return it.
 
-        The native kernel leaves its result on the CPU; torch works in `steps` parts, see `Search.advance`.
+        The native kernel runs on a thread of its own and leaves its result on the CPU. In torch, the search
+        is divided into `steps` parts; each call of `Search.advance` does one part.
         """
         seed = self._seed() if seed is None else seed
         search = Search(x0, plans, seed)
@@ -227,7 +233,7 @@ class Searcher:
 
 
 class _TorchClimb:
-    """Local search in torch, like that of the native kernel; a generation is one batch of changed plans.
+    """Local search in torch, by the method of the native kernel; a generation is a batch of changed plans.
 
     Attributes:
         found: the best plan of each state until now.
@@ -250,10 +256,10 @@ class _TorchClimb:
 
     @torch.no_grad()
     def generation(self, stop: Stop = never) -> bool:
-        """Try `TRIES` changed plans for every state whose plan has not reached the robustness `enough`.
+        """Try `TRIES` changed plans for every state whose plan has not reached the target robustness.
 
         Returns:
-            False if no generation is left or all plans have reached it, else True.
+            False if no generation is left or all plans have reached the target, else True.
         """
         still = (self.found.rho < self.enough).nonzero()[:, 0]
         if self.left == 0 or not len(still):
@@ -297,7 +303,10 @@ class _TorchClimb:
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
-        """Random plans of the library `bank`, (B, count, T, m); if it holds few, piecewise constant plans."""
+        """Random plans of the library `bank`, or random piecewise constant plans if it holds few plans.
+
+        They are (B, count, T, m).
+        """
         states, steps, controls = plans.shape
         if bank.shape[0] >= 64:
             return bank[self._randint(0, bank.shape[0], states, count)]

@@ -225,7 +225,10 @@ def _without_steps(
 
 
 def _require_as_many(before: int, now: int) -> None:
-    """Raise UsageError (R104) if the number of ranks (processes) `now` is not that of the run `before`."""
+    """Raise UsageError (R104) if the number of ranks (processes) has changed since the run was made.
+
+    `before`: number of ranks of the run. `now`: number of ranks at present.
+    """
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
         raise UsageError(
@@ -345,7 +348,7 @@ class _Session:
     def _planned(self) -> int:
         """Plan the total number of steps by the budget or the schedule, and return it.
 
-        A new plan is recorded in the schedule and in the learner.
+        A changed number is recorded in the schedule and in the learner.
         """
         learner = self.learner
         if self.time.allowed:
@@ -445,7 +448,7 @@ class _Session:
         self.watch.row(row)
 
     def _broken(self) -> StlcError:
-        """Return the error with the cause of a step that was not finite, and record that the run failed.
+        """Return the error that explains a step without finite loss or gradient; mark the run as failed.
 
         The weights before that step are saved if they are finite.
         """

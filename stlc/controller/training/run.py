@@ -126,7 +126,10 @@ class RunWriter:
             self.folder.update(facts)
 
     def before(self, step: int) -> None:
-        """Remove rows of validations at `step` and later from `train.jsonl`; these steps are run again."""
+        """Remove the rows of validations at step `step` and later from `train.jsonl`.
+
+        A resumed training makes these steps again.
+        """
         if self.writes:
             self.folder.keep_rows(lambda row: row.get("step", 0) < step)
 

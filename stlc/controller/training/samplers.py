@@ -145,9 +145,10 @@ class Missions(Supply):
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Continue some missions from states that plans (k, T, m) reach from states (k, n).
+        """Continue some missions from states on the way of plans that a search found.
 
-        The plans were found by a search from states at which the policy failed.
+        `states`: states at which the policy failed, (k, n). `plans`: the plans found from there, (k, T, m).
+        The state after a random number of steps of each plan is used.
         """
         if len(states) and len(self.pool):
             judged = self.task.judge(states, plans)
@@ -180,7 +181,7 @@ class Missions(Supply):
         return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
-        """Restart missions that are over or can no longer succeed, and some of those whose plan fails.
+        """Restart missions that are over or can no longer succeed, and some others whose plan fails.
 
         `good` tells for each mission whether its present plan satisfies the specification, (POOL,).
         """
@@ -195,7 +196,7 @@ class Missions(Supply):
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
-        """Predicted states under each judged plan after its number of steps, `steps` (n,): (n, dim)."""
+        """Predicted state after `steps[i]` steps of plan i, for all judged plans: (n,) -> (n, dim)."""
         return torch.stack(
             [judged.columns[name].gather(0, steps[None])[0] for name in self.task.system.names], 1
         )
@@ -213,8 +214,9 @@ class Missions(Supply):
 def mission_steps(task: Task) -> int:
     """Number of steps for which a mission is simulated.
 
-    If the specification names no times, it ends after four horizons. Otherwise it ends one horizon after the
-    last time named. If requirements recur forever, it ends `ROUNDS` periods after that time instead.
+    If the specification names no times, the mission ends after four horizons. If it does, the mission ends
+    one horizon after the last of these times. If requirements recur forever, the mission ends `ROUNDS`
+    periods after that time; a period is at least a horizon.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
@@ -226,10 +228,10 @@ def mission_steps(task: Task) -> int:
 
 @torch.no_grad()
 def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
-    """States that missions pass when simulated with the policy, in random order, (n, dim) float64.
+    """States visited by missions that are simulated with the policy, in random order, (n, dim) float64.
 
-    The simulation ends early once `enough` returns True. Initial states are added if there are fewer than
-    `n`.
+    The simulation ends early once `enough` returns True. If fewer than `n` states were visited, initial
+    states are added.
     """
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)

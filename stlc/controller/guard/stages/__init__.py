@@ -34,7 +34,7 @@ class Setup:
 
     Attributes:
         task: specification and system.
-        policy: policy that plans from the ends of prefixes (sampled first actions of plans).
+        policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
         grid: values of the controls in prefixes, and lengths of prefixes.
         limits: computational limits of a decision.
         guard: name of the guard.
@@ -50,7 +50,7 @@ class Setup:
 
     @property
     def enough(self) -> float:
-        """Robustness at which the search for a plan ends."""
+        """Robustness at which the search for a plan ends: a small share of gamma, at which training aims."""
         return TO_SPARE * self.task.system.decl.objective.gamma
 
 

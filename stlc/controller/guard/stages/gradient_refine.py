@@ -117,7 +117,8 @@ class GradientAscent:
     def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
         """Run one round of ascent; return the best plans, (agents, KEPT, T, m), and their values, best first.
 
-        Values (agents, KEPT) are those of `_worth`. `plans`: (agents, k, T, m). `rate`: initial step size.
+        Plans are compared by their values, (agents, KEPT); larger is better. `x`: states, (agents, n).
+        `plans`: starting plans, (agents, k, T, m). `rate`: initial step size. `until`: deadline.
         """
         plans, value = self._raised(x, plans, rate, until)
         order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
@@ -138,7 +139,9 @@ class GradientAscent:
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Run gradient ascent from plans (agents, k, T, m).
+        """Run gradient ascent from the plans `plans`, (agents, k, T, m).
+
+        `x`: states, (agents, n). `rate`: initial step size. `until`: deadline.
 
         Returns:
             The best iterate from each plan, (agents, k, T, m), and its value (see `_worth`), (agents, k).
@@ -169,10 +172,13 @@ class GradientAscent:
         return best.reshape(plans.shape), value.reshape(agents, count)
 
     def _worth(self, each: Numbers) -> Numbers:
-        """Values by which plans are compared, from their robustness per requirement, (rows, R) -> (rows,).
+        """Values by which plans are compared: (rows, R) -> (rows,); larger is better.
 
-        The value is the robustness of the specification plus `APART` if the plan satisfies it; its robustness
-        if the plan is only safe; else the robustness of the safety requirements minus `APART`.
+        `each`: robustness of the plans per requirement, (rows, R).
+
+        If a plan satisfies the specification, the value is its robustness plus the large number `APART`. If
+        the plan is only safe, it is the robustness alone. If the plan is unsafe, it is the robustness of the
+        safety requirements minus `APART`.
         """
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
@@ -181,7 +187,9 @@ class GradientAscent:
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        """Scaled robustness per requirement, (rows, R), and a function for its gradient.
+        """Scaled robustness of plans per requirement, (rows, R), and a function for its gradient.
+
+        `x`: states, (rows, n). `u`: plans, (rows, T, m).
 
         A robustness of NaN becomes -inf. The function maps weights (rows, R) to the gradient of the weighted
         sum of the robustness values with respect to the plans (vector-Jacobian product), (rows, T, m).
@@ -203,7 +211,11 @@ class GradientAscent:
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
-        """Unscaled robustness per requirement, (rows, R), and gradient function of `_judged`, by torch."""
+        """Unscaled robustness per requirement, (rows, R), and a function for its gradient, computed by torch.
+
+        `x`: states. `u`: plans. The function maps weights (rows, R) to the gradient of the weighted sum of
+        the robustness values with respect to the plans, (rows, T, m).
+        """
         with torch.enable_grad():
             u = u.requires_grad_()
             columns = self.task.system.rollout_columns(x, u, StraightThrough(SLOPE))

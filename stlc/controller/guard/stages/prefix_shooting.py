@@ -4,7 +4,7 @@ The lengths T0 = 1, 2, … are tried in turn. The prefixes of a length are all s
 of L values per control; these are M = L^(m T0), or a random sample if M is too large. Each prefix is applied
 from the present state, and the policy plans from its end. The first T0 is chosen at which a plan satisfies
 the specification, or at least the requirements tagged `@safety`. One addition to the paper (decision record
-37 in `docs/decisions`): the remainder of the previous plan is a candidate too, so that a safe plan is not
+37 in `docs/decisions`): the remainder of the previous plan is also a candidate, so that a safe plan is not
 lost after its first action.
 """
 
@@ -31,8 +31,8 @@ class PrefixShooting(GuardStage):
 
     If no plan with a prefix of some length satisfies the specification, a safe plan with such a prefix is
     accepted. Plans with prefixes of equal length are ordered by robustness, then by the performance cost of
-    the objective, then by closeness to the policy's plan. The cost matters where a deadline cannot be met:
-    there, all plans have the same robustness.
+    the objective, then by closeness to the policy's plan. The cost matters if a deadline of the specification
+    cannot be met: then all plans have the same robustness.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
@@ -50,9 +50,11 @@ class PrefixShooting(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan of the smallest prefix length T0 with a satisfying or safe plan, for each agent.
+        """The best plan of each agent, from the shortest prefixes with which some plan is satisfying or safe.
 
-        An agent without such a plan gets an unjudged one.
+        Prefixes (first actions of plans) of length T0 = 1, 2, … are tried in turn.
+
+        An agent for which no length gives a safe plan gets an unjudged one.
         """
         deadline = Deadline() if self.patient else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
@@ -78,11 +80,14 @@ class PrefixShooting(GuardStage):
     def candidates(
         self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
     ) -> Iterator[tuple[Tensor, Candidates]]:
-        """Candidate plans of the prefix length T0 = `length` for the agents `rows[todo]`, group by group.
+        """Candidate plans with prefixes of `length` actions for the agents `rows[todo]`, group by group.
+
+        `rows`: indices of agents among the rejected ones. `todo`: indices of entries of `rows`.
 
         Yields:
-            The entries of `todo` in a group, (k,), and their agents' candidates, (k, choices). Choice 0 has
-            the prefix of the policy's own plan; the last choice is the remainder of the previous plan.
+            The part of `todo` that forms the group, (k,), and the candidate plans of its agents, (k,
+            choices). Choice 0 has the prefix of the policy's own plan. If there are previous plans, the last
+            choice is the remainder of the previous plan.
         """
         prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
         for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):

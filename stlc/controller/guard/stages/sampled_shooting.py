@@ -75,7 +75,10 @@ class SampledPrefixes:
 
 
 class SampledShooting(GuardStage):
-    """Guard stage: the best plan of sampled prefixes, and of local searches from the best of these."""
+    """Guard stage: plans from sampled prefixes, and local searches that start from the best of them.
+
+    A prefix is a sequence of the first actions of a plan; the policy plans the rest.
+    """
 
     turns: ClassVar[Mapping[str, int]] = {"full": 40}
 

@@ -111,7 +111,7 @@ class Cem:
 
 
 class _Plans:
-    """Space of whole plans: the vector is the plan, (T m,)."""
+    """Space of whole plans: a sampled vector contains all T m controls of a plan."""
 
     def __init__(self, task: Task, how: Cem) -> None:
         system = task.system

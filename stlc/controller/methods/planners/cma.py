@@ -22,8 +22,8 @@ class Cma:
 
     Attributes:
         sigma: initial standard deviation, in half-widths of the control ranges.
-        population: number of samples per generation; 0 for the package's default, 4 + 3 ln(d), where d is the
-            number of entries of a plan.
+        population: number of samples per generation; 0 for the default of the package `cma`, 4 + 3 ln(d),
+            where d is the number of entries of a plan.
         diagonal: whether the covariance is diagonal, which is faster for long plans.
     """
 
@@ -54,8 +54,10 @@ class Cma:
     def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
         """Run CMA-ES once for the initial state with index `row`.
 
-        The run ends once it has converged, reached the target robustness, or spent the budget. Its population
-        is doubled `restarts` times; with `restarts` 0 it begins at the initial guess, else at random.
+        The run ends once it has converged, reached the target robustness, or spent the budget. `restarts`:
+        number of earlier runs for this state; each of them doubles the population of the next run. The first
+        run begins at the initial guess, later runs begin at random plans. `strategy`: class for CMA-ES of the
+        package `cma`.
         """
         system, rows = search.task.system, torch.tensor([row])
         low, high = system.control_low.double(), system.control_high.double()

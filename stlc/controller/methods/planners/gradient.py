@@ -27,8 +27,8 @@ class GradientPlanner:
         steps: number of gradient steps, after which the search begins anew from random latent plans.
         starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
         rate: learning rate of Adam.
-        slope: slope that replaces the derivative of jumps and conditions of the system if the objective is
-            `exact`.
+        slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions of the system
+            if the objective is `exact`.
     """
 
     objective: str = "exact"

@@ -59,7 +59,8 @@ class Milp:
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by mixed-integer linear programs.
 
-        Programs of a few initial states are written at once, to find expressions that cannot be encoded.
+        The programs for a few random initial states are built before the search, to report expressions that
+        cannot be encoded.
 
         Raises:
             UsageError: U101, an expression has no mixed-integer linear form; the message shows it.
@@ -84,7 +85,7 @@ class Milp:
                 return
 
     def _search(self, search: PlanSearch) -> None:
-        """Offer the plans that a short local search finds, for all initial states at once."""
+        """Run a short local search for all initial states together, and offer its plans to `search`."""
         rows, task = search.open(), search.task
         with search.charged(rows):
             searcher = Searcher(task, search.generator, enough=search.budget.target or TOLERANCE)
@@ -123,11 +124,14 @@ class Milp:
     def _solved(
         self, task: Task, state: Tensor, goal: _Goal, limit: _Limit, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Solve the program for a plan from one state, (n,), with the robustness of `goal`.
+        """Solve the program for a plan from the state `state`, (n,), with the robustness that `goal` demands.
+
+        `limit`: condition that ends the solve early. `highs`: the module of HiGHS. `tight`: if True, every
+        solution is a plan of the system; if False, every satisfying plan is a solution.
 
         Returns:
-            `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), None unless
-            found.
+            `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), if it was found,
+            else None.
         """
         encoding, cost = _encoded(task, state, goal.target, known=goal.known, tight=tight)
         if not encoding.model.feasible:
@@ -156,7 +160,7 @@ class _Goal:
     """Robustness that a plan must reach.
 
     Attributes:
-        target: this robustness; inf to maximise it.
+        target: the robustness; inf: as large as possible.
         known: robustness of a plan that is already known. If the robustness is maximised, only plans that
             reach at least this value are of interest.
     """
@@ -194,8 +198,8 @@ class _Limit:
 def _without_collection() -> Iterator[None]:
     """Context without cyclic garbage collection.
 
-    A program consists of tens of thousands of small objects without cycles. They would set off collections
-    that visit all objects of the process.
+    A program consists of tens of thousands of small objects without cycles. Their creation would trigger
+    collections, each of which visits all objects of the process.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -213,10 +217,11 @@ def _at(form: Affine, values: Any) -> float:
 def _encoded(
     task: Task, state: Tensor, target: float, *, known: float = 0.0, tight: bool
 ) -> tuple[Encoding, Affine]:
-    """Program whose solutions are plans from a state with a robustness of at least `target`, and its cost.
+    """Program whose solutions are plans from the state `state`, and the cost to be minimised.
 
-    If `target` is inf, the robustness is at least `known`, and the cost to be minimised is the negative
-    robustness. Otherwise the cost is 0. For `tight`, see `Encoding`.
+    If `target` is finite, the robustness of the plans is at least `target`, and the cost is 0. If `target` is
+    inf, the robustness is to be maximised: it is at least `known`, and the cost is its negative. `tight`: if
+    True, every solution is a plan of the system; if False, every satisfying plan is a solution.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.

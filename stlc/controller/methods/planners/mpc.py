@@ -42,7 +42,7 @@ class Mpc:
     Attributes:
         guesses: number of guesses; the first is the initial guess of the search, the others are random
             controls that are constant over five pieces.
-        drawn: number of random plans of which the most robust is a guess.
+        drawn: number of random plans that are judged for one guess; the most robust of them is taken.
         iterations: maximum number of iterations of the interior-point method from each guess.
         smoothing: scale of log-sum-exp for minima and maxima within conditions.
         sharpness: greatest slope of the smooth indicators of conditions.
@@ -121,10 +121,11 @@ class Mpc:
     def _improve(
         self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
     ) -> None:
-        """Solve the program for one initial state from a guess (T, m), and offer the plan to the search.
+        """Solve the program for one initial state from the plan `guess`, (T, m); offer the result.
 
-        The program may be nearly feasible although the exact robustness of the plan misses the target. It is
-        then solved once more with a larger margin, which is increased by the missing robustness.
+        `search` keeps the result if it is better. `rows`: index of the state, (1,). The solution may violate
+        the program only slightly, but miss the target of the exact robustness. Then the program is solved
+        once more, with a margin increased by the missing robustness.
         """
         target = search.budget.target
         maximise = math.isinf(target)
@@ -142,7 +143,11 @@ class Mpc:
             margin += self.margin + target - rho
 
     def _mend(self, search: PlanSearch, rows: Tensor, searcher: Searcher) -> None:
-        """Continue with a short local search from the best plan of one initial state, if nearly robust."""
+        """Improve the best plan of one initial state by a short local search.
+
+        This is done only if the plan misses the target robustness by little. `rows`: index of the state,
+        (1,).
+        """
         missed = search.budget.target - float(search.rho[rows])
         if self.repair and TOLERANCE < missed <= NEARLY:
             found = searcher.at_once(search.states[rows], search.plans[rows], tries=self.repair)
