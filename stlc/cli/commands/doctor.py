@@ -25,7 +25,7 @@ _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 def doctor(
     quick: Annotated[bool, typer.Option("--quick", help="Do not import torch to look for devices.")] = False,
 ) -> Answer[InstallationReport]:
-    """Check the installation: versions, devices, packages and shell completion.
+    """Check the installation: versions, devices, packages, completion.
 
     Exit code: 0, or 5 if a required package is missing.
     """

@@ -22,7 +22,7 @@ def schema(
         str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
     ] = None,
 ) -> None:
-    """Print the JSON Schema of a command's --json output, or list all schemas.
+    """Print the JSON Schema of the --json output of a command.
 
     Within one major version keys are added but never removed.
     """

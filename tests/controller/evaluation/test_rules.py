@@ -16,7 +16,7 @@ from stlc.controller.evaluation.rules import Lost, Rules, judge_runs, judge_runs
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run, load_task
+from stlc.controller.training.run import Run, task_of_run
 from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
@@ -66,7 +66,7 @@ def task_of(home: Path, overrides: Mapping[str, str] | None = None) -> Task:
 
 
 def opened(folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None) -> Run:
-    return Run(folder, load_task(folder, overrides, scenario), None)  # type: ignore[arg-type]
+    return Run(folder, task_of_run(folder, overrides, scenario), None)  # type: ignore[arg-type]
 
 
 def run_of(home: Path, overrides: Mapping[str, str] | None = None) -> RunDir:
