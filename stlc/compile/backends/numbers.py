@@ -19,7 +19,9 @@ V = TypeVar("V")
 
 
 class NumberEvaluator(ABC, Generic[V]):
-    """Evaluator of numeric expressions; the back end decides what a value is (a tape register, a name in C).
+    """Evaluator of numeric expressions. The type of a value depends on the back end.
+
+    For example, a value is a register of a tape, or a name in C code.
 
     Attributes:
         bound: name of a signal -> value that replaces it.
@@ -55,9 +57,9 @@ class NumberEvaluator(ABC, Generic[V]):
                 return self._leaf(leaf)
 
     def inlined(self, body: ir.Body, args: Sequence[V]) -> Self:
-        """Return an evaluator for the body of a function, in which its parameters have the values `args`.
+        """Return an evaluator for the body of a function whose parameters have the values `args`.
 
-        The intermediate variables of the body are already evaluated.
+        In the returned evaluator, the intermediate variables of the body already have their values.
         """
         key = (id(body), *map(repr, args))
         inner = self._calls.get(key)
@@ -87,7 +89,7 @@ class NumberEvaluator(ABC, Generic[V]):
 def margin_of(formula: ir.Formula) -> ir.Num:
     """Return the robustness of a state formula (one without temporal operators) as an expression.
 
-    Guards (predicates that count as +-inf) become ordinary predicates.
+    Guards are treated as ordinary predicates. (Elsewhere the robustness of a guard is +inf or -inf.)
 
     Raises:
         Untranslatable: the formula has a temporal operator.

@@ -1,8 +1,9 @@
 """Numeric expressions (`ir.Num`) as programs over any array library.
 
 A program is built once and called often. Its operations are recorded on a tape, a list of operations
-(`stlc.compile.backends.array.tape`), with one tape for exact conditions (0 or 1) and one for soft ones. The
-operations are then bound to the functions of an array library; a call executes them in order.
+(`stlc.compile.backends.array.tape`). There are two tapes: one evaluates conditions exactly, as 0 or 1; the
+other evaluates them smoothly, as numbers between 0 and 1. The operations are then bound to the functions of
+an array library, and each call executes them in order.
 """
 
 from __future__ import annotations
@@ -35,13 +36,14 @@ class ArrayProgram:
 
     Args:
         outputs: name of an output -> expression to compute.
-        constants: signals whose value is known when the program is built (`dt`, constants of a system).
-        externs: functions of the system that `ir.Extern` names.
+        constants: name of a signal -> value, for signals that are constant (`dt`, constants of a system).
+        externs: name of a function that the system provides (`ir.Extern`) -> the function.
 
-    A call takes a dictionary with one array for each name in the attribute `columns`; the arrays must
-    broadcast. A signal that is read some samples earlier or later needs an entry of its own; the attribute
-    `shifted` lists the names of these entries. The call returns one array per output; a constant output has
-    the shape of the first array in the dictionary. Common sub-expressions are computed once.
+    A call takes a dictionary with one array for each name in the attribute `columns`; the shapes of the
+    arrays must broadcast. If an expression reads a signal some samples earlier or later, the shifted signal
+    is a separate array; the attribute `shifted` lists the names of such arrays. The call returns one array
+    per output. A constant output has the shape of the first array in the dictionary. Common sub-expressions
+    are computed once.
     """
 
     def __init__(
@@ -64,10 +66,10 @@ class ArrayProgram:
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
-        """Return the value of each output, by name, from the arrays `env`.
+        """Return the value of each output, by name, computed from the arrays `env`.
 
-        `switch` converts a condition to a number from 0 (false) to 1 (true). If it is None, the number is
-        exactly 0 or 1.
+        `switch` converts a condition to a number from 0 (false) to 1 (true). If `switch` is None, the number
+        is exactly 0 or 1.
         """
         switch = switch or Hard()
         like = _first(env)
@@ -79,7 +81,11 @@ class ArrayProgram:
             return bound.run(env, ops)
 
     def operations(self, *, exact: bool = True) -> int:
-        """Number of array operations per call, with exact conditions (0 or 1) or with soft ones."""
+        """Number of array operations per call.
+
+        If `exact`, conditions are evaluated as 0 or 1. Otherwise they are evaluated as numbers between 0 and
+        1.
+        """
         tape, outputs = self._tape(exact=exact)
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
@@ -138,9 +144,12 @@ class ArrayProgram:
 class _Bound:
     """Tape (list of operations) bound to the functions of an array library, ready to run.
 
-    `registers` is the initial memory of a run, with the constants in place. Each output is an entry either in
-    `arrays` (name -> number of the register with its value) or, if it is constant, in `numbers` (name ->
-    value).
+    Attributes:
+        inputs: pairs of the name of an input and the register into which the input is copied.
+        code: operations in order, as (function, registers of the operands, register of the result).
+        registers: initial memory of a run, with the constants in place.
+        arrays: name of an output -> register with its value.
+        numbers: name of a constant output -> its value.
     """
 
     inputs: list[tuple[str, int]]
@@ -169,7 +178,10 @@ def _first(env: Mapping[str, Array]) -> Array:
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
-    """Numbers of the registers of `tape` on which the registers `outputs` depend, in ascending order."""
+    """Registers that must be computed to obtain `outputs`, in ascending order.
+
+    `outputs` contains registers of `tape`, and constants, which need no computation.
+    """
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
     while stack:
@@ -237,8 +249,8 @@ class _TapeWriter(NumberEvaluator[Operand]):
     def _truth(self, cond: ir.Formula) -> int | bool:
         """Return the register of the mask that is true where a state formula holds.
 
-        If the truth of the formula is constant, the truth value itself is returned. A state formula has no
-        temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
+        If the formula is always true or always false, the truth value itself is returned. A state formula has
+        no temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
         """
         match cond:
             case ir.Truth(value):
@@ -264,10 +276,11 @@ class _TapeWriter(NumberEvaluator[Operand]):
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
         """Return the register of a state formula's soft weight, a number between 0 and 1.
 
-        If the weight is constant, its value is returned. The weight is computed from the margin (robustness)
-        of the formula, for instance as `(1 + tanh(sharpness * margin)) / 2`. A default replaces a `sharpness`
-        of None. If the formula contains both `>` and `>=`, it may be true or false where its margin is 0; the
-        weight is then adjusted by the exact truth (`Switch.settle`).
+        If the weight is constant, its value is returned instead. The weight is computed from the margin
+        (robustness) of the formula, for instance as `(1 + tanh(sharpness * margin)) / 2`. If `sharpness` is
+        None, the switch uses its default. A formula with both `>` and `>=` may be true or false where its
+        margin is 0. For such a formula, the exact truth is computed as well, and the switch adjusts the
+        weight to it (`Switch.settle`).
         """
         kinds = _strictness(cond)
         margin = self.margin(cond)
@@ -301,9 +314,9 @@ def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops
     program take their shape from it.
 
     Args:
-        program: program whose inputs are read; all samples that it needs at these instants must exist.
+        program: program whose inputs are read.
         env: signal name -> all samples, `(time, batch)`.
-        run: instants within the trace.
+        run: instants within the trace. Every sample that `program` needs at these instants must exist.
         ops: the array library of `env`.
     """
 
@@ -324,7 +337,8 @@ def _rows(column: Array, start: int, count: int) -> Array:
 def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
     """Values of a signal `at.steps` samples after each instant in `run`: `(count, batch)`.
 
-    `column` is the whole signal. Before its first sample and after its last, that sample is repeated.
+    `column` holds all samples of the signal. A read before the first sample gives the first sample, and a
+    read after the last sample gives the last.
     """
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)

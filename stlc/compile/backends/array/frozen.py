@@ -1,8 +1,9 @@
 """Evaluation of `freeze`: a formula that refers to signal values at the instant at which it is evaluated.
 
-The values bound by `freeze` differ from instant to instant, so instants become part of the batch axis:
-signals `(time, batch)` are copied to `(time, instants * batch)`. If the body reads only samples within a
-bounded distance of the instant, only these are copied.
+For example, `freeze a = x in eventually[0 s, 1 s] x > a` compares later values of `x` with the present value.
+The value of `a` differs from instant to instant. So instants become part of the batch axis: signals
+`(time, batch)` are copied to `(time, instants * batch)`. If the body (the formula after `in`) reads only
+samples near the instant, only these samples are copied.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Yield the robustness at instants at which a value bound by `freeze` is undefined, in chunks.
+        """Yield, in chunks, the robustness at the instants `run`, at which bound values are undefined.
 
         A predicate that reads an undefined value is unknown if the trace is open (continues beyond its last
         sample), and false otherwise.
@@ -81,7 +82,7 @@ class Freezer:
                 yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
     def _undefined(self, node: ir.Freeze, instant: int) -> frozenset[str]:
-        """Names of the bound values that are undefined at `instant`: they read samples outside the trace."""
+        """Names of the values that `freeze` cannot bind at `instant`: they need samples outside the trace."""
         domain, run = self.domain, spanning(instant, 1)
         return frozenset(
             name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
@@ -101,10 +102,10 @@ class Freezer:
             yield from self._whole(node, IndexRange(last + 1, run.last), back, ahead)
 
     def _near(self, node: ir.Freeze, run: IndexRange, back: int, ahead: int) -> Iterator[Array]:
-        """Yield the robustness at the instants `run`, in chunks, from a copy of each instant's neighbourhood.
+        """Yield, in chunks, the robustness at the instants `run`, from copies of their neighbourhoods.
 
-        The neighbourhood, from `back` samples before the instant to `ahead` after it, must lie within the
-        trace.
+        The neighbourhood of an instant extends from `back` samples before the instant to `ahead` samples
+        after the instant. Every neighbourhood must lie within the trace.
         """
         length = back + ahead + 1
         domain = replace(self.domain, samples=length, stop=None)
@@ -116,10 +117,11 @@ class Freezer:
             yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
     def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
-        """Yield the robustness at the instants `run`, in chunks; neighbourhoods may end outside the trace.
+        """Yield, in chunks, the robustness at the instants `run`, whose neighbourhoods may leave the trace.
 
-        Each instant of a chunk is evaluated on its own copy of the samples from `back` before the first to
-        `ahead` after the last instant of the chunk.
+        The neighbourhood of an instant extends from `back` samples before the instant to `ahead` samples
+        after the instant. Every instant of a chunk has its own copy of all samples in the neighbourhoods of
+        the chunk.
         """
         ops, batch = self.ops, self._batch
         for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
@@ -139,7 +141,10 @@ class Freezer:
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
     def _bound_values(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
-        """Values bound at each instant in `run`, by name, repeated along time: `(length, count * batch)`."""
+        """Values that `freeze` binds at each instant in `run`, by name: `(length, count * batch)`.
+
+        A value is the same in all `length` rows.
+        """
         program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
         blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
@@ -149,8 +154,8 @@ class Freezer:
     def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
         """Signals, and values bound by enclosing `freeze` formulas, that the body reads, by name.
 
-        The body is the formula inside the `freeze` operator `node`. If it reads none of them, the result is
-        one arbitrary signal, so that the shape of the signals is still known.
+        The body is the formula inside the `freeze` operator `node`. If the body reads no signal and no bound
+        value, the result is one arbitrary signal, which gives the shape.
         """
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
@@ -171,7 +176,10 @@ def _combined_reach(node: ir.Freeze, domain: TraceDomain) -> Reach:
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
-    """Numbers of samples that a formula reads before and after its instant; inf for all samples."""
+    """Numbers of samples that the formula `body` may read before and after its instant.
+
+    A number is inf if all samples on that side of the instant may be read.
+    """
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(depends_on_ends, numbers(body))):
@@ -181,10 +189,10 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _chunk_size(most: int, width: float, samples: int) -> int:
-    """Number of instants to evaluate together: the greatest that needs at most `most` values, but at least 1.
+    """Number of instants to evaluate together, so that at most `most` values are needed; at least 1.
 
-    For c instants c (c + width) values are needed: each instant has a copy of c + width samples. If `width`
-    is infinite, each instant has a copy of the whole trace, which has `samples` samples.
+    If c instants are evaluated together, each has its own copy of c + width samples: c * (c + width) values
+    in total. If `width` is infinite, each instant has a copy of the whole trace, which has `samples` samples.
     """
     if math.isinf(width):
         return max(most // samples, 1)
@@ -199,9 +207,9 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
     """Return `body` with a constant in place of each predicate that reads a value in `names`.
 
-    These values are undefined. On an open trace (one that continues beyond its last sample) the constant is
-    true if an upper bound is computed, and false if a lower bound is computed. On any other trace the
-    predicate counts as false, and its negation as true.
+    The values in `names` are undefined. On an open trace (one that continues beyond its last sample) the
+    constant is true if an upper bound is computed, and false if a lower bound is computed. On any other trace
+    the constant is false for a predicate, and true for a negated predicate.
     """
     match body:
         case ir.Predicate(num, sign):

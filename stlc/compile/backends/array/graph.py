@@ -1,6 +1,6 @@
 """Robustness of formulas at given instants, over any array library.
 
-Signals are arrays `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute,
+Signals are arrays `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute, and
 `stlc.compile.backends.array.steps` computes them.
 """
 
@@ -49,12 +49,12 @@ def evaluate(
         formulas: formulas in negation normal form.
         env: signal name -> array `(time, batch)`.
         ops: the array library of `env`.
-        semantics: definition of min and max; None is `Exact()`.
+        semantics: definition of min and max; None for the exact ones.
         start: first instant.
         count: number of instants.
         end: treatment of instants beyond the last sample (`stlc.compile.schedule.schedule.Boundary`).
         stop: final number of samples of a trace that continues (`end` "lower" or "upper"). Unbounded windows
-            end there; if None, they end with the last known sample.
+            end there. If None, they end with the last known sample.
 
     Returns:
         For each formula an array `(count, batch)`.
@@ -81,11 +81,11 @@ def evaluate_parts(
     """Yield the exact robustness of a formula and of its sub-formulas.
 
     The formula is evaluated at `instants`, each sub-formula at the instants at which its value is needed. If
-    `end` is "lower" or "upper", instants may lie beyond the last sample; for `stop` see `evaluate`.
+    `end` is "lower" or "upper", instants may lie beyond the last sample. `stop` is explained in `evaluate`.
 
     Yields:
-        Formula, instants and values `(instants, batch)`, operands before the formula that reads them; nothing
-        from inside a `freeze`.
+        Tuples (formula, instants, values), with values of the shape `(instants, batch)`. Operands come before
+        the formula that reads them. Sub-formulas inside a `freeze` are left out.
     """
     windows = Windows(Exact(), ops)
     plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
@@ -104,10 +104,12 @@ def _domain(
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
     """Return the evaluation plan of `formulas` at the instants `run`; plans are cached.
 
-    The plan is for traces of the length in `domain`.
+    A plan lists the values to compute, and the programs that compute them. It applies to every trace of the
+    length in `domain`.
 
     Raises:
-        ValueError: an instant lies outside the trace, or a window does and `domain.end` is "strict".
+        ValueError: an instant lies outside the trace; or `domain.end` is "strict", and a window extends
+            beyond the trace.
     """
     samples = domain.samples
     if run.start < 0 or (run.last >= samples and not domain.open):
@@ -141,12 +143,12 @@ def robustness_signal(
 
 
 def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Execute an evaluation plan; returns the robustness of its formulas, `(count, batch)` each.
+    """Execute an evaluation plan; return the robustness of its formulas, `(count, batch)` each.
 
     Args:
         plan: list of the values to compute, and the programs that compute them.
         env: signal name -> array `(time, batch)`.
-        windows: algorithms for extrema over windows, in one semantics and for one array library.
+        windows: algorithms for extrema over windows, for a given semantics and array library.
 
     Raises:
         TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
@@ -162,7 +164,8 @@ def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> lis
     A step is one sub-formula at a range of instants.
 
     Raises:
-        TraceError: E306, more than `MAX_BEYOND` instants, or `MAX_VALUES` values, lie beyond the trace.
+        TraceError: E306, more than `MAX_BEYOND` instants or more than `MAX_VALUES` values lie beyond the
+            trace.
     """
     batch = math.prod(next(iter(env.values())).shape[1:])
     if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * batch > MAX_VALUES):
@@ -188,7 +191,10 @@ class Weighed(Protocol):
     """Requirement with its weight, such as `stlc.compile.pipeline.CompiledRequirement`."""
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """Formula with times in steps, simplified by the laws of min and max that hold in `semantics`."""
+        """Formula of the requirement, simplified, with times counted in steps.
+
+        The simplification uses only laws of min and max that hold in `semantics`.
+        """
 
     @property
     def weight(self) -> float:
@@ -209,8 +215,8 @@ class RobustnessGraph:
         end: treatment of windows that extend beyond the last sample.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
-    The argument `smoothing` of a method replaces the semantics in that call by log-sum-exp with scale k =
-    `smoothing`.
+    Methods have an argument `smoothing`. If it is given, min and max in that call are log-sum-exp with the
+    scale `smoothing`.
 
     Raises:
         UsageError: U101, an unknown semantics, or `smoothing` for a semantics without a scale.
@@ -230,7 +236,11 @@ class RobustnessGraph:
         self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
-        """Overall robustness, `(batch,)`: minimum of `weight * rho / scale` over the requirements."""
+        """Overall robustness of trajectories `x`, `(batch,)`.
+
+        It is the minimum over the requirements of `weight * rho / scale`, where rho is the robustness of a
+        requirement.
+        """
         env, ops = self._columns(x)
         return self.columns(env, ops=ops, smoothing=smoothing)
 
@@ -240,11 +250,17 @@ class RobustnessGraph:
         return self.per_requirement_columns(env, ops=ops, smoothing=smoothing)
 
     def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
-        """Overall robustness, `(batch,)`, from signals: name -> `(time, batch)`."""
+        """Overall robustness, `(batch,)`, from the signals `env`.
+
+        `env` maps the name of a signal to an array `(time, batch)`.
+        """
         return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
 
     def overall(self, each: Array, smoothing: float | None = None) -> Array:
-        """Overall robustness from that of each requirement: (batch, rules) -> (batch,); +inf for no rules."""
+        """Overall robustness, `(batch,)`, from the robustness of each requirement, `(batch, rules)`.
+
+        Without requirements, the overall robustness is +inf.
+        """
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
@@ -257,7 +273,10 @@ class RobustnessGraph:
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None
     ) -> Array:
-        """Robustness of each requirement, `(batch, rules)`, from signals: name -> `(time, batch)`."""
+        """Robustness of each requirement, `(batch, rules)`, from the signals `env`.
+
+        `env` maps the name of a signal to an array `(time, batch)`.
+        """
         rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
         if not rows:
             like = next(iter(env.values()))

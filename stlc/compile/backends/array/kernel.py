@@ -1,8 +1,8 @@
-"""Sliding extrema and `until` with exact subgradients by a C kernel, for NumPy and torch in any layout.
+"""C kernel for extrema over sliding windows and for `until`, with exact subgradients.
 
-`windows.c` is compiled on first use (`stlc.native`), once per dtype and vector width. If it cannot be
-compiled, or for other operands, `stlc.compile.backends.array.windows` computes the same with array
-operations.
+It works on arrays of NumPy and torch with any memory layout. `windows.c` is compiled on first use
+(`stlc.native`), once for each dtype and vector width. If the code cannot be compiled, or the operands do not
+suit the kernel, `stlc.compile.backends.array.windows` computes the same with array operations.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class WindowKernel:
     traces: int
 
     def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Compute extrema or `until`; with `back`, compute the gradients of the operands instead.
+        """Compute extrema or `until`; if `back`, compute the gradients of the operands instead.
 
         Args:
-            arrays: without `back`, the operands, then the array for the values. With `back`, the operands,
-                then the gradients of the values, then one array for the gradient of each operand.
+            arrays: the operands, then the array that receives the values. If `back`, the operands, then the
+                gradients of the values, then for each operand the array that receives its gradient.
             operands: 1 for extrema, 2 for `until` and `release`.
             back: whether to compute gradients.
 
@@ -84,10 +84,11 @@ class WindowKernel:
 
 
 def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sliding) -> WindowKernel | None:
-    """Return the kernel for operands `(time, batch)` of a dtype; None if no kernel can be used.
+    """Return the kernel for operands `(time, batch)` of the type `dtype`; None if no kernel can be used.
 
-    The dtype must be float32 or float64, and the kernel must compile. Its working memory grows with the width
-    of the windows; it must not exceed the greater of `_ROOM` bytes and the size of one operand.
+    A kernel can be used if `dtype` is float32 or float64, if the kernel compiles, and if its working memory
+    is small enough. This memory grows with the width of the windows. The limit is `_ROOM` bytes or the size
+    of one operand, whichever is greater.
 
     Args:
         dtype: name of the dtype.
@@ -112,7 +113,7 @@ def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sl
 
 @cache
 def _library(dtype: str, vector: int) -> ctypes.CDLL | None:
-    """Return the library for a dtype and a vector width in bytes; None if it cannot be compiled or loaded."""
+    """Return the compiled library for a dtype and a vector width in bytes; None if it is unavailable."""
     real, index, _ = _TYPES[dtype]
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n#define CHUNK {_CHUNK}\n"
     return native.load(defined + _SOURCE.read_text(encoding="utf-8"))

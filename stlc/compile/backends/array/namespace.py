@@ -45,7 +45,7 @@ class Sliding:
 
 
 class Ops(Protocol):
-    """An array library. Reductions and running extrema work along axis 0, which is time."""
+    """Operations of an array library. Reductions and running extrema work along axis 0, which is time."""
 
     name: str
 
@@ -163,15 +163,16 @@ class Ops(Protocol):
         """Exact elementwise minimum or maximum of one or more arrays."""
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema over sliding windows: `(time, batch)` -> `(count, batch)`.
+        """Exact extrema over the sliding windows `window`: `(time, batch)` -> `(count, batch)`.
 
-        None if operations of the array library are faster.
+        `pick` is "max" or "min". The result is None if a combination of other operations is faster; the
+        caller then uses these.
         """
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch).
 
-        None if operations of the array library are faster.
+        The result is None if a combination of other operations is faster; the caller then uses these.
         """
 
     # constants and shapes
@@ -188,7 +189,10 @@ class Ops(Protocol):
         """Array of a constant, with dtype and device of `like`."""
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """Array `first`, `first + 1`, … along time, (count, batch); batch, dtype and device as `like`."""
+        """Array `first`, `first + 1`, … along time, `(count, batch)`.
+
+        Batch size, dtype and device are those of `like`.
+        """
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
         """Uninitialized array with dtype and device of `like`."""
@@ -203,7 +207,10 @@ class Ops(Protocol):
         """Reverse `x` along axis 0."""
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """Copy of `x` with `value` in the rows (axis 0) where `keep` is False."""
+        """Copy of `x` with `value` in the rows where `keep` is False.
+
+        `keep` contains one truth value for each row (axis 0).
+        """
 
     def columns(self, x: Array) -> Sequence[Array]:
         """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""

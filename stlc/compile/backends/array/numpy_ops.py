@@ -113,17 +113,23 @@ class NumpyOps:
         return choose(*items) if len(items) == 2 else reduce(choose, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema over sliding windows by the C kernel; None if NumPy is faster or no kernel fits."""
+        """Exact extrema over sliding windows by the C kernel.
+
+        The result is None if array operations of NumPy are faster, or if no kernel is available.
+        """
         wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
         return _by_kernel((x,), pick, window) if wide else None
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` or `release` by the C kernel; None if NumPy is faster or no kernel fits."""
+        """Exact `until` or `release` by the C kernel.
+
+        The result is None if array operations of NumPy are faster, or if no kernel is available.
+        """
         wide = left.ndim == 2 and (left.shape[1] >= _WIDE or window.width >= _LONG)
         return _by_kernel((left, right), pick, window) if wide else None
 
     def softmax(self, x: Array, k: float) -> Array:
-        """Smooth maximum (`k` > 0) or minimum over axis 0, which is kept with length 1."""
+        """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) over axis 0, which is kept with length 1."""
         top = self.amax(x) if k > 0 else self.amin(x)
         finite = np.where(np.isfinite(top), top, 0.0)
         with self.quiet():
@@ -131,7 +137,7 @@ class NumpyOps:
             return top + np.log(total) / k
 
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
-        """Smooth maximum (`k` > 0) or minimum of two arrays."""
+        """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) of two arrays."""
         top = np.maximum(a, b) if k > 0 else np.minimum(a, b)
         with self.quiet():
             gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
@@ -142,9 +148,9 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return None for every array: a constant stays a Python float, so one form fits all arrays.
+        """Return None, one common key for all arrays.
 
-        In general the result is a key, and arrays with equal keys can share converted constants.
+        Constants are converted once per key. Here they stay Python floats, which suit every array.
         """
         return None
 

@@ -1,8 +1,8 @@
 """Execution of an evaluation schedule (`stlc.compile.schedule.schedule`: a list of steps) over arrays.
 
-A step is one sub-formula at a range of instants; its values are `(count, batch)`. One program computes all
-predicates at the same instants. For each of the remaining steps there is one function. Functions are built
-once per semantics and array library, and cached.
+A step is one sub-formula at a range of instants; its values are an array `(count, batch)`. One program
+computes all predicates that are evaluated at the same instants. Every other step has a function of its own.
+The functions are built once for each semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -49,7 +49,12 @@ _ENDLESS = 1 << 60
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Program that computes several predicates at the same instants, which lie within the trace."""
+    """Program that computes several predicates at the same instants, which lie within the trace.
+
+    Attributes:
+        run: the instants.
+        program: the program; each of its outputs is the margin of a predicate.
+    """
 
     run: IndexRange
     program: ArrayProgram
@@ -77,10 +82,10 @@ class ArrayPlan:
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
-        predicates: number of a predicate's step -> source of the predicate's values. A predicate that is
-            defined at none of its instants is absent.
+        predicates: step number of a predicate -> source of its values. A predicate that is defined at none of
+            its instants has no entry.
         beyond: number of instants beyond the last sample, summed over all steps.
-        runners: (semantics, array library) -> function of each step, built on first use.
+        runners: (semantics, array library) -> functions of the steps, in order; they are built on first use.
     """
 
     schedule: Schedule
@@ -93,8 +98,8 @@ class ArrayPlan:
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
     """Return the evaluation plan of `formulas` at the instants `run`: the steps and their programs.
 
-    A step is one sub-formula at a range of instants. `domain` tells the length of the trace and how instants
-    beyond its last sample are treated.
+    A step is one sub-formula at a range of instants. `domain` contains the length of the trace, and the
+    treatment of instants beyond its last sample.
     """
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
@@ -103,10 +108,10 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
 
 
 def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
-    """Group the predicates over the same instants into programs.
+    """Group the predicates that are evaluated at the same instants into programs.
 
     Returns the programs, and a mapping from the step number of a predicate to the source of its values. A
-    predicate whose margin is just a signal needs no program.
+    predicate whose margin is just a signal, such as `x > 0`, needs no program.
     """
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
     predicates: dict[int, StepSource] = {}
@@ -135,9 +140,13 @@ def _signed(atom: ir.Predicate) -> ir.Num:
 
 
 def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
-    """Merge overlapping and adjacent ranges of instants; return each merged range with the ranges in it.
+    """Merge overlapping and adjacent ranges of instants, such as 0 to 3 and 4 to 6.
 
-    Each range of instants comes with the number of its step.
+    Args:
+        ranges: pairs of a range and the number of the step that is evaluated there.
+
+    Returns:
+        Pairs of a merged range and the list of the given pairs that it covers.
     """
     out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
     for run, index in sorted(ranges, key=lambda item: (item[0].start, item[0].count)):
@@ -180,10 +189,10 @@ class Machine:
         return math.inf if self.domain.end == "upper" else -math.inf
 
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
-        """Return the function that pads a predicate's values, at instants `inside`, to the instants `run`.
+        """Return the function that extends a predicate's values from the instants `inside` to all of `run`.
 
-        At the added instants the predicate is unknown if the trace is open (continues beyond its last
-        sample), and false otherwise.
+        The predicate is defined at the instants `inside` only. At the others it is unknown if the trace is
+        open (continues beyond its last sample), and false otherwise.
         """
         outside = self.unknown if self.domain.open else -node.sign * math.inf
         if inside.count <= 0:
@@ -242,9 +251,9 @@ class Machine:
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
         """Function that computes a temporal operator over future windows at the instants `run`.
 
-        The function computes an extremum of one operand, or `until` of two. An open trace continues beyond
-        its last known sample. On such a trace, an operator with an unbounded window has an unknown value at
-        instants whose window starts beyond the final length of the trace.
+        The function computes an extremum of one operand, or `until` of two. If a trace is open, it continues
+        beyond its last known sample. An operator with an unbounded window is then unknown at instants whose
+        window starts beyond the final length of the trace.
 
         Args:
             window: window of the operator, relative to each instant.
@@ -280,7 +289,7 @@ class Machine:
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
         """Function that computes extrema of one operand, or `until` of two, over `rows` sliding windows.
 
-        `window` has the bounds of a window relative to its instant, and `pick` is "max" or "min".
+        `window` contains the bounds of the windows, relative to an instant. `pick` is "max" or "min".
         """
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1

@@ -25,10 +25,10 @@ class Instr:
     """Array operation.
 
     Attributes:
-        kernel: name of the operation: a method of `Ops` (array library) or of `Switch` (conditions as
-            numbers); or `input` (read a signal), `extern` (call a function of the system), or `pick` (select
-            a component of the function's result).
-        args: operands: register numbers or constants.
+        kernel: name of the operation. This is a method of `Ops` (array library) or of `Switch` (conditions as
+            numbers), or one of three special names. `input` reads a signal, `extern` calls a function of the
+            system, and `pick` selects a component of that function's result.
+        args: operands, each a register number or a constant.
         params: further arguments of the operation, after the operands.
     """
 
@@ -54,7 +54,7 @@ class GradientTape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction that computes `operand`; None if its operation is not `kernel`."""
+        """Operands of the instruction that computes `operand`; None if this is not an operation `kernel`."""
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
@@ -87,7 +87,10 @@ class GradientTape:
         return self.emit("sub", a, b)
 
     def _plus_product(self, whole: int, part: int, sign: float) -> int | None:
-        """Register of `whole + sign * part`, as one operation, if `part` is a product; else None."""
+        """Compute `whole + sign * part` by one operation, if `part` is a product; return the register.
+
+        If `part` is not a product, the result is None.
+        """
         factors = self.parts(part, "mul")
         if factors is None:
             return None
@@ -164,7 +167,7 @@ class GradientTape:
     def call(self, kernel: str, *args: Operand) -> Operand:
         """Result of the operation called `kernel` on the operands `args`.
 
-        It is a register, or a number if all operands are constants.
+        The result is a number if all operands are constants, and a register otherwise.
         """
         if all(isinstance(arg, float) for arg in args):
             with NUMPY.quiet():
@@ -205,9 +208,10 @@ class GradientTape:
     # ---------------------------------------------------------------- choice
 
     def compare(self, margin: Operand, strict: bool) -> int | bool:
-        """Register of the mask `margin > 0` (if `strict`) or `margin >= 0`; its truth value if constant.
+        """Register of the mask `margin > 0` (if `strict`) or `margin >= 0` (otherwise).
 
-        A margin `a - b` need not be computed: the mask is `a > b` or `a >= b`.
+        If `margin` is a constant, the result is the truth value. If `margin` is a difference `a - b`, the
+        mask is computed as `a > b` or `a >= b`, and the difference is not needed.
         """
         if isinstance(margin, float):
             return margin > 0 if strict else margin >= 0
@@ -221,9 +225,9 @@ class GradientTape:
         return self.emit(kernel, margin, 0.0)
 
     def number(self, mask: int) -> int:
-        """Register of a number that is 1 where `mask` is True, else 0.
+        """Register of an array that is 1 where `mask` is True, else 0.
 
-        The number gets the dtype of the arrays whose comparison gave the mask.
+        Its dtype is that of the arrays whose comparison gave the mask.
         """
         return self.emit("number", mask, self._compared(mask))
 
@@ -235,7 +239,7 @@ class GradientTape:
 
 
 def _constant_last(a: Operand, b: Operand) -> tuple[Operand, Operand]:
-    """Order the operands of a commutative operation: registers first, in ascending order."""
+    """Order the operands of a commutative operation: first registers in ascending order, then constants."""
     if isinstance(a, float):
         return (a, b) if isinstance(b, float) else (b, a)
     return (b, a) if isinstance(b, int) and b < a else (a, b)

@@ -1,8 +1,8 @@
 """Extrema over time windows.
 
-They are computed by a reduction over time, by the C kernel, by running extrema, or by merging blocks of 1, 2,
-4, … rows. All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; it
-ends with the last row of the array at the latest. A window without rows has the neutral value (+inf for a
+The method depends on the windows: a reduction over time, the C kernel, running extrema, or merging blocks of
+1, 2, 4, … rows. All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows;
+it ends with the last row of the array at the latest. A window without rows has the neutral value (+inf for a
 minimum, -inf for a maximum).
 """
 
@@ -29,7 +29,12 @@ _OVERLAP = 8
 @final
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Algorithms for extrema over time windows, in one semantics and with one array library."""
+    """Algorithms for extrema over time windows, for a given semantics and array library.
+
+    Attributes:
+        semantics: definition of min and max, exact or smooth.
+        ops: the array library.
+    """
 
     semantics: Semantics
     ops: Ops
@@ -42,7 +47,10 @@ class Windows:
         return self.ops.cat([x, missing]) if x.shape[0] else missing
 
     def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
-        """Extrema over `count` sliding windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
+        """Extrema over `count` sliding windows of `width` rows: `(time, batch)` -> `(count, batch)`.
+
+        `pick` is "max" or "min".
+        """
         rows = x.shape[0]
         width = min(width, max(rows, 1))
         if tiles := self._tiles(x, count, width):
@@ -63,7 +71,8 @@ class Windows:
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
         """Tiles of a long trace, which are computed one after the other; empty if one tile suffices.
 
-        A tile is a pair: the windows to compute, and the rows that these windows read.
+        A tile is a pair of slices. The first slice selects the windows to compute, the second one the rows
+        that these windows read.
         """
         if self.ops.name != "numpy" or not self.semantics.exact:
             return []
@@ -104,8 +113,8 @@ class Windows:
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
         """Merge the partial extremum of each block of rows with that of the block `shift` rows later.
 
-        Row j of `a` and `b` is the partial extremum (`Parts` of the semantics) of the block that starts at
-        row j.
+        Row j of `a` belongs to the block that starts at row j. It is the partial extremum of this block, in
+        the form `Parts` of the semantics. The same holds for `b`.
         """
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
@@ -115,8 +124,8 @@ class Windows:
     def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
         """Robustness of `until` (for `pick` "max") or of its dual `release` (for "min") over windows.
 
-        For `until`, row `j` of the result is the maximum, over the rows `t` of window `j`, of the minimum of
-        `right[t]` and the rows `j` to `lo + t` of `left`.
+        For `until`, row `j` of the result is the maximum of `min(right[t], left[j], …, left[lo + t])` over
+        all rows `t` of window `j`. For `release`, minimum and maximum are exchanged.
 
         Args:
             left: operand that must hold up to and including `t`; `(time, batch)`.
@@ -127,7 +136,7 @@ class Windows:
             lo: number of rows of `left` before the window.
 
         Returns:
-            `(count, batch)`
+            One row per window, `(count, batch)`.
         """
         rows = right.shape[0]
         width = min(width, max(rows, 1))
@@ -168,8 +177,8 @@ class Windows:
         """Compute `until` by its definition, for extrema that are not exact.
 
         Faster methods assume that min distributes over max, which is true of exact extrema only. A loop runs
-        over the samples of the window; its `lo + width` iterations work on all `count` windows together.
-        `sizes` is (count, width, lo), as in `until`.
+        over the samples of the window. Each of its `lo + width` iterations works on all `count` windows at
+        once. `sizes` is (count, width, lo), as in `until`.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -217,7 +226,10 @@ class Windows:
     def _until_by_tiles(
         self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
     ) -> Array:
-        """Unbounded `until` on a long recorded trace, tile by tile backward in time."""
+        """Unbounded `until` on a long recorded trace, tile by tile backward in time.
+
+        `tiles` contains consecutive ranges of rows, in the form of `_tiles`.
+        """
         out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
         later = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
         for rows, _ in reversed(tiles):
@@ -231,12 +243,12 @@ class Windows:
         return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
-        """`until` over windows of `width` rows, in about log2(width) compositions of adjacent blocks.
+        """`until` over windows of `width` rows, by about log2(width) rounds that join adjacent blocks.
 
-        Every window must lie within the array. Each block of rows has two values: the least `left` over the
-        block (`held`), and `until` within the block (`met`). In the loop, row j of `held` and `met` belongs
-        to the block of `size` rows that starts at row j. Row j of `total` belongs to the first `done` rows of
-        window j.
+        Every window must lie within the array. A block has two values: the least `left` in the block
+        (`held`), and `until` within the block (`met`). At first every block is one row. In the loop, row j of
+        `held` and `met` belongs to the block of `size` rows that starts at row j. Row j of `total` belongs to
+        the first `done` rows of window j.
         """
         size, done = 1, 0
         total: tuple[Array, Array] | None = None
@@ -251,10 +263,11 @@ class Windows:
             size *= 2
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """Combine each block of rows in `a` with the next block, in `b`, to one block.
+        """Join each block of rows in `a` with the adjacent later block in `b`.
 
         A block is given by two values: the least `left` over its rows, and `until` within the block. For
-        `pick` "min", it is the greatest `left`, and `release`.
+        `pick` "min", they are the greatest `left`, and `release`. The result gives the joined blocks in the
+        same form.
         """
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)

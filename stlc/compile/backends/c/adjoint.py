@@ -1,7 +1,9 @@
 """C code for the gradient of robustness and states with respect to plans (control sequences).
 
-The code is the reverse mode of exact minima and maxima (the first of equal operands gets the gradient) and of
-the steps of the system, for sixteen trajectories at a time. The forward pass is that of `emit`.
+First the code of `emit` computes the states and the robustness. Then the gradient is computed in reverse:
+through the formulas back to the states, and through the steps of the system back to the controls. Minimum and
+maximum are exact, and the first of equal operands gets the gradient. The code works on sixteen trajectories
+at a time.
 """
 
 from __future__ import annotations
@@ -45,12 +47,14 @@ def emit_adjoint(
     fixed: Collection[str] = (),
     end: End = "strict",
 ) -> str:
-    """Return the C source of `pull`, which computes the gradient; see `stlc.native` for its signature.
+    """Return the C source of the function `pull`, which computes the gradient.
+
+    `stlc.native` describes its signature.
 
     Args:
         motion: one step of the system.
         formulas: the requirements.
-        fixed: states through whose update no gradient is propagated.
+        fixed: names of states. No gradient is propagated back through the update of these states.
         end: treatment of windows that extend beyond the end of a plan.
 
     Raises:
@@ -84,7 +88,7 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
     """C code that propagates the gradient one step back in time.
 
     The gradient with respect to the states at sample k + 1 is passed to the states and controls at sample k.
-    The code is for one lane, one of the trajectories that are computed side by side. No gradient is
+    Several trajectories are computed side by side; the code is for one of them, number `j`. No gradient is
     propagated through the update of a state in `fixed`.
     """
     index = state_index(motion)

@@ -1,7 +1,7 @@
 """C code of one step of a system, with its observation and reward, for many states at once.
 
-Switching is exact, numbers are double, and `LANES` state vectors are computed at a time; observations are
-float32, the input of learners.
+Conditions are evaluated exactly. Numbers are double, and `LANES` state vectors are computed at a time.
+Observations are written as float32, the type that learning methods read.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ def emit_advance(
 ) -> str:
     """Return the C source of the functions `advance` (one step) and `look` (one observation).
 
-    Their signatures are described in `stlc.native.Advance`.
+    `stlc.native.Advance` calls them.
 
     Args:
         motion: one step of the system.
-        observed: expressions of the states that the policy reads.
-        reward: reward of a step, an expression of the states after the step and of the actuator commands of
-            the step; None: no reward.
-        commands: control -> actuator command, an expression of the states before the step and the controls;
-            for a control that is not listed, the actuator gets the control itself.
+        observed: inputs of the policy, as expressions of the states.
+        reward: reward of a step, as an expression of the states after the step and the actuator commands of
+            the step. None if there is no reward.
+        commands: name of a control -> actuator command, as an expression of the states before the step and
+            the controls. The actuator of a control that is not listed gets the control itself.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
@@ -57,9 +57,9 @@ def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
 
 
 def _writer(motion: Motion) -> NumberWriter:
-    """Writer of C expressions in which the arrays `x` and `u` hold states and controls, read at index `j`.
+    """Writer of C expressions that read states from the C array `x` and controls from the C array `u`.
 
-    The index `j` numbers the state vectors that are computed side by side.
+    Several state vectors are computed side by side. The expressions are for vector `j`.
     """
     index = state_index(motion)
 
@@ -74,9 +74,10 @@ def _writer(motion: Motion) -> NumberWriter:
 
 
 def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
-    """C statements of a time step, from states and controls to next states and actuator commands.
+    """C statements of a time step: they compute the next states and the actuator commands.
 
-    The C arrays `x` and `u` hold the states and the controls, `y` the next states, `c` the commands.
+    The C arrays `x` and `u` hold the states and the controls. The next states are stored in `y`, the commands
+    in `c`.
     """
     index, writer = state_index(motion), _writer(motion)
     given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
@@ -90,7 +91,7 @@ def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
 def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
     """C statements that store the values of the expressions `numbers` in the C array `y`.
 
-    The expressions may read the states and the commands, which are in the C arrays `x` and `u`.
+    The expressions may read states from the C array `x`, and actuator commands from the C array `u`.
     """
     writer = _writer(motion)
     values = [writer.number(num) for num in numbers]

@@ -1,7 +1,7 @@
-"""Local search over plans in C: each generation perturbs the best plan and keeps the best of a batch.
+"""Local search over plans in C: each generation perturbs the best plan and keeps the best candidate.
 
 The code is appended to the source of `emit` and calls its functions `roll` (rollout) and `check`
-(robustness). Each row of the batch has its own random stream, so the result does not depend on the number of
+(robustness). Each initial state has its own random stream, so the result does not depend on the number of
 threads.
 """
 

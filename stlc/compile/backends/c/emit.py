@@ -1,7 +1,7 @@
 """C code of dynamics and requirements: rollout, exact robustness, and NaN check.
 
-It is made from the same IR as the torch graph, with exact switching, in double precision, for `LANES`
-trajectories at a time.
+The code is made from the same IR as the torch graph. Conditions are evaluated exactly. Numbers are double,
+and `LANES` trajectories are computed at a time.
 """
 
 from __future__ import annotations
@@ -132,10 +132,10 @@ def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
 
 
 def along_roots(plan: Plan, form: str) -> list[str]:
-    """Return the C statements for all requirements, made from the template `form`.
+    """Return the C statements that result from the template `form` for all requirements.
 
     In `form`, `{i}` stands for the index of a requirement and `{value}` for the C expression of its
-    robustness.
+    robustness. An example is `LANE out[{i}][j] = {value};`.
     """
     lines = []
     for first, root, rows in _side_by_side(plan):
@@ -148,10 +148,10 @@ def along_roots(plan: Plan, form: str) -> list[str]:
 
 
 def _side_by_side(plan: Plan) -> list[tuple[int, Storage, int]]:
-    """Group the requirements whose robustness values are stored in consecutive rows.
+    """Group the requirements whose robustness values are stored in consecutive rows of memory.
 
-    Returns for each group the index of its first requirement, the location of the first value, and the number
-    of requirements.
+    Returns a tuple for each group: the index of its first requirement, the location of the first value, and
+    the number of requirements.
     """
     runs: list[tuple[int, Storage, int]] = []
     for i, root in enumerate(plan.roots):
@@ -176,8 +176,8 @@ CHECK = Frame(
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
     """Return the function that maps a state or control to its C expression in a step.
 
-    The expression is for sample `k` and trajectory `j`. For an operand of another kind, such as a function
-    call, the returned function gives None.
+    The C expression is for sample `k` and trajectory `j`. For anything but a state or control, such as a
+    function call, the returned function gives None.
     """
     index = state_index(motion)
 

@@ -107,7 +107,8 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 def _entries(formula: ir.Formula) -> list[Entry]:
     """Constants and signals of a formula that may differ between the members of a family.
 
-    They are listed in order of occurrence. A constant exponent, for instance, must not differ.
+    They are listed in order of occurrence. A constant exponent is left out, for instance, since it must not
+    differ.
     """
     found: list[Entry] = []
 
@@ -120,7 +121,10 @@ def _entries(formula: ir.Formula) -> list[Entry]:
 
 
 def _changed(node: N, change: Callable[[Entry], ir.Num]) -> N:
-    """Replace each constant or signal that may differ between the members of a family by `change(leaf)`."""
+    """Replace each constant or signal in `node` that may differ between the members of a family.
+
+    A constant or signal `leaf` is replaced by `change(leaf)`.
+    """
     if isinstance(node, (ir.Freeze, ir.Extern)):
         return node  # names of frozen values are unique; a call is computed once for its columns
     if isinstance(node, (ir.Const, ir.Signal, ir.ShiftedSignal)):

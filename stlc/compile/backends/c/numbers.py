@@ -22,8 +22,9 @@ class NumberWriter(NumberEvaluator[str]):
     """Writer of numeric expressions as C statements; equal expressions share a register (C variable).
 
     Args:
-        place: returns the C expression of a signal, of a value bound by `freeze`, or of a function result
-            that is already computed; None for a function that must be expanded in place.
+        place: function that returns the C expression of an operand: a signal, a value bound by `freeze`, or a
+            function result that is already computed. If it returns None for a function call, the body of the
+            function is written in place of the call.
 
     Attributes:
         lines: the statements.
@@ -36,7 +37,10 @@ class NumberWriter(NumberEvaluator[str]):
         self._texts: dict[str, str] = {}
 
     def truth(self, cond: ir.Formula) -> str:
-        """C expression of a condition's exact truth value, 0 or 1; `>` and `>=` are distinguished."""
+        """C expression of the exact truth value of a condition, 0 or 1.
+
+        A margin of exactly 0 satisfies `>=`, but not `>`.
+        """
         match cond:
             case ir.Truth(value):
                 return "1" if value else "0"

@@ -35,7 +35,7 @@ def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str
     Args:
         frame: name, arguments and local statements of the function.
         blocks: groups of statements that must stay together.
-        buffers: C name of a buffer -> its declaration, written into the parts that use it.
+        buffers: C name of a buffer -> its declaration. Each part declares the buffers that it uses.
     """
     lines, calls = [], []
     names = [formal.rpartition(" ")[2] for formal in frame.formals]

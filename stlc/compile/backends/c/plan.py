@@ -1,8 +1,9 @@
-"""Evaluation schedule of formulas with memory for all values, from which the C code is printed.
+"""Evaluation schedule of formulas from which the C code is printed, with memory for all values.
 
-A `freeze` is computed in a loop over its instants; sub-formulas that do not read frozen values are moved out
-of the loop. Operands and requirements that differ in parameters only are computed in a loop over a table of
-the parameters (`families`). A function of signals is computed once for all samples.
+A `freeze` is computed in a loop over its instants. Sub-formulas that do not read the frozen values are
+computed before the loop. Requirements that differ in parameters only are computed in a loop over a table of
+the parameters (`families`); so are operands of `and` and `or`. A function of signals is computed once for all
+samples.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Buffer:
         name: name of the C array.
         origin: instant of the first row.
         rows: number of instants.
-        place: offset in the working memory, in doubles per trajectory.
+        place: start of the array in the working memory, as a number of doubles per trajectory.
     """
 
     name: str
@@ -142,7 +143,8 @@ class Plan:
         roots: location of each formula's robustness at the first sample.
         buffers: memory of each step, by step number.
         size: working memory in doubles per trajectory.
-        calls: key of a function call on signals (`call_of`) -> step number of its first component.
+        calls: key of a function call on signals (`call_of`) -> step number of the first component of its
+            result.
     """
 
     schedule: Schedule
@@ -177,8 +179,10 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int, end: End = "strict") -
 class _Scope(StepScope):
     """Group of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
 
-    `read` names the values that change in every iteration of the loop. `own` lists the numbers of the steps
-    in the group. `table` is True for a loop over a table.
+    Attributes:
+        read: names of the values that change in every iteration of the loop; empty for the whole schedule.
+        table: whether the group is the body of a loop over a table.
+        own: numbers of the steps in the group.
     """
 
     read: frozenset[str] = frozenset()
@@ -214,7 +218,7 @@ class _Planner(Scheduler):
             return self.place(node, run.settled if frozen else run)
 
     def number(self, run: IndexRange) -> int:
-        """Return the next step number and reserve memory for its values."""
+        """Return the next step number, and reserve memory for the values of that step at `run`."""
         buffer = Buffer(f"b{len(self.buffers)}", earliest(run.start), run.count, self.size)
         self.buffers.append(buffer)
         self.size += buffer.rows
@@ -223,7 +227,7 @@ class _Planner(Scheduler):
 
     @contextmanager
     def _inside(self, scopes: list[_Scope]) -> Iterator[_Scope]:
-        """Context manager: new steps are added to the innermost of `scopes`."""
+        """Context manager in which new steps are added to the last of `scopes`, the innermost one."""
         before = self.scopes
         self.scopes, self.scope = scopes, scopes[-1]
         try:
@@ -261,10 +265,11 @@ class _Planner(Scheduler):
         return super().scheduled(node, run)
 
     def roots(self, formulas: Sequence[ir.Formula]) -> list[tuple[int, int]]:
-        """Add the steps of formulas at the first sample; return each formula's step number and row.
+        """Add the steps that compute formulas at the first sample.
 
-        The formulas of a family (which differ in parameters only) are the rows of one step. Any other formula
-        is row 0 of its own step.
+        Returns for each formula the number of its step, and a row in the values of this step. The formulas of
+        a family (which differ in parameters only) are the rows of one step. Any other formula is row 0 of its
+        own step.
         """
         places: dict[int, tuple[int, int]] = {}
         for family in self._families(list(map(_split, formulas))):
@@ -346,8 +351,8 @@ class _Planner(Scheduler):
 def call_of(num: ir.Num) -> CallKey | None:
     """Key that identifies a function call on signals: (function name, signals).
 
-    All signals must be read at the same sample. Calls with equal keys are computed once, for all samples. The
-    result is None for any other expression.
+    Calls with equal keys are computed once, for all samples. The result is None if `num` is not such a call,
+    or if its signals are read at different samples.
     """
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
@@ -362,7 +367,10 @@ def _offset(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
-    """Names of the signals that a formula reads, and of the values that an enclosing `freeze` binds."""
+    """Names of the signals and frozen values that a formula reads.
+
+    A frozen value is one that a `freeze` around the formula binds.
+    """
     match formula:
         case ir.Predicate(num):
             return frozen_in(num) | columns_of(num)

@@ -1,10 +1,13 @@
-"""C code of the steps of a schedule, forward and adjoint, on trajectories computed by a rollout.
+"""C code of the steps of a schedule: forward code computes values, adjoint code computes gradients.
 
-For each kind of step a class (`FORMS`) prints the forward and the adjoint code. The innermost loop runs over
-trajectories and is vectorized. `gb7` is the gradient with respect to buffer `b7`, `gx` that with respect to
-the states. The gradient of a minimum or maximum goes to the first of equal operands. For a step that is a
-loop over other steps, the adjoint recomputes the body, in iterations with a nonzero gradient only. Windows
-that all end with the trace, or all begin with it, are computed by one recursion.
+For each kind of step there is a class that prints both codes (`FORMS`). The states come from a rollout. The
+innermost loop runs over trajectories and is vectorized. `gb7` is the gradient with respect to buffer `b7`,
+and `gx` the gradient with respect to the states. The gradient of a minimum or maximum goes to the first of
+equal operands.
+
+If a step is a loop over other steps, the adjoint code recomputes the body of the loop. Iterations whose
+gradient is zero are skipped. Windows that all end with the trace, or all begin with it, are computed by one
+recursion.
 """
 
 from __future__ import annotations
@@ -85,7 +88,7 @@ class StepForm(ABC):
 
 
 def loop(run: IndexRange, *, back: bool = False) -> str:
-    """Return the head of a C loop over instants `k`, backward in time with `back`."""
+    """Return the head of a C loop over the instants `k` in `run`; if `back`, it runs backward in time."""
     if back:
         return f"for (int k = {run.last}; k >= {run.start}; --k)"
     return f"for (int k = {run.start}; k <= {run.last}; ++k)"
@@ -124,8 +127,8 @@ class LeafReader:
     def _instant(self, leaf: ir.Num) -> str:
         """C expression of the index of the sample at which a signal is read.
 
-        For a clamped read, which repeats the first or last sample outside the trajectory, it is a C variable
-        that `heads` declares.
+        A clamped read repeats the first or last sample outside the trajectory. For such a read, the result is
+        a C variable that `heads` declares.
         """
         if not isinstance(leaf, ir.ShiftedSignal):
             return "k"
@@ -190,7 +193,8 @@ class _Margin(StepForm):
     def backward(self) -> list[str]:
         """Return C statements that propagate the gradient; none if it is zero.
 
-        It is zero for guards (predicates that count as +-inf) and for predicates on the elapsed time.
+        It is zero for guards (predicates whose robustness is +inf or -inf) and for predicates on the elapsed
+        time.
         """
         num, sign = self.node.num, "" if self.node.sign > 0 else "-"
         counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
@@ -263,7 +267,7 @@ class _Extremum(StepForm):
 
 
 class _AtStart(StepForm):
-    """C code of a formula's value at the first sample, which is the same at every instant."""
+    """C code of an operator whose value, at every instant, is that of its operand at the first sample."""
 
     def forward(self) -> list[str]:
         return [f"{loop(self.run)} LANE {self.out['k']} = {self.args[0][0]};"]
@@ -273,7 +277,7 @@ class _AtStart(StepForm):
 
 
 class _Shifted(StepForm):
-    """C code of a formula's value some samples later or earlier."""
+    """C code of an operator whose value is that of its operand some samples later or earlier."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -303,8 +307,8 @@ class _Shifted(StepForm):
 class _Windowed(StepForm):
     """C code of a temporal operator: an extremum over a window, `until`, `release`, or a past operator.
 
-    The value at an instant is a loop over its window (`_scan`). Windows that extend to the end or to the
-    start of the trace are computed by a recursion on the value at the adjacent instant (`_step`).
+    The value at an instant is computed by a loop over its window (`_scan`). If the windows extend to the end
+    or to the start of the trace, the value is computed from the value at the adjacent instant (`_step`).
     """
 
     lanes = ""
@@ -455,16 +459,16 @@ class _Until(_Windowed):
         ]
 
     def _step(self) -> str:
-        """C expression `u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual."""
+        """C expression `u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual (min for max)."""
         reached = f"{self.pick}({self.args[1]['k']}, {self.before})"
         return f"{self.dual}({self.args[0]['k']}, {reached})"
 
     def _scan_back(self) -> list[str]:
         """C statements that pass the gradient of the value at `k` to the operand that attains the value.
 
-        They search the window for the first instant at which the value is attained. If it is attained by the
-        right side, the right side gets the gradient at that instant. If it is attained by the left side, the
-        left side gets the gradient at its worst instant up to there.
+        They search the window for the first instant at which the value is attained. If `right` attains the
+        value, `right` gets the gradient at that instant. Otherwise `left` gets the gradient, at the instant
+        from `k` on at which `left` is worst so far.
         """
         out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
         near, far = self._outwards()
@@ -568,7 +572,10 @@ class _TableLoop(_Repeated):
     """
 
     def _head(self) -> list[str]:
-        """C statements with the table and the head of the loop over its rows; two braces close the loop."""
+        """C statements that declare the table and begin the loop over its rows.
+
+        They open two braces, which the caller must close.
+        """
         table, row, index = self.node.table, self.loop.index, self.printer.index
         constants = {name: map(literal, values) for name, values in table.constants.items()}
         columns = {name: [str(index[state]) for state in states] for name, states in table.columns.items()}
@@ -596,7 +603,7 @@ class _TableLoop(_Repeated):
         """Return C statements that propagate the gradient, in a loop over the rows of the table.
 
         Each iteration first recomputes the values of its row. If the step is an extremum over the rows, only
-        the first row that attains it gets a gradient.
+        the first row whose value equals the extremum gets a gradient.
         """
         if self.node.pick is None:
             own, body = self.out[self.loop.index], self.root[0]
@@ -623,8 +630,8 @@ class _TableLoop(_Repeated):
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
     """C declaration of a table whose entries have the C type `kind`: an array with one row per line.
 
-    `entries` maps each column of the table to the texts of its values. `row` is the C name of the row index;
-    it is part of the array's name. Without columns, the result is empty.
+    `entries` maps the name of each column to the values of the column, as texts. `row` is the C name of the
+    row index; it is part of the array's name. If `entries` is empty, so is the result.
     """
     if not entries:
         return []

@@ -27,8 +27,8 @@ class SlopeWriter(NumberWriter):
 
     Args:
         place: returns the C expression of a leaf (signal, call, or frozen value).
-        soft: whether conditions have the gradient of a smooth step; otherwise they have none, and only the
-            branch taken has a gradient.
+        soft: whether conditions have the gradient of a smooth step. If not, conditions have no gradient; a
+            choice between two branches then passes its gradient to the branch taken only.
     """
 
     def __init__(self, place: Callable[[Leaf], str | None], *, soft: bool) -> None:
@@ -46,8 +46,9 @@ class SlopeWriter(NumberWriter):
                 register.
 
         Returns:
-            The statements; and a mapping from the C expression of a leaf's gradient (`gx[…]` for `x[…]`) to
-            the register with the value to add to it.
+            The statements, and a mapping that tells which register must be added to the gradient of each
+            leaf. The keys are C expressions of gradients, such as `gx[…]` for the leaf `x[…]`; the values are
+            registers.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
@@ -57,11 +58,14 @@ class SlopeWriter(NumberWriter):
         return lines, gathered
 
     def gradients(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
-        """Return C statements that compute expressions and add up the gradients of the signals in them.
+        """Return C statements that compute expressions and propagate gradients to the signals in them.
+
+        A gradient is a derivative of the final output. For a signal `x[…]`, the statements add to the C
+        variable `gx[…]`.
 
         Args:
-            outputs: pairs of an expression and the C expression of the derivative of the final output with
-                respect to it.
+            outputs: pairs of an expression and its gradient. The gradient is the C expression of the
+                derivative of the final output with respect to the expression.
         """
         seeds: dict[str, str] = {}
         for num, own in outputs:
@@ -123,7 +127,10 @@ class SlopeWriter(NumberWriter):
         return operand in self._texts.values() and operand not in self._constants
 
     def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
-        """Derivatives of `min(max(x, low), high)` with respect to its operands."""
+        """Derivatives of `min(max(x, low), high)` with respect to the three arguments.
+
+        Returns pairs of an argument and the C expression of the derivative with respect to it.
+        """
         raised = super()._apply("max", [x, low])
         of_x, of_low = self._shares("max", x, low)
         of_raised, of_high = self._shares("min", raised, high)

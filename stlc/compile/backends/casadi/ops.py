@@ -203,7 +203,7 @@ class CasadiOps:
     def straight_through(self, rho: SymbolicColumn, strict: bool, slope: float) -> SymbolicColumn:  # noqa: ARG002
         """Return the smooth step `(1 + tanh(slope rho)) / 2`, not 0 or 1 as with other array libraries.
 
-        So the value and the gradient belong to the same function.
+        In this way the gradient is the true derivative of the value.
         """
         return SymbolicColumn(0.5 + 0.5 * casadi.tanh(slope * rho.entries))
 
@@ -234,7 +234,10 @@ class CasadiOps:
         return self.cat([self.amax(x[: k + 1]) for k in range(len(x))])
 
     def softmax(self, x: SymbolicColumn | StackedColumns, k: float) -> SymbolicColumn | StackedColumns:
-        """`log(sum(exp(k x))) / k` over the first axis, which is kept with length 1; computed pairwise."""
+        """`log(sum(exp(k x))) / k` over the first axis, which is kept with length 1.
+
+        The terms are combined in pairs by `softmax2`.
+        """
         parts = x.rows()
         while len(parts) > 1:
             pairs = [self.softmax2(a, b, k) for a, b in zip(parts[::2], parts[1::2], strict=False)]
@@ -266,9 +269,9 @@ class CasadiOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None for every array: a constant stays a Python float, so one form fits all arrays.
+        """Return None, one common key for all arrays.
 
-        In general the result is a key, and arrays with equal keys can share converted constants.
+        Constants are converted once per key. Here they stay Python floats, which suit every array.
         """
         return None
 

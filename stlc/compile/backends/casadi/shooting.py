@@ -1,10 +1,13 @@
 """Multiple shooting: planning as a nonlinear program, made from dynamics and formulas of the IR.
 
 All states that controls affect are variables of the program; the dynamics are equality constraints (Bock &
-Plitt 1984). A clamped state is bounded to its range; the part that the clamp cuts off is a further variable
-in the dynamics, which the cost penalises. Every condition that a formula requires at a sample is a constraint
-`value + shortfall >= margin`, with one shortfall to be minimised; minima and maxima within a condition are
-log-sum-exp (Pant et al. 2017). States that no control affects are parameters of the program.
+Plitt 1984). States that no control affects are parameters of the program. If a state is clamped to a range,
+its variable is bounded to this range. The correction by the clamp is a further variable in the dynamics,
+which the cost penalises.
+
+A formula requires conditions at certain samples. Each condition is a constraint
+`value + shortfall >= margin`. All these constraints share the variable `shortfall`, which the cost minimises.
+Minima and maxima within a condition are log-sum-exp (Pant et al. 2017).
 """
 
 from __future__ import annotations
@@ -48,7 +51,8 @@ class NotSmoothError(Exception):
 class Eased:
     """Switch that evaluates conditions by smooth indicators (Eq. 6 of Meng and Fan 2023).
 
-    `sharpness` is the greatest slope w of an indicator `(1 + tanh(w rho)) / 2` of a margin rho.
+    The indicator of a condition with the margin rho is `(1 + tanh(w rho)) / 2`. `sharpness` is the greatest
+    value of w that is used.
     """
 
     exact: ClassVar[bool] = False
@@ -57,7 +61,8 @@ class Eased:
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """Smooth indicator `(1 + tanh(w rho)) / 2` of the margin `rho`.
 
-        w is the `sharpness` of the switch, or the argument `sharpness` if that is less.
+        The switch has an attribute `sharpness`. w is this attribute or the argument `sharpness`, whichever is
+        smaller. If the argument is None, w is the attribute.
         """
         width = self.sharpness if sharpness is None else min(self.sharpness, sharpness)
         return ops.sigmoid(rho * (2.0 * width))
@@ -73,7 +78,7 @@ class Eased:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Dynamics of a system, with the clamps of its states given apart from the expressions of the step.
+    """Dynamics of a system, in which the expressions of a step do not include the clamps of states.
 
     Attributes:
         lets: intermediate variables of a step as (name, expression), in order.
@@ -140,7 +145,7 @@ class Shooting:
             motion: dynamics of the system.
             demands: formulas that must hold.
             smoothing: scale of log-sum-exp.
-            sharpness: greatest slope of the smooth indicators of conditions.
+            sharpness: greatest factor w in a smooth indicator `(1 + tanh(w rho)) / 2` of a condition.
 
         Raises:
             NotSmoothError: an expression that depends on the controls is discontinuous or has no CasADi form,
@@ -241,8 +246,9 @@ class Shooting:
     def limits(self, *, maximise: bool) -> dict[str, Vector]:
         """Bounds of variables (`lbx`, `ubx`) and constraints (`lbg`, `ubg`), under the names of CasADi.
 
-        The last variable is the shortfall: the amount by which the worst condition misses the robustness that
-        is asked for. If `maximise`, it may become negative, so that additional robustness is rewarded.
+        The last variable is the shortfall: the amount by which the worst condition misses the required
+        robustness. If `maximise`, the shortfall may be negative, so that robustness above the required one is
+        rewarded.
         """
         motion, steps = self._motion, self._motion.horizon
         free = (-math.inf, math.inf)
@@ -310,9 +316,10 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals that an expression always reads at the first sample of the plan.
+    """Names of the signals whose initial value an expression reads.
 
-    It does so at whatever sample the expression is evaluated.
+    The initial value is the value at the first sample of the plan, at whatever sample the expression is
+    evaluated.
     """
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}

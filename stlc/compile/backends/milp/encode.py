@@ -2,8 +2,8 @@
 
 Signals that no control affects are constants, and an expression of constants is replaced by its value. The
 encoding is tight or relaxed. In a tight encoding the conditions in the dynamics hold or fail with a margin of
-at least `MARGIN`, so that every solution is a plan. A relaxed encoding has every satisfying plan among its
-solutions, so that its infeasibility proves that no plan satisfies the specification.
+at least `MARGIN`, so that every solution is a plan. In a relaxed encoding every plan that satisfies the
+specification is a solution. If a relaxed encoding has no solution, no plan satisfies the specification.
 
 Without norms, both encodings are exact up to `MARGIN`. For norms, circles are replaced by polygons with
 `SIDES` sides. This makes a condition stronger in the tight encoding and weaker in the relaxed one.
@@ -83,7 +83,7 @@ Atom: TypeAlias = "Greatest | Conditional | Norm | Square"
 class Expression:
     """Affine form plus a linear combination of atoms (maxima, conditional values, norms, squares).
 
-    An atom is replaced by variables of the program only where that is necessary.
+    An atom stays symbolic as long as possible. Only where necessary, variables of the model replace it.
 
     Attributes:
         form: the affine part.
@@ -121,8 +121,8 @@ class Demand:
 
     Attributes:
         formula: formula of the IR.
-        margin: affine form. The robustness of each predicate in the formula must be at least this form.
-            Predicates on time are excepted: they must be true, without a minimum robustness.
+        margin: least robustness of each predicate in the formula, as an affine form. Predicates on time only
+            need to be true.
     """
 
     formula: ir.Formula
@@ -134,10 +134,10 @@ Row: TypeAlias = dict[str, Expression]
 
 
 class Encoding:
-    """Mixed-integer linear model whose solutions are plans from one initial state.
+    """Mixed-integer linear model of the plans from one initial state.
 
     If `tight`, every solution of the model is a plan of the system. Otherwise the encoding is relaxed: every
-    plan that satisfies the requirements is a solution, but some solutions may be no plans of the system.
+    plan that satisfies the requirements is a solution, but a solution need not be a plan of the system.
 
     Attributes:
         model: variables and constraints of the program.
@@ -171,13 +171,13 @@ class Encoding:
     ) -> list[Tree]:
         """Encode the dynamics over a horizon, and requirements at the first sample.
 
-        A requirement that must hold at every sample, such as `always`, bounds the state variables before the
-        next step is encoded. These bounds decide many of the conditions in that step.
+        A requirement such as `always p` must hold at every sample. At each sample it bounds the state
+        variables before the next step is encoded. These bounds decide many of the conditions in that step.
 
         Args:
             x0: initial state, name -> value.
             bounds: control -> its range.
-            lets: intermediate results of a step, in order.
+            lets: intermediate results of a step as (name, expression), in order.
             step: name of a state that changes -> expression of its value one step later.
             horizon: number of steps.
             requirements: formulas that must hold at the first sample, with the robustness that their
@@ -264,7 +264,7 @@ class Encoding:
     # ------------------------------------------------------------------- formulas
 
     def _tree(self, formula: ir.Formula, k: int, what: Demand) -> Tree:
-        """Condition that the subformula `formula` of the requirement `what` holds at sample `k`."""
+        """Condition under which `formula`, a part of the requirement `what`, holds at sample `k`."""
         key = id(what), id(formula), k
         if key not in self._trees:
             self._trees[key] = self._formula(formula, k, what)
@@ -301,10 +301,10 @@ class Encoding:
     def _until(
         self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Demand
     ) -> Tree:
-        """Condition of `until` at sample `k` or, if `strong` is False, of its dual `release`.
+        """Condition under which `until` holds at sample `k`; if `strong` is False, `release` instead.
 
         Args:
-            strong: True for `until`; False for `release`, in which conjunctions and disjunctions are
+            strong: True for `until`; False for its dual `release`, in which conjunctions and disjunctions are
                 exchanged.
             k: sample at which the formula is evaluated.
             samples: samples of the window, at one of which `right` must hold.
@@ -334,9 +334,9 @@ class Encoding:
         return self._condition(value, ZERO if node.guard else margin, node.num)
 
     def _decided(self, cond: ir.Formula, k: int, *, holds: bool) -> Tree:
-        """Condition that the state formula `cond` is true at sample `k`.
+        """Condition under which the state formula `cond` is true at sample `k`.
 
-        If `holds` is False, it is the condition that `cond` is false.
+        If `holds` is False, the result is the condition under which `cond` is false.
         """
         match cond:
             case ir.Truth(truth):
@@ -405,9 +405,9 @@ class Encoding:
         return False if high < 0.0 else Leaf(form, margin)
 
     def _quadratic(self, variable: int, a: float, form: Affine) -> Tree:
-        """`a x^2 + form >= 0` as affine conditions on x, the given variable, by the roots of the polynomial.
+        """Condition `a x^2 + form >= 0` as affine conditions on x, by the roots of the polynomial.
 
-        `form` is affine in x.
+        `variable` is the index of the variable x, and `form` is affine in x.
         """
         b, c = form.terms.get(variable, 0.0), form.const
         inside = b * b - 4.0 * a * c
@@ -421,9 +421,10 @@ class Encoding:
         return junction("or", below) if a > 0.0 else junction("and", between)
 
     def _ellipse(self, squares: Mapping[int, float], form: Affine) -> Tree:
-        """`sum of a_i x_i^2 + b_i x_i + c >= 0`, with `a_i` of one sign, rewritten as a bound on a norm.
+        """Condition `sum(a_i x_i^2 + b_i x_i) + c >= 0`, rewritten as a bound on a norm.
 
-        `squares` maps the variable x_i to a_i; `form` is the sum of all b_i x_i and c.
+        All `a_i` must have the same sign. `squares` maps the index of the variable `x_i` to `a_i`. `form` is
+        the affine part: the sum of all `b_i x_i`, plus c.
         """
         sign = 1.0 if next(iter(squares.values())) > 0.0 else -1.0
         parts, rest = [], sign * form.const
@@ -532,12 +533,13 @@ class Encoding:
         return Expression(ZERO, ((1.0, Greatest(tuple(items[i] for i in left))),))
 
     def _held(self, args: Sequence[Expression]) -> Expression | None:
-        """Encode `clip(v + c u, low, high)` as a variable that equals `v + c u`, without clipping.
+        """Encode `clip(v + c u, low, high)` without clipping, as a variable that equals `v + c u`.
 
-        Here `v + c u` is the first argument, and u a control that no other expression reads. If v itself lies
-        within the bounds, u can be chosen such that the sum reaches a bound exactly instead of exceeding it.
-        So the sum can be constrained to [low, high]. The result is None if v may leave the bounds, or if the
-        arguments have another form.
+        Here u is a control that no other expression reads, and v lies within [low, high]. If the sum
+        `v + c u` exceeds a bound, a u closer to 0 gives exactly this bound. So no behaviour is lost if the
+        sum is constrained to [low, high]. `args` contains the three arguments of `clip`.
+
+        The result is None if v may leave the bounds, or if the arguments have another form.
         """
         form, low, high = args[0].form, args[1].known, args[2].known
         free = self._free & form.terms.keys()
@@ -642,7 +644,7 @@ _FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {
 
 
 def _read_once(names: set[str], nums: Sequence[ir.Num]) -> set[str]:
-    """Names of the signals that the expressions `nums` read exactly once in total; a subset of `names`."""
+    """Those signals in `names` that the expressions `nums` together read exactly once."""
     reads = [leaf.name for num in nums for leaf in leaves(num) if isinstance(leaf, ir.Signal)]
     return {name for name in names if reads.count(name) == 1}
 
@@ -666,7 +668,7 @@ def _conjuncts(tree: Tree) -> Iterator[Tree]:
 def _scaled(one: Expression, other: Expression) -> Expression | None:
     """Product of `one` and `other`, if `one` is a choice between two constants; None otherwise.
 
-    The product is a choice between two multiples of `other`.
+    The product is then a choice between two multiples of `other`.
     """
     match one.atoms:
         case ((factor, Conditional(yes, no, holds, fails)),) if not one.form.terms:

@@ -69,8 +69,8 @@ class Leaf:
 
     Attributes:
         form: affine form.
-        margin: affine form that `form` must reach. For example, it is the variable of the robustness that is
-            maximised. It is 0 for predicates on time.
+        margin: affine form that `form` must reach. An example is the variable of the robustness that is
+            maximised. For predicates on time, the margin is 0.
         literal: index of the binary variable that implies the condition; None until one is needed.
     """
 
@@ -115,9 +115,10 @@ class Arrays:
 
     Attributes:
         lower, upper: bounds of the variables, (n,).
-        integer: whether a variable is an integer, (n,).
+        integer: whether each variable is an integer, (n,).
         starts: index of the first entry of each row, (rows + 1,).
-        indices, values: index of the variable, and coefficient, of each entry.
+        indices: for each entry, the index of its variable.
+        values: for each entry, its coefficient.
         row_lower, row_upper: bounds of the rows, (rows,).
         cost: coefficients of the cost that is minimised, (n,).
     """
@@ -174,7 +175,7 @@ class Model:
     def most(self, tree: Tree) -> float:
         """Upper bound on the robustness of the condition `tree`, from the bounds of the variables.
 
-        It is inf for a condition that is True and -inf for one that is False.
+        It is inf if `tree` is the constant True, and -inf if `tree` is the constant False.
         """
         if isinstance(tree, bool):
             return math.inf if tree else -math.inf
@@ -230,9 +231,10 @@ class Model:
         return found
 
     def imply(self, off: Affine, tree: Tree) -> None:
-        """Add constraints by which the condition `tree` must hold if `off` is 0.
+        """Add constraints that force the condition `tree` to hold if `off` is 0.
 
-        `off` is an affine form with nonnegative integer values. If it is 1 or more, nothing is required.
+        `off` is an affine form with nonnegative integer values. If its value is 1 or more, nothing is
+        required.
         """
         if isinstance(tree, bool):
             if not tree:

@@ -1,7 +1,7 @@
-"""Array operations on symbolic values, and robustness: operations are recorded as an ONNX graph.
+"""Operations on symbolic arrays, and robustness of formulas, both recorded as an ONNX graph.
 
-Switching and robustness are exact; gradients and smooth extrema are not supported. Numbers are float64. If
-the ONNX runtime has a function in float32 only (`atan`), one Newton step gives full precision.
+Conditions and robustness are exact; gradients and smooth extrema are not supported. Numbers are float64. The
+ONNX runtime has some functions, such as `atan`, in float32 only. One Newton step then gives full precision.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class OnnxOps:
         return self.atan2(((1.0 - x) * (1.0 + x)).apply("Sqrt"), x)
 
     def atan2(self, a: Number, b: Number) -> Value:
-        """Angle of the point (b, a) in radians, from the smaller coordinate divided by the larger."""
+        """Angle of the point (b, a), in radians."""
         like = _like(a, b)
         y, x = like.beside(a), like.beside(b)
         tall, wide = y.apply("Abs"), x.apply("Abs")
@@ -228,7 +228,7 @@ def _flat(slope: Value) -> Value:
 
 
 def _running(x: Value, op: str) -> Value:
-    """Running minimum or maximum (`op`) in about log2(rows) operations."""
+    """Running minimum (`op` "Min") or maximum ("Max") along axis 0, in about log2(rows) operations."""
     size = 1
     while size < x.shape[0]:
         x = joined([x[:size], x[size:].apply(op, x[:-size])])

@@ -38,7 +38,10 @@ class GraphNode:
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names that the node depends on, including those of the enclosing graph that its loop body reads."""
+        """Names of the values that the node reads.
+
+        If the node is a loop, they include values of the enclosing graph that the loop body reads.
+        """
         bodies = (value for _, value in self.attributes if isinstance(value, GraphBody))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
 
@@ -48,8 +51,8 @@ class GraphBody:
     """Body of a loop: a graph inside a node.
 
     Attributes:
-        sheet: graph of an iteration; `sheet.inputs` are its inputs.
-        outputs: values that an iteration returns.
+        sheet: graph of one iteration; `sheet.inputs` are its inputs.
+        outputs: values that each iteration returns.
     """
 
     sheet: OnnxGraph
@@ -79,7 +82,8 @@ class OnnxGraph:
         nodes: operations in order.
         constants: name -> array.
         inputs: input values of the graph.
-        prefix: start of all names in the graph; a loop body and the enclosing graph have different ones.
+        prefix: start of the names that the graph creates. It differs between a loop body and the enclosing
+            graph, so that their names differ too.
     """
 
     nodes: list[GraphNode] = field(default_factory=list)
@@ -111,7 +115,15 @@ class OnnxGraph:
         kind: Kind,
         attributes: Mapping[str, Attribute] | None = None,
     ) -> tuple[Value, ...]:
-        """Add a node or reuse an equal one; return its outputs, one per shape."""
+        """Add a node, or reuse an equal one; return the outputs of the node.
+
+        Args:
+            op: ONNX operation.
+            inputs: operands.
+            shapes: shape of each output.
+            kind: element type of the outputs.
+            attributes: name of an ONNX attribute -> its value.
+        """
         facts = tuple(sorted((attributes or {}).items()))
         names = tuple(value.name for value in inputs)
         key = (op, names, facts, len(shapes))
@@ -130,9 +142,9 @@ class OnnxGraph:
         Args:
             carried: initial values of the loop state.
             rows: values (count, …); an iteration gets one row (1, …) of each.
-            turn: loop body: a function (graph, loop state, rows) -> (next loop state, outputs). It writes to
-                the graph that it gets, and imports values of the enclosing graph by `Value.on`. The next loop
-                state has the shapes of the loop state; each output is (1, …).
+            turn: loop body, a function (graph, loop state, rows) -> (next loop state, outputs). It adds
+                operations to the graph that it gets. If it reads a value of the enclosing graph, it must
+                convert the value by `Value.on`. The loop state keeps its shapes; each output is (1, …).
 
         Returns:
             Outputs of all iterations, (count, …) each.
@@ -299,7 +311,7 @@ class Value:
     def expand(self, *shape: int, like: Value | None = None) -> Value:
         """Expand axes of length 1, so that the result has the given shape.
 
-        A length `BATCH` in the shape is unknown; it is the length of the last axis of `like`.
+        If a length in the shape is `BATCH` (unknown), that axis gets the length of the last axis of `like`.
         """
         if self.shape == shape:
             return self

@@ -1,8 +1,8 @@
 """Minimum and maximum in torch with fast subgradients: elementwise, along time, over windows, and `until`.
 
-The backward passes of torch spend most of their time on boolean masks. Here masks are numbers, stored in the
-memory of the resulting gradient. Windows are computed by the C kernel (`stlc.compile.backends.array.kernel`),
-or, for small arrays, by gathering all windows into one array.
+The backward passes of torch spend most of their time on boolean masks. Here a mask consists of numbers 0 and
+1, and the gradient overwrites it in the same memory. Windows are computed by the C kernel
+(`stlc.compile.backends.array.kernel`), or, for small arrays, by gathering all windows into one array.
 """
 
 from __future__ import annotations
@@ -159,7 +159,10 @@ def _like(x: Tensor, rows: int) -> Tensor:
 
 
 def is_small(x: Tensor, window: Sliding) -> bool:
-    """True if the array is small enough to gather all windows, which takes `width` times its memory."""
+    """True if `x` is small enough to copy all windows into one array.
+
+    This array takes `window.width` times the memory of `x`.
+    """
     return x.numel() * window.width <= _SMALL
 
 
@@ -174,7 +177,7 @@ def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
 
 
 def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
-    """Exact `until` ("max") or `release` ("min") over windows: `(time, batch)` -> `(count, batch)`."""
+    """Exact `until` (`pick` "max") or `release` ("min") over windows: (time, batch) -> (count, batch)."""
     held, then = _gathered(left, neutral(dual(pick)), window), _gathered(right, neutral(pick), window)
     if pick == "max":
         return torch.minimum(torch.cummin(held, -1).values, then).amax(dim=-1)

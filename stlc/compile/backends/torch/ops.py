@@ -45,9 +45,9 @@ class _SafeSqrt(torch.autograd.Function):
 
 
 class _MaskedRows(torch.autograd.Function):
-    """Autograd function: copy of an array with a constant in the rows outside a mask.
+    """Autograd function: copy of an array in which some rows are replaced by a constant.
 
-    These rows have no gradient.
+    The replaced rows have no gradient.
     """
 
     @staticmethod
@@ -200,7 +200,11 @@ class TorchOps:
         return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
 
     def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
-        """Array of exactly 0 or 1 by the sign of `rho`, with the gradient of `(1 + tanh(slope rho)) / 2`."""
+        """Array that is 1 where the condition with robustness `rho` holds, else 0, with a smooth gradient.
+
+        The condition is `rho > 0` if `strict`, and `rho >= 0` otherwise. The gradient is that of
+        `(1 + tanh(slope rho)) / 2`.
+        """
         hard = torch.heaviside(rho.detach(), self.constant(0.0 if strict else 1.0, rho))
         if not rho.requires_grad:
             return hard
@@ -228,15 +232,18 @@ class TorchOps:
         return torch.cummax(x, dim=0).values
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
-        """Exact minimum or maximum of arrays; one of several equal operands may get the whole gradient."""
+        """Exact minimum or maximum of arrays.
+
+        If several operands are equal, they may share the gradient, or one of them gets all of it.
+        """
         if torch.compiler.is_exporting():  # the choice must not depend on the batch size
             return reduce(torch.minimum if pick == "min" else torch.maximum, items)
         return choice(items, pick)
 
     def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact extrema over sliding windows; None if other torch operations must compute them.
+        """Exact extrema over sliding windows; None if the caller must use other torch operations.
 
-        One of several equal operands may get the whole gradient.
+        If several rows are equal, one of them may get the whole gradient.
         """
         if x.ndim != 2 or torch.compiler.is_exporting():
             return None
@@ -245,9 +252,9 @@ class TorchOps:
         return by_kernel((x,), pick, window)
 
     def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact `until` or `release` over windows; None if other torch operations must compute them.
+        """Exact `until` or `release` over windows; None if the caller must use other torch operations.
 
-        One of several equal operands may get the whole gradient.
+        If several values are equal, one of them may get the whole gradient.
         """
         if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
             return None
@@ -256,12 +263,12 @@ class TorchOps:
         return by_kernel((left, right), pick, window)
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
-        """Smooth maximum (`k` > 0) or minimum over axis 0, which is kept with length 1."""
+        """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) over axis 0, which is kept with length 1."""
         out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
         return out
 
     def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
-        """Smooth maximum (`k` > 0) or minimum of two arrays of the same shape."""
+        """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) of two arrays of the same shape."""
         out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
         return out
 
