@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from stlc.trace import Trace
 
     def compile(spec: ast.Spec, system: System) -> Task:
-        """Compile a specification for a system: the package `stlc.compile`, called as a function."""
+        """Compile a specification for a system; see `_CallablePackage.__call__`.
+
+        At run time, this name is the package `stlc.compile`, which can be called like a function.
+        """
 
 else:
     import stlc.compile as compile

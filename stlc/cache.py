@@ -53,8 +53,9 @@ class Cache:
 
     Attributes:
         shown: path of the folder, for messages.
-        folder: path used to read and write. Where the system supports that, it is the path of an open file
-            descriptor: it leads to the folder that was checked even if a parent folder is replaced.
+        folder: path used to read and write. On systems with `/proc` it is the path of an open file
+            descriptor. This path leads to the folder that was checked, even if a parent folder is replaced
+            later.
     """
 
     shown: Path
@@ -225,9 +226,10 @@ def private(path: Path) -> Cache:
 
 
 def _checked_folder(path: Path) -> Path:
-    """Check the owner of a folder and set its mode to 0700; return its path through an open file descriptor.
+    """Check the owner of the folder `path`, set its mode to 0700, and return a path to the folder.
 
-    Where the system has no such paths, `path` is returned. Raises Unusable if the folder has another owner.
+    On systems with `/proc`, the returned path is that of an open file descriptor, which cannot be redirected
+    to another folder. On other systems, `path` is returned. Raises Unusable if the folder has another owner.
     """
     open_one = _descriptors.get(path)
     fresh = open_one is None or not os.path.samestat(os.fstat(open_one), path.lstat())
@@ -291,7 +293,10 @@ def _prune_once(store: Cache) -> None:
 
 
 def prune(store: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
-    """Remove files that were not used for `most_days` days, then the oldest ones beyond `most_bytes`."""
+    """Remove files that were not used for `most_days` days; of the others, keep the newest.
+
+    The files that are kept have at most `most_bytes` bytes in total.
+    """
     now, left = time.time(), most_bytes
     for name, found in sorted(_entries(store), key=lambda entry: entry[1].st_mtime, reverse=True):
         days = (now - found.st_mtime) / _DAY

@@ -22,7 +22,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Edits that repair a finding, (source location, replacement) pairs, and their effect in words."""
+    """Repair of a finding: edits, as (source location, replacement) pairs, and their effect in words."""
 
     edits: tuple[tuple[Span, str], ...]
     text: str = ""
@@ -71,7 +71,7 @@ class Findings(list[Diagnostic]):
         self._indexed = 0
 
     def tell(self, finding: Diagnostic) -> None:
-        """Append a finding; one with the code, location and message of a finding in the list is dropped."""
+        """Append a finding, unless the list has one with the same code, location and message."""
         for known in self[self._indexed :]:
             self._known.add((known.code, known.span, known.message))
         key = (finding.code, finding.span, finding.message)
@@ -84,7 +84,7 @@ class Findings(list[Diagnostic]):
 def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
     """Append a finding to the list `sink`.
 
-    It is dropped if the list has a finding with the same code, location and message.
+    The finding is dropped if the list has one with the same code, location and message.
     """
     if isinstance(sink, Findings):
         sink.tell(finding)
@@ -95,9 +95,10 @@ def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
 
 
 class StlcError(Exception):
-    """Base class of the errors that a user can correct; `exit_code` is that of the command line.
+    """Base class of the errors that a user can correct.
 
-    Its `diagnostics` are the findings to show.
+    `diagnostics` are the findings to show. `exit_code` is the exit code of a command that fails with the
+    error.
     """
 
     exit_code = 3

@@ -2,7 +2,8 @@
 
 Names, comments, units and file names come from untrusted files. Each target has one function here, through
 which every text for that target passes. If the target can represent every character, reading it restores the
-text exactly; if not (a comment, a terminal, a picture), such characters are replaced by a visible symbol.
+text exactly; if not (a comment, a terminal, a picture), the characters that it cannot represent become
+visible symbols.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def _word(text: str) -> str:
 
 
 def _ansi(char: str) -> str:
-    """A character as written within `$'…'` in a shell; an invisible one is written as its bytes."""
+    """A character as written within `$'…'` in a shell; an invisible character is written as its bytes."""
     if not _INVISIBLE.match(char):
         return char
     return "".join(

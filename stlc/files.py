@@ -174,11 +174,11 @@ def reported(action: str) -> Iterator[None]:
 def find_system(name: str, spec_path: Path | None = None) -> Path:
     """Find the system file called `name` and return its path.
 
-    It is searched as given, then beside the specification, in `systems`, in `examples`, and among the
+    The name is tried as a path, then beside the specification, in `systems`, in `examples`, and among the
     installed files. The suffix `.yaml` may be omitted.
 
     Raises:
-        UsageError: U102, it is in none of these places, which the message lists.
+        UsageError: U102, the file is in none of these places; the message lists them.
     """
     folders = [Path()]
     if spec_path is not None:
@@ -214,7 +214,7 @@ def _straight(path: Path) -> Path:
 
 
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:
-    """Find the trace called `name`: the given path, else in the folder of the newest run below `runs`.
+    """Find the trace called `name`: a file at that path, else in the folder of the newest run below `runs`.
 
     Raises:
         UsageError: U102, it is in neither place; the message lists both.

@@ -70,9 +70,10 @@ class SearchOptions:
     """Parameters of a local search in native code; all arrays are contiguous float64.
 
     Attributes:
-        bounds: lowest value, highest value, and 1 for a periodic angle (else 0) of each control, (3, m).
-        factors: weight / scale of each requirement, (R,); the search maximises the least of the robustness
-            values multiplied by these.
+        bounds: three numbers for each control, (3, m). They are its lowest value, its highest value, and 1 if
+            the control is a periodic angle, else 0.
+        factors: weight / scale of each requirement, (R,). The search multiplies each robustness by its
+            factor, and maximises the least product.
         bank: plans that satisfied the specification from other states, (k, T, m). The search may replace the
             last steps of a plan, or all of its steps, by those of a plan in the bank.
         generations: largest number of iterations, in each of which several changes of the best plan are
@@ -298,8 +299,8 @@ def _share(
 ) -> None:
     """Call `rows(first, last)` for consecutive short ranges of the rows of a batch, on several threads.
 
-    Between two calls, an interruption or `stop` ends the work; then the remaining rows are not processed. The
-    number of rows per call is a multiple of `grain`.
+    The work ends early if the process is interrupted, or if `stop` returns True between two calls; the
+    remaining rows are then not processed. The number of rows per call is a multiple of `grain`.
 
     Raises:
         MemoryError: a call returned a value other than 0.
@@ -338,7 +339,8 @@ class _Parts:
     def work(self, rows: Callable[[int, int], int]) -> None:
         """Process ranges of rows until none are left.
 
-        A range takes about `PART` seconds: the time of one determines the number of rows of the next.
+        A range takes about `PART` seconds, because the time of each range determines the number of rows of
+        the next.
         """
         grains = 1
         while not self.failed:
@@ -372,7 +374,10 @@ def load(text: str) -> ctypes.CDLL | None:
 
 
 def why_none(text: str) -> str:
-    """Reason why `load` returned None for a C code, as a clause that continues "because"."""
+    """Return the reason why `load` returned None for the C code `text`.
+
+    The reason is a clause that continues a sentence after "because".
+    """
     using = compiler()
     if using is None:
         return "there is no C compiler"
@@ -384,9 +389,9 @@ def why_none(text: str) -> str:
 
 
 def _loaded(text: str, using: str) -> ctypes.CDLL | None:
-    """Return the library of a C code for the compiler `using`, from the cache or newly built.
+    """Return the library of the C code `text`, loaded from the cache or built by the compiler `using`.
 
-    It is None if the disk is full or the operating system refuses to load it.
+    The result is None if the disk is full, or if the operating system refuses to load the library.
 
     Raises:
         CompilerError: the compiler cannot be used, or failed for this code a short while ago.
@@ -427,7 +432,7 @@ _temporary: dict[str, Cache | None] = {}
 def _key(text: str, using: str) -> str:
     """Hash of all inputs of a build: C code (`text`), compiler (`using`), its flags, and the processor.
 
-    It is a part of the library's file name.
+    The hash is a part of the library's file name.
 
     Raises:
         CompilerError: the compiler cannot be used.
@@ -439,7 +444,7 @@ def _key(text: str, using: str) -> str:
 def _cached(place: Cache, key: str) -> ctypes.CDLL | None:
     """Load the library with the hash `key` from the cache.
 
-    Return None if it is missing; a library whose content has changed is removed with a warning.
+    Return None if there is no such library. A library whose content has changed is removed with a warning.
     """
     for name in place.names(f"kernel-{key}-"):
         data = place.read(name)

@@ -32,9 +32,9 @@ def versions() -> dict[str, str]:
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:
-    """Commit of the git repository of `folder` (by default the current one), and whether it has changes.
+    """Return the commit of a git repository, and whether the repository has uncommitted changes.
 
-    None if there is no repository.
+    The repository is that of `folder`, by default the current folder. The result is None if there is none.
     """
     commit = _git(folder, "rev-parse", "HEAD")
     if commit is None:

@@ -283,10 +283,10 @@ def _by_name(where: str, root: Path) -> RunDir:
 def _of_spec(path: Path, root: Path) -> RunDir:
     """Return the newest run that was trained for the specification file `path`.
 
-    If there is none, it is the newest run for a specification of the same name in another folder.
+    If there is none, return the newest run for a specification of the same name in another folder.
 
     Raises:
-        UsageError: R101, there is none.
+        UsageError: R101, there is no such run either.
     """
     runs = every_run(root)
     trained = [run for run in runs if _spec_path(run) == path.resolve()]

@@ -56,8 +56,8 @@ class HangsError(Exception):
 
     Attributes:
         why: reason in words.
-        worked: whether it exceeded the limit of processor time or memory; False: it used no processor time
-            for too long.
+        worked: True if the program exceeded its limit of processor time or memory. False if the program hung,
+            that is, used no processor time for too long.
     """
 
     def __init__(self, why: str, *, worked: bool = False) -> None:
@@ -138,7 +138,7 @@ def works(using: str) -> str:
     """Test whether the compiler `using` can build a library; remembered failures are forgotten first.
 
     Returns:
-        The reason if it cannot, else "".
+        The reason if the compiler cannot, else "".
     """
     forget()
     try:
@@ -168,7 +168,7 @@ _known: dict[str, str] = {}
 
 
 def trouble(key: str) -> str:
-    """Reason of a failure remembered under `key`, by this process or another; "" if there is none."""
+    """Reason of the failure that this or another process remembered under `key`; "" if there is none."""
     if key in _known:
         return _known[key]
     store = cache.persistent()
@@ -288,7 +288,10 @@ def _signals_deferred() -> Iterator[None]:
 
 
 def _limit_time(process: subprocess.Popen[bytes]) -> None:
-    """Limit the processor time of a program and its children, for the case that this process dies first."""
+    """Limit the processor time of a program and its children.
+
+    The limit ends them even if this process ends first.
+    """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         import resource
 

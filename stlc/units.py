@@ -246,7 +246,7 @@ def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
 def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
     """Product of powers of units, given as pairs (unit, power).
 
-    Its text keeps the symbols of the given units: the square of `km` is `km^2`.
+    The text of the product keeps the symbols of the given units: the square of `km` is `km^2`.
     """
     dims, ratio = _NONE, Fraction(1)
     powers: dict[str, int] = {}

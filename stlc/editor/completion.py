@@ -190,7 +190,7 @@ def _functions() -> Iterator[Offer]:
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
-    """Yield proposals for names at a cursor where the grammar does not accept a number.
+    """Yield proposals for names at a cursor where no expression can begin.
 
     `piece` is the text of the declaration up to the word under the cursor. If it ends with a colon or an
     arrow, types are proposed. In a signal declaration, the states of the system that are not yet declared are

@@ -49,7 +49,7 @@ class Finding:
     Attributes:
         diagnostic: the same diagnostic that `stlc lint` prints.
         span: location in the edited text.
-        mild: whether it is an error that prevents training but not monitoring; it is shown as a warning.
+        mild: True for an error that prevents training but not monitoring. The editor shows it as a warning.
     """
 
     diagnostic: Diagnostic
@@ -87,7 +87,7 @@ class Document:
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """Imported modules; empty if the file of one cannot be read."""
+        """Imported modules; empty if any of their files cannot be read."""
         try:
             return load_modules(self.spec)
         except StlcError:
@@ -113,8 +113,8 @@ class Document:
     def _place(self, finding: Diagnostic) -> Finding:
         """Locate a diagnostic in this text.
 
-        A diagnostic of another file is placed where this text names the system, else at the start of the
-        text.
+        A diagnostic of another file is placed where this text names the system. If the text names no system,
+        it is placed at the start of the text.
         """
         span = finding.span
         if span is not None and span.source.name == self.source.name:
@@ -315,7 +315,7 @@ def _ranged(
 def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
     """Return the formulas of a specification by name.
 
-    If a requirement and a definition have the same name, it is the formula of the requirement.
+    If a requirement and a definition have the same name, the name stands for the formula of the requirement.
     """
     found: dict[str, typed.Formula] = {}
     for item in spec.items:
@@ -378,9 +378,9 @@ def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Bor
 def definition(document: Document, offset: int) -> tuple[Span, ...]:
     """Return the source locations to which "go to definition" leads from the cursor at `offset`.
 
-    A name leads to its declaration; a declared signal, parameter or constant to its entry in the system file;
-    `system "file"` to that file; and `module.name` to the declaration in the module. The result is empty if
-    the cursor is at none of these.
+    A name leads to its declaration. In the declaration itself, the name of a signal, parameter or constant
+    leads to its entry in the system file. `system "file"` leads to that file, and `module.name` leads to the
+    declaration in the module. The result is empty if the cursor is at none of these.
     """
     place = document.spec.system_span
     if place is not None and place.start <= offset <= place.end:

@@ -1,4 +1,4 @@
-"""Hover text of the word under the cursor: sort, unit, range, value, and times in seconds and steps."""
+"""Hover text of the word under the cursor: kind, unit, range, value, and times in seconds and steps."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ def _is_temporal(lexeme: Lexeme) -> bool:
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
     """Return the source location that the hover text of a temporal operator refers to.
 
-    It extends from the word under the cursor to the end of the operator's interval, if that is written.
+    The location extends from the word under the cursor to the end of the operator's interval. If the operator
+    has no interval, it is the word alone.
     """
     word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
     if node.interval is None:
@@ -104,7 +105,7 @@ def duration(steps: int, grid: Grid) -> str:
 
 
 def about(document: Document, symbol: Symbol) -> str:
-    """Return the hover text of a symbol: its declaration, its sort, unit and range, and its `##` comment."""
+    """Return the hover text of a symbol: its declaration, its kind, unit and range, and its `##` comment."""
     item = symbol.item
     parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
@@ -134,7 +135,7 @@ def about_shared(item: ast.Item, key: str) -> str:
 
 
 def summary(document: Document, symbol: Symbol) -> str:
-    """Return sort, unit and range of a symbol in one line."""
+    """Return one line on a symbol: for example, the kind, unit and range of a signal."""
     return next(iter(_facts(document, symbol)), symbol.kind)
 
 

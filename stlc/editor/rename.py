@@ -26,7 +26,7 @@ _FROM_ELSEWHERE = ("module", "extern", "param")
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """Return the symbol at `offset` and its place, if the symbol can be renamed; else None.
+    """Return the occurrence of a symbol at `offset` if the symbol can be renamed, else None.
 
     Imported modules, external functions and parameters cannot be renamed, because other files may refer to
     them by name.
@@ -105,6 +105,6 @@ def _bindings(names: SymbolNames) -> list[int]:
 def _declared(names: SymbolNames) -> tuple[int, int, int]:
     """Return the numbers of distinct names of values, of types, and of requirements or assumptions.
 
-    A number that decreases tells that two symbols got the same name.
+    If a renaming decreases one of these numbers, it has given two symbols the same name.
     """
     return len(names.values), len(names.types), len(names.rules)

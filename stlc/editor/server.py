@@ -47,9 +47,10 @@ class Layout:
         return lsp.Position(row, self._units(self.text[self._starts[row] : min(offset, self._ends[row])]))
 
     def offset(self, place: lsp.Position) -> int:
-        """Return the offset of the character at a position, also if the position lies within the character.
+        """Return the offset of the character at a position.
 
-        In UTF-16, for instance, some characters count as two columns.
+        The position may lie within the character: in UTF-16, for instance, some characters count as two
+        columns.
         """
         if place.line >= len(self._starts):
             return len(self.text)
@@ -62,7 +63,7 @@ class Layout:
 
 
 class Server(LanguageServer):
-    """Language server that stores an analysis of every open specification, made anew after each change."""
+    """Language server that stores an analysis of every open specification, renewed after each change."""
 
     def __init__(self) -> None:
         super().__init__("stlc", __version__, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)

@@ -215,7 +215,7 @@ def _of_item(item: ast.Item, names: SymbolNames) -> Iterator[Occurrence]:
 def _uses(node: ast.Node, scope: Scope, names: SymbolNames) -> Iterator[Occurrence]:
     """Yield the occurrences of symbols in a part of a declaration; built-in names are left out.
 
-    `scope` maps the names that can be used there to their symbols.
+    `scope` maps the names that can be used in this part to their symbols.
     """
     match node:
         case ast.Name(span, name, quoted):

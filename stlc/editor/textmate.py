@@ -76,8 +76,9 @@ _COMMENT = r"(?:#|//).*$"
 def _declarations() -> list[dict[str, Any]]:
     """Patterns for the keyword and the name of a declaration.
 
-    The names of requirements and assumptions get a different TextMate scope (class for colouring) than
-    others.
+    A name gets a TextMate scope (class for colouring) that depends on the kind of declaration. Requirements
+    and assumptions have one scope, definitions, regions and enums a second, and all others, such as signals,
+    a third.
     """
     rules = ("require", "assume")
     callables = ("def", "region", "enum")

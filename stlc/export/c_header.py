@@ -1,7 +1,8 @@
-"""Export of a controller as one C header (C99, C++11): policy, model, monitor, guard of Meng and Fan 2023.
+"""Export of a controller as one C header (C99, C++11): policy, model, monitor and guard.
 
-The code is that of the native kernel, whose functions have short names such as `roll` and `check`. These
-could collide with names in the program that includes the header, so every name gets a prefix.
+The guard is that of Meng and Fan (2023). The code is that of the native kernel (the compiled code that
+evaluates plans in stlc), whose functions have short names such as `roll` and `check`. These could collide
+with names in the program that includes the header, so every name gets a prefix.
 """
 
 from __future__ import annotations
@@ -428,10 +429,10 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 
 
 def _falling(motion: Motion, plan: Plan) -> list[str]:
-    """C function `fall`: robustness of the safety requirements on a prefix of a trajectory.
+    """C function `fall`: robustness of the safety requirements on the first steps of a trajectory.
 
-    Its input is the states and one further signal, with index STATES. This signal is positive at the samples
-    after the prefix.
+    The function reads the states and one further signal, which follows the states (index STATES). This signal
+    is positive at the samples after the first steps.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -56,13 +56,16 @@ def control_images(task: Task) -> dict[str, ir.Num]:
 class CostTerm:
     """Summand of a plan's cost: an expression, averaged or maximized over samples.
 
+    The expressions use two special signals. `MARGIN` is the robustness of `goal` at a sample. `REDUCED` is
+    the mean or the maximum of `number` over the samples.
+
     Attributes:
         number: expression that is evaluated at each sample. It may read the states, the states at the first
             sample (name with suffix `START`), the sample `k`, the time `t`, the robustness `rho`, the flag
-            `sat` (always 1), and `MARGIN`; if there are `horizon` samples, also the controls.
+            `sat` (always 1), and `MARGIN`. If `samples` is the horizon, it may also read the controls.
         samples: number of samples, from the first on.
         greatest: True if `REDUCED` is the maximum of `number` over the samples, False if it is the mean.
-        goal: formula whose robustness at each sample is `MARGIN`.
+        goal: formula to which `MARGIN` refers.
         value: the summand, an expression of `REDUCED`.
         condition: condition on the states at the first sample; if it is false, the summand is 0.
     """

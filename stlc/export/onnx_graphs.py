@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
-    """Return the states under plans, with exact switching.
+    """Return the states under plans; conditions of the dynamics switch exactly, without smoothing.
 
     Args:
         step: one step of the system.
@@ -114,7 +114,7 @@ class _Rollout:
         return value.expand(self.steps, value.shape[1])
 
     def _loop(self, stage: RolloutStage) -> None:
-        """Compute the states of a stage that depend on one another, step by step."""
+        """Compute the states of a stage step by step, because they depend on one another."""
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         outside = sorted(read - inside)
@@ -171,7 +171,7 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
         (batch, plans, T, m) float64.
 
     Raises:
-        Untranslatable: an observation or a mirror image calls a Python function.
+        Untranslatable: the expression of an observation or of a mirrored value calls a Python function.
     """
     folded, swapped = _folded(task, network, state)
     raw = _layers(network, _observed(task, folded))
@@ -188,10 +188,10 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
 def _folded(
     task: Task, network: PlanNetwork, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
-    """Reflect states to the side of the mirror symmetry on which the network was trained.
+    """Replace states on one side of the system's mirror symmetry by their mirror images.
 
-    Returns the states by name, and the mask (1, batch) of the reflected ones. The mask is None if the system
-    has no symmetry.
+    The network was trained only for states on the other side. Returns the states by name, and the mask (1,
+    batch) of the states that were replaced. The mask is None if the system has no symmetry.
     """
     if network.mirror is None:
         return state, None
@@ -304,7 +304,8 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
     """Weighted minimum of the robustness of `rules`, (1, batch); +inf without requirements.
 
-    `each` maps the name of a requirement to its robustness. `like` is any array of the batch.
+    `each` maps the name of a requirement to its robustness. `like` is any array of the batch; it determines
+    the size of the batch.
     """
     if not rules:
         return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
@@ -335,7 +336,10 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
 
 
 def rank(found: Verdicts) -> Value:
-    """Rank of plans, (1, batch): larger is better; equal to `stlc.controller.problem.task.rank`."""
+    """Rank of plans, (1, batch); a plan with a larger rank is better.
+
+    The rank is equal to that of `stlc.controller.problem.task.rank`.
+    """
     rho, cost = found.rho, found.cost
     unknown = cost.apply("IsNaN", kind="bool")
     paid = ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None)
@@ -379,10 +383,10 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
 
 
 def deepened(task: Task, states: States) -> Value:
-    """Mask of the plans whose next step increases the robustness of a goal that is satisfied now: (1, batch).
+    """Mask of the plans whose next step increases the robustness of a goal, (1, batch).
 
-    A goal counts as long as its robustness is less than the number `gamma` in the system file. The mask
-    equals `PendingGoals.deepened`. The task must have at least one goal.
+    A goal counts only if it is satisfied now, with a robustness below the number `gamma` in the system file.
+    The task must have at least one goal. The mask equals `PendingGoals.deepened`.
     """
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
@@ -490,7 +494,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
 
 
 def _best(score: Value) -> Value:
-    """Index of the plan with the highest rank for each agent, (batch, 1)."""
+    """Index of the plan with the highest rank for each agent, (batch, 1); `score` holds the ranks."""
     (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
     return best
 

@@ -2,7 +2,7 @@
 
 The guard (Meng and Fan 2023) takes the first T0 steps of a plan from a grid of control sequences.
 `stlc.controller.guard.shooting` tries a longer T0 only if no plan was found with a shorter one. An exported
-program has no such branches: it always tries every T0, and returns the same plans.
+program cannot stop early: it always tries every T0, and returns the same plans.
 """
 
 from __future__ import annotations

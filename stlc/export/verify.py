@@ -50,7 +50,10 @@ class Agreement:
     ties: int
 
     def worst(self, other: Agreement, *distances: float) -> Agreement:
-        """Return the worse values of two agreements; `distances` are further differences of robustness."""
+        """Combine two agreements: take the greater differences, and add the ties.
+
+        `distances` are further differences of robustness.
+        """
         rho = max(self.rho, other.rho, *distances)
         return Agreement(self.states, max(self.plan, other.plan), rho, self.ties + other.ties)
 

@@ -1,6 +1,6 @@
 """Detection of formulas without parentheses that other STL tools parse differently.
 
-Precedence in other tools, from their grammars:
+Precedence in other tools, from their grammars (temporal words are operators such as `always`):
 
     RTAMT      `or` binds tighter than `and`, temporal words bind loosest, `->` is left-associative
     MoonLight  `->` binds tighter than `or`, `or` than `and`, temporal words loosest; `->` is left-associative
@@ -58,7 +58,7 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """Words and signs of a source text, to tell which operands have parentheses.
+    """Words and signs of a source text, from which it is known which operands have parentheses.
 
     `parenthesised` holds the (start, end) offsets of the parts that were already reported for lack of
     parentheses.
@@ -83,7 +83,7 @@ class _Words:
 
 
 def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the operands of a connective that other tools may read differently for lack of parentheses.
+    """Yield the operands of `node` that have no parentheses and that other tools may parse differently.
 
     An example is `p and q` in `p and q or r`.
     """
@@ -109,10 +109,10 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the temporal operator, if any, at the end of the left operand of the connective `node`.
+    """Yield the temporal operator that ends the left operand of the connective `node`, if there is one.
 
-    It has no parentheses. In other tools its operand extends beyond the connective: they parse `always p and
-    q` as `always (p and q)`.
+    The temporal operator has no parentheses. In other tools, its operand extends beyond the connective: they
+    parse `always p and q` as `always (p and q)`.
     """
     part: ast.Node = node.left
     governed: ast.Node | None = None

@@ -181,8 +181,8 @@ class Interval(Node):
 class Temporal(Node):
     """Temporal operator with one operand: `op[interval] body`.
 
-    Without an interval the window extends to the end of the trace. `alias` is the other spelling used in the
-    source, if any (`G`).
+    Without an interval the window extends to the end of the trace. `alias` is the spelling in the source if
+    that is not `op`, such as `G`; else it is "".
     """
 
     op: str
@@ -195,8 +195,8 @@ class Temporal(Node):
 class Until(Node):
     """Temporal operator with two operands: `left op[interval] right`.
 
-    Without an interval the window extends to the end of the trace. `alias` is the other spelling used in the
-    source, if any (`U`).
+    Without an interval the window extends to the end of the trace. `alias` is the spelling in the source if
+    that is not `op`, such as `U`; else it is "".
     """
 
     op: str
@@ -398,8 +398,8 @@ class Spec(Node):
         name: name given by `spec NAME`; "" without it.
         system: path given by `system "…"`, or None.
         system_span: location of that path in the source, or None.
-        time_unit: unit of the numbers in intervals that have none, given by `time UNIT`; "" without that
-            line.
+        time_unit: unit of interval bounds that are written without a unit, given by the line `time UNIT`; ""
+            if there is no such line.
         imports: imports, in order.
         items: declarations, in order.
         source: the source text.

@@ -36,14 +36,15 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     The agent moves on the model of a system, or in its world (the closed-loop simulation, with disturbances
     and further agents if the system file declares them).
 
-    An observation, (k,) float32, is what the policy observes, followed by the elapsed share of the episode if
-    the episode terminates at its end (the remaining return depends on it). Observations are clipped to finite
-    bounds: the nominal ranges of the states and the ranges that random plans reach, widened by half. An
-    action is the actuator command, (m,) float32, in physical units, clipped to the actuator's range. `info`
-    holds `state`, (n,) float64. After the last step, and with the reward `dense` after each step, it also
-    holds `robustness` per requirement, `rho` of the whole specification, and `satisfied`. Robustness is that
-    of the last T steps of the episode (T is the horizon of a plan), clipped to ±10; while the episode is
-    shorter, windows of the formulas end at its last sample.
+    An observation, (k,) float32, is what the policy observes. If the episode terminates at its end, its
+    elapsed share is added as the last value, because the remaining return depends on it. Observations are
+    clipped to finite bounds. The bounds are the nominal ranges of the states and the ranges that random plans
+    reach, widened by half. An action is the actuator command, (m,) float32, in physical units, clipped to the
+    actuator's range. `info` holds `state`, (n,) float64. After the last step, and with the reward `dense`
+    after each step, it also holds `robustness` per requirement, `rho` of the whole specification, and
+    `satisfied`. Robustness is computed from the last T steps of the episode, where T is the number of steps
+    of a plan, and clipped to ±10. While the episode is shorter than T steps, windows of the formulas end at
+    its last sample.
 
     Args:
         task: specification and system.
@@ -211,7 +212,7 @@ class _OnModel:
 
 
 class _InWorld:
-    """Motion of the agent in the world of the system (closed-loop simulation), anew in each episode."""
+    """Motion of the agent in the world of the system (closed-loop simulation), a new one in each episode."""
 
     def __init__(self, task: Task, steps: int) -> None:
         self._task, self._steps, self._type = task, steps, world_type(task.system.decl)

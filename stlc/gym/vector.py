@@ -140,7 +140,10 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._shown(moved.observation), reward, done, none, info
 
     def _plans(self, actions: NDArray[np.float32]) -> Tensor:
-        """Controls of the model, (N, m), for which the actuator commands are `actions`."""
+        """Return the controls of the model, (N, m), that lead to the actuator commands `actions`.
+
+        They depend on the present states if the system file declares a feedback law around plans.
+        """
         if np.shape(actions) != self.action_space.shape:
             raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
         held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))

@@ -40,8 +40,8 @@ class Fixed:
 def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
     """Repair a text in rounds until no finding with an automatic repair remains; return the repaired text.
 
-    In a round all repairs that do not overlap are applied; of two overlapping ones, the second waits for the
-    next round. A round that would introduce new errors is undone and ends the repairs.
+    In each round, all repairs that do not overlap are applied. Of two overlapping repairs, the second waits
+    for the next round. A round that increases the number of errors is undone, and no further round follows.
 
     Args:
         source: the text.

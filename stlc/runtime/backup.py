@@ -24,8 +24,8 @@ POLICY, BACKUP, SAFEST = range(3)
 class Found:
     """Plan found for one state.
 
-    `judged`: the plan and its verdicts, one row. `source`: rule that chose the plan, `BACKUP` or `SAFEST`.
-    `t0`: number of first steps of the plan that were taken from a grid of controls.
+    `judged` is the plan with its verdicts, as one row. `source` is the rule that chose the plan, `BACKUP` or
+    `SAFEST`. `t0` is the number of first steps of the plan that were taken from a grid of controls.
     """
 
     judged: JudgedPlans

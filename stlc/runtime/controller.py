@@ -33,7 +33,8 @@ class ControlDecision:
         rho: robustness of the plan; the specification is satisfied if it is at least -1e-6.
         safe: robustness of the safety requirements alone.
         robustness: robustness of each requirement, by name.
-        source: the rule by which the plan was first chosen.
+        source: rule that first chose the plan; for a plan that is kept from an earlier step, it differs from
+            `rule`.
         t0: number of first steps of the plan that the backup policy took from a grid; 0 for the policy's own
             plan.
         policy_rho: robustness of the policy's plan; -inf if it is not a number.
@@ -174,7 +175,9 @@ class Controller:
     # ---------------------------------------------------------------------- states
 
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
-        """Return the state as an array (agents, n), with added states, and whether it is a single agent's.
+        """Return the states as an array (agents, n), and True if `state` is that of a single agent.
+
+        The array includes the states that the specification adds.
 
         `elapsed`: number of steps since the previous decision.
 
@@ -218,8 +221,8 @@ class Controller:
     def _added_states(self, agents: int, elapsed: int) -> Numbers:
         """States that the specification adds, if the caller does not pass them: (agents, added).
 
-        They are the model's prediction at the previous decision; before the first decision, those of a new
-        mission.
+        The states are those that the model predicted at the previous decision. Before the first decision,
+        they are those of a new mission.
 
         Raises:
             RunError: R107, `elapsed` is not 1, the number of agents has changed, or a parameter has no value.

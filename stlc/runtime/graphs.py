@@ -35,7 +35,7 @@ class JudgedPlans:
     each: Numbers
 
     def of(self, rows: Any) -> JudgedPlans:
-        """Return the rows that an index or a mask selects."""
+        """Return the rows that the index or mask `rows` selects."""
         return JudgedPlans(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 

@@ -38,7 +38,7 @@ class PrefixGrid:
         lengths: lengths T0 of the prefixes, in the order in which they are tried.
         batch: number of trajectories evaluated at a time.
         samples: greatest number of prefixes of one length that are tried.
-        sampling: sequence by which `samples` prefixes are chosen if the grid has more: "lattice" or "random".
+        sampling: method by which `samples` prefixes are chosen if the grid has more, "lattice" or "random".
     """
 
     values: tuple[tuple[float, ...], ...]
@@ -86,7 +86,10 @@ def generators(dims: int) -> tuple[int, ...]:
 
 
 def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
-    """The first `count` points of a sampling sequence in the unit cube, (count, dims), in units of 2^-64."""
+    """Return the first `count` points of a sampling sequence in the unit cube, (count, dims).
+
+    The coordinates are integers, in units of 2^-64.
+    """
     if sampling == "lattice":
         steps = np.array(generators(dims), dtype=np.uint64)
         return np.arange(1, count + 1, dtype=np.uint64)[:, None] * steps

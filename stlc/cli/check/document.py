@@ -75,10 +75,10 @@ def trace_record(
         name: name of the trace.
         source: text of the specification.
         dt: time step in seconds.
-        horizon: value of `T` in steps, if known.
+        horizon: number of steps of the horizon `T`, if known.
         gaps: signal -> number and range of its unknown samples.
         time: function that maps the index of a sample to its time in seconds.
-        found: the keys of the record that the other arguments do not determine, such as `verdict`.
+        found: all other keys of the record and their values, such as `verdict`.
     """
     made: Any = {
         "trace": name,
@@ -124,10 +124,10 @@ def requirement_record(
     Args:
         rule: the requirement.
         cause: cause of its violation, if any.
-        margins: key -> value of the entries on the robustness, such as its minimum, mean or bounds.
+        margins: key -> number, for statistics of the robustness such as its minimum or mean.
         trace: index of the trace with the least robustness.
-        start: instant at which the robustness is least, in seconds.
-        found: entries of the record on the verdict and the counts.
+        start: time in seconds at which the requirement has its least robustness.
+        found: further keys of the record and their values, on the verdict and the counts.
     """
     robustness = {
         **margins,
@@ -216,8 +216,8 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     """Write the robustness of each requirement to the trace file `path`, one signal per requirement.
 
     `result` is the judged trace, and `question` the options with which it was judged. A signal has the shape
-    (traces, samples). Its value at a sample is the robustness of the requirement evaluated there, or NaN if
-    that is not defined.
+    (traces, samples). Its value at a sample is the robustness of the requirement at that instant, or NaN
+    where the robustness is not defined.
 
     Raises:
         MissingError: R201, the disk is full, or the user may not write there.

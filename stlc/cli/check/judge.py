@@ -37,8 +37,9 @@ class Question:
         system: name of a system file.
         names: name of a signal in the specification -> its name in the trace.
         require: names of the judged requirements; all if empty.
-        at: instant at which judging starts: a sample, a time, or `all`. None: the first sample; for
-            requirements over a planning window, every sample with a full window after it.
+        at: instant at which requirements are evaluated, as text: a sample, a time, or `all`. With None it is
+            the first sample. Requirements that hold for every planning window (the steps of one plan) are
+            then evaluated at each sample that has a full window after it.
         end: treatment of traces that are too short: "open" (report bounds), "strict" (an error) or "truncate"
             (end time windows at the last sample).
         tolerance: a requirement is satisfied if its robustness is at least `-tolerance`.
@@ -103,10 +104,10 @@ def found(name: str, runs: Path) -> Path:
 def judge(name: str, question: Question, runs: Path) -> Checked:
     """Load the trace called `name`, judge it with the options in `question`, and explain its violations.
 
-    The name is searched in the newest run below `runs` if there is no such file.
+    If there is no file at the path `name`, it is searched in the newest run below `runs`.
 
     Raises:
-        StlcError: the trace or the specification is invalid, or they do not fit.
+        StlcError: the trace or the specification is invalid, or the two do not fit together.
     """
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.report import explain_all
@@ -151,7 +152,7 @@ def _options(question: Question) -> tuple[str, ...]:
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:
     """Options for reading trace files: names of signals, time steps, and the longest gap between samples.
 
-    With a monitor, they also include the types of the signals that its specification declares.
+    If `monitor` is given, the options also include the types of the signals that its specification declares.
     """
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
@@ -212,7 +213,7 @@ def _monitor(
 
 
 def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
-    """Index of the sample of a trace that the option `--at` names; "all" and None are returned unchanged.
+    """Return the index of the sample that `--at` selects in a trace; "all" and None are returned unchanged.
 
     Args:
         text: value of the option: a sample, a time, or "all".

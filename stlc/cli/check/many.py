@@ -22,8 +22,8 @@ SMALL = 1_000_000
 def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
     """Yield the outcomes of all files in order, computed by `jobs` processes (0: one per core).
 
-    If there is only one file and it cannot be judged, its error is raised. Of several files, one that cannot
-    be judged has an outcome that contains its errors.
+    If there is only one file and it cannot be judged, its error is raised. If there are several files, errors
+    are stored in the outcome of the file.
     """
     if len(works) == 1:
         yield outcome_of(works[0])
@@ -89,9 +89,9 @@ def outcome_of(work: Work) -> Outcome:
 
 
 def _too_large(path: Path) -> bool:
-    """True if the unpacked content of a file is too large for memory, so that it is read in chunks.
+    """True if the unpacked content of a file is too large for memory; the file is then read in chunks.
 
-    A file below `SMALL` bytes is never too large, however well it is compressed.
+    A file of less than `SMALL` bytes is never too large, however well it is compressed.
     """
     if path.stat().st_size < SMALL:
         return False
@@ -133,10 +133,10 @@ def _line(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
-    """Return the row that the summary shows for a file: that of its worst requirement.
+    """Return the row of a file's worst requirement; the summary shows this row for the file.
 
-    A violated requirement comes before an inconclusive one, and that before a satisfied one. Of several, the
-    one with the least robustness is chosen.
+    Violated requirements are worse than inconclusive ones, and inconclusive ones are worse than satisfied
+    ones. Among requirements with the same verdict, the one with the least robustness is the worst.
     """
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
     return min(rows, key=lambda row: (order[row.status], row.least))

@@ -169,10 +169,10 @@ CLOCK = "t"
 
 
 def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
-    """Judge the standard input; with `talk`, print verdicts as soon as they are decided.
+    """Judge the standard input; with `talk`, print each verdict as soon as it is decided.
 
     Raises:
-        UsageError: U101, no specification, or an option that needs the whole trace.
+        UsageError: U101, there is no specification, or an option needs the whole trace.
         TraceError: a line is not a sample, or signals are missing or not finite.
     """
     from stlc.trace.live import MAX_LINE, SampleStream, on_grid
@@ -241,9 +241,10 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
 
 
 def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
-    """Return the sample with its values converted to the declared units by the functions in `changes`.
+    """Return `sample` with its values converted to the units that the specification declares.
 
-    A sample without a time gets one: the number of samples before it, times the time step.
+    `changes` maps the name of a signal to the function that converts its values. If the sample has no time,
+    the time is computed from the number of samples before it and the time step.
     """
     converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}
@@ -252,7 +253,7 @@ def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online)
 def _tell(decision: Decision, online: Online) -> None:
     """Print the verdict `decision`, which the monitor `online` has just reached.
 
-    For a requirement that is judged at many instants only violations are printed.
+    For a requirement that is judged at many instants, only violations are printed.
     """
     repeated = online.repeats(decision.requirement)
     if decision.status == "satisfied" and repeated:

@@ -72,7 +72,7 @@ class Outcome:
         warnings: warnings of the compiler.
         remarks: further messages for the user.
         errors: reasons for which the file could not be judged.
-        exit_code: exit code of the errors.
+        exit_code: exit code of the command for these errors; 0 without errors.
     """
 
     name: str
@@ -93,10 +93,11 @@ class Outcome:
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
     """Return the exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
-    With `fail_under`, the share of the judged instants at which all requirements hold is compared with
-    `fail_under`. 0 means that the share is at least `fail_under`, 1 that it is below, whatever samples
-    follow, and 4 that this is undecided. A file that cannot be judged takes precedence over every verdict.
-    Traces to which the specification does not apply (out of scope) do not count.
+    With `fail_under`, the code depends on the share of the judged instants at which all requirements hold.
+    The code is 0 if this share is at least `fail_under`. It is 1 if the share stays below `fail_under`
+    whatever samples follow. It is 4 if this is undecided. If a file cannot be judged, its exit code is
+    returned, whatever the verdicts of the other files. Traces to which the specification does not apply (out
+    of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:
@@ -112,7 +113,10 @@ def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> i
 
 
 def overall(outcomes: Sequence[Outcome]) -> Status:
-    """Verdict over all judged files, without those to which the specification does not apply."""
+    """Return the verdict over all judged files.
+
+    Files to which the specification does not apply do not count.
+    """
     found = {outcome.status for outcome in outcomes if not outcome.errors}
     if "violated" in found:
         return "violated"

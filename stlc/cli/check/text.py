@@ -64,7 +64,7 @@ def text_of(
     Args:
         title: first line.
         rows: results of the requirements.
-        gaps: unknown samples, a line per signal.
+        gaps: lines about unknown samples, one line per signal.
         reasons: paragraphs on requirements that are not satisfied.
         ending: last lines.
         several: whether the file has several traces.
@@ -81,8 +81,8 @@ def text_of(
 def robustness_text(status: Status, low: float, high: float, least: float, unit: str) -> str:
     """Text of the robustness of a requirement, with its unit.
 
-    It shows the bounds `low` and `high` if the verdict is inconclusive, else the minimum `least`, or
-    "boundary" if that is zero up to rounding.
+    If the verdict `status` is inconclusive, the text shows the bounds `low` and `high`. Otherwise it shows
+    the least robustness, `least`, or the word "boundary" if `least` is zero up to rounding.
     """
     if status == "inconclusive":
         return in_unit(f"[{signed(low)}, {signed(high)}]", unit)
@@ -158,7 +158,10 @@ def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) ->
 
 
 def _gap_texts(result: Checked) -> dict[str, str]:
-    """Lines about the samples that are unknown although a requirement reads them: signal -> its line."""
+    """Return a line of text for each signal with unknown samples that a requirement reads.
+
+    The result maps the name of the signal to the line.
+    """
     subject = result.verdict.subject
     samples = subject.signals.samples * subject.signals.batch
     moment = subject.moment

@@ -120,7 +120,7 @@ def check(
 
 
 def _print(outcomes: Sequence[Outcome]) -> None:
-    """Print the results of the judged files, after remarks and warnings.
+    """Print remarks, errors and warnings, then the results of the judged files.
 
     A single result is printed in full. Of several results, those that are not satisfied are printed in full,
     and a summary table follows.
@@ -145,7 +145,8 @@ def _print(outcomes: Sequence[Outcome]) -> None:
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
     """Split the arguments `files` into a specification and traces; return (specification or None, traces).
 
-    The specification is the first file if it is one, else `spec`, the value of `--spec`.
+    The specification is the file in `files` with the suffix of a specification. If there is none, it is
+    `spec`, the value of `--spec`.
     """
     specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
     traces = [name for name in files if name not in specs]

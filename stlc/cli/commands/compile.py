@@ -39,9 +39,10 @@ def compile_(
 ) -> Answer[documents.CompileResult]:
     """Show the compiled form of a specification, or its syntax tree.
 
-    The compiled form lists intervals in seconds and in steps, added states, the safety part, and the horizon.
-    --show ast prints the syntax tree, --show dot the same for Graphviz; both check only the syntax, `stlc
-    lint` also names, types and units.
+    The compiled form lists the intervals of the temporal operators in seconds and in steps, the states that
+    the specification adds to the system, the requirements tagged @safety, and the horizon. --show ast prints
+    the syntax tree, and --show dot prints it as a graph for Graphviz. Both check only the syntax; `stlc lint`
+    also checks names, types and units.
     """
     from stlc.diagnostics import usage
 
@@ -65,10 +66,10 @@ def compile_(
 def _trees(
     names: Sequence[str], show: Literal["ast", "dot"]
 ) -> Answer[documents.ParsedFile | documents.ParsedFiles]:
-    """Return the syntax trees of the specification files `names`, as the outcome of `stlc compile`.
+    """Return the answer of `stlc compile` that shows the syntax trees of the specification files `names`.
 
-    The text printed is a tree, or with `show` "dot" a graph for Graphviz. The syntax errors of all files are
-    raised together.
+    If `show` is "ast", the trees are printed as indented text. If it is "dot", they are printed as a graph
+    for Graphviz. The syntax errors of all files are raised together.
     """
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
@@ -114,8 +115,8 @@ def _compiled(
 ) -> Answer[documents.CompiledSpec]:
     """Compile the specification `path` for a system, without importing torch; print the part `show`.
 
-    `system` is the system file of `--system`, and `set_` are the values of `--set`. If the system judges
-    closed-loop runs by this specification, it is compiled for recorded traces.
+    `system` is the system file of `--system`, and `set_` are the values of `--set`. The specification is
+    compiled for recorded traces if the system file names it as the judge of closed-loop runs.
     """
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
@@ -196,9 +197,10 @@ def _requirement(rule: CompiledRequirement, dt: float) -> documents.RequirementI
 
 
 def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[documents.WrittenInterval]:
-    """Return the intervals of the temporal operators in `rule`, a requirement, in seconds and in steps.
+    """Yield a record of each interval of a temporal operator in the requirement `rule`.
 
-    An upper end of None is the end of the trace. `dt` is the time step in seconds.
+    The ends of the interval are given in seconds and in steps. If the upper end is None, the interval extends
+    to the end of the trace. `dt` is the time step in seconds.
     """
     from stlc.compile.ir import nodes as ir
     from stlc.compile.ir.traverse import nodes

@@ -154,7 +154,7 @@ def _compiler() -> InstallationFinding:
 
 
 def _completion() -> str:
-    """Path of the file that completes commands in the user's shell; "" if there is none."""
+    """Path of the file that sets up command completion in the user's shell; "" if there is none."""
     try:
         home = Path.home()
     except (RuntimeError, OSError):

@@ -181,7 +181,7 @@ class Page:
 
 
 def read_page(name: str) -> Page | None:
-    """Return the manual page of a code, or of operator precedence (`precedence`); None without a page."""
+    """Return the manual page `name` (an error code or `precedence`); None if there is no such page."""
     path = FOLDER / f"{name}.md"
     if not path.is_file():
         return None
@@ -216,10 +216,11 @@ ASSUMED = (
 
 
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
-    """Compute lower bounds on the probability that the backup policy of a run finds a plan that works.
+    """Compute lower bounds on the probability that the backup policy of a run finds a satisfying plan.
 
-    There is one bound for each prefix length of its grid search and each assumed size of the set of plans
-    that work. The record that is returned also states the assumptions behind the bounds. `runs` is the folder
+    The backup policy takes the first steps (prefix) of a plan from a grid of control sequences. It is assumed
+    that every prefix within a radius of an unknown one leads to a satisfying plan. There is one bound for
+    each prefix length and each radius. The returned record also lists all assumptions. `runs` is the folder
     of all runs, and `overrides` gives new values of constants.
     """
     from stlc.controller.guard.candidates import grid_of

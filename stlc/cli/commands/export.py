@@ -28,10 +28,10 @@ def export(
 ) -> Answer[ExportedRun]:
     """Export a trained controller, monitor included.
 
-    `torch` is a torch.export program: states in, plans and their robustness out. `c` is a C99 header that
-    depends only on libm and includes the backup policy, with an example program. `onnx` are graphs for
-    onnxruntime, run by `stlc.runtime` without torch, the backup policy included. Every export is checked
-    against the run on random states.
+    `torch` is a torch.export program that maps states to plans and their robustness. `c` is a C99 header with
+    an example program. It depends only on libm, and includes the backup policy. `onnx` are graphs for
+    onnxruntime, which `stlc.runtime` runs without torch. They include the backup policy, too. Every export is
+    compared with the run in random states.
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write

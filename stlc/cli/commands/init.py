@@ -39,7 +39,7 @@ _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 def examples(incomplete: str = "") -> list[str]:
     """Return the names of examples that begin with the text `incomplete`, for shell completion.
 
-    Examples are `cart`, the installed systems to which an installed specification refers, and `empty`.
+    The examples are `cart`, `empty`, and every installed system that an installed specification names.
     """
     found = {system.removesuffix(".yaml") for _, system in _pairs()}
     return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
@@ -131,10 +131,10 @@ def _project(example: str) -> dict[str, str]:
 
 
 def _following(files: Mapping[Path, str]) -> str:
-    """Command to run next: training for the first specification in `files` (path -> text).
+    """Return the command to run next: the training for the first specification in `files` (path -> text).
 
-    A specification that a system file names as judge of closed-loop runs is skipped; no policy is trained for
-    it.
+    A specification by which a system file judges closed-loop runs is skipped, because no policy is trained
+    for it.
     """
     systems = (text for path, text in files.items() if path.suffix == ".yaml")
     judging = {name for text in systems for name in _JUDGE.findall(text)}
@@ -145,7 +145,10 @@ def _following(files: Mapping[Path, str]) -> str:
 
 
 def _example_files(name: str) -> dict[str, str]:
-    """Files of an installed system, its dependencies and its specifications: path in the project -> text."""
+    """Return the files of the example `name`, as a mapping from the path in the project to the text.
+
+    They are an installed system file, the files to which it refers, and its specifications.
+    """
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
         advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
@@ -189,7 +192,7 @@ def _template(name: str) -> str:
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
     """Path and text of a new specification in `folder`, which declares a signal for each state of a system.
 
-    The system is the one called `from_`. Without it (None), the specification declares an example signal.
+    The system is the one called `from_`. If `from_` is None, the specification declares an example signal.
 
     Returns:
         Path -> text, and the command to run next.

@@ -50,9 +50,9 @@ def lint(
 ) -> Answer[LintedFiles]:
     """Report errors and warnings in specifications.
 
-    Checks syntax, types, units, parentheses, unused names and vacuous requirements; with --system also that
-    the specification fits the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors. `stlc
-    explain CODE` says what a code means.
+    Checks syntax, types, units, parentheses, unused names and vacuous requirements; with --system it also
+    checks that the specification fits the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors.
+    `stlc explain CODE` says what a code means.
     """
     from stlc.files import find_spec, read_source, write_atomic
     from stlc.lint.lint import Selection
@@ -101,7 +101,10 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """Load the system file against which a specification is checked; None if no system is given."""
+    """Load the system file `system`, with which the specification `source` is checked.
+
+    Return None if `system` is None.
+    """
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
@@ -159,7 +162,7 @@ _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 
 
 def github(findings: Iterable[Diagnostic]) -> str:
-    """Findings as commands of GitHub Actions: one line `::error …` or `::warning …` each."""
+    """Findings as commands of GitHub Actions: one line `::error …` or `::warning …` per finding."""
     return "\n".join(map(_command, findings))
 
 

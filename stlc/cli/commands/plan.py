@@ -63,10 +63,10 @@ def plan(
 ) -> Answer[Plans]:
     """Plan from initial states, without training.
 
-    The best plan found is written as a trace that check and plot read. Every plan is judged exactly in
-    float64. If the search finds no satisfying plan from a start, one may still exist; only the planner milp
-    can prove that there is none. Ctrl-C ends the search and keeps the best plans found. Without --fail-under,
-    the exit code is 1 if a plan violates the specification.
+    The best plan from each initial state is written to a trace, which `stlc check` and `stlc plot` can read.
+    Every plan is judged exactly in float64. If the search finds no satisfying plan, there may still be one.
+    Only the planner milp can prove that there is none. Ctrl-C ends the search and keeps the best plans found.
+    Without --fail-under, the exit code is 1 if a plan violates the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named
     from stlc.controller.planning.traces import starts_of, trace_of

@@ -15,8 +15,8 @@ from stlc.escape import visible
 def report(run: RunArgument = "latest", runs: RunsOption = Path("runs")) -> Answer[WrittenReport]:
     """Write a self-contained report.html with the pictures of a run.
 
-    It is written to the run's folder: training curves, signals with the robustness of each requirement, and
-    the animation of a simulation, if available. The page needs no network.
+    The report is written to the run's folder. It shows training curves, signals with the robustness of each
+    requirement, and the animation of a simulation, if available. The page needs no network.
     """
     from stlc.rundir import RunDir
     from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended

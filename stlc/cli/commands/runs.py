@@ -103,7 +103,7 @@ def rm(
 ) -> Answer[documents.RemovedRuns]:
     """Remove the folders of runs.
 
-    A running one needs --force. The links to the newest run are updated.
+    A run in progress is removed only with --force. The links to the newest run are updated.
     """
     folders = [RunDir.open(name, runs) for name in names]
     going = [folder.shown for folder in folders if folder.status == "running"]

@@ -19,12 +19,12 @@ _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 @command("stlc schema", "stlc schema check/1")
 def schema(
     name: Annotated[
-        str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
+        str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; without /1, the newest version.")
     ] = None,
 ) -> None:
     """Print the JSON Schema of the --json output of a command.
 
-    Within one major version keys are added but never removed.
+    Without a name, all schemas are listed. Within one major version, keys are added but never removed.
     """
     if name is None:
         emit("\n".join(names()))
@@ -33,14 +33,20 @@ def schema(
 
 
 def names() -> list[str]:
-    """Names of all schemas, such as `check/1`; `system-file/1` is the schema of system files."""
+    """Return the names of all schemas, such as `check/1`.
+
+    Most schemas describe the output of a command. `system-file/1` describes system files.
+    """
     from stlc.cli.framework.documents import LINES, RESULTS
 
     return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
-    """Schema of a complete JSON document: the keys that all commands share, and one command's result.
+    """Return the JSON Schema called `name`, such as `check/1`; `check` without a number means `check/1`.
+
+    The schema of a command describes a complete document: the keys that all commands share, and the result of
+    the command.
 
     Raises:
         UsageError: U101, there is no such schema.

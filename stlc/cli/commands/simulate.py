@@ -125,12 +125,12 @@ def simulate(
     """Deploy a trained policy in the world of its system.
 
     The newest run by default. With --method, RUN is a specification, and a planner controls the system
-    without training. With --backup the paper's backup policy guards the policy, and the same seeds are
-    simulated without it for comparison. Trace, scene and figures are written to the run's folder. Drives
-    (closed-loop runs, one agent over one seed each) are judged by the specification that the system names
-    (key `judge` of its section `test`). Means over seeds have 95 % intervals (Student's t). Every system has
-    the scenarios mismatch, disturb and noise, also with a percentage (mismatch-20); --scenario disturbed runs
-    them all.
+    without training. With --backup the paper's backup policy guards the policy. For comparison, the same
+    seeds are simulated without the backup policy, too. Trace, scene and figures are written to the run's
+    folder. A drive is the closed-loop run of one agent with one seed. Drives are judged by the specification
+    that the system file names (key `judge` of its section `test`). Means over seeds have 95 % intervals
+    (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their strength in
+    percent, as in mismatch-20. --scenario disturbed runs all of them.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
@@ -215,9 +215,10 @@ def _run_of(
 
 
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
-    """Return the warning W604 if a simulation of `steps` steps is longer than the missions in the validation.
+    """Return the warning W604 if `steps` steps exceed the time for which the policy was validated, else ().
 
-    It concerns requirements without an end: the validation of the policy says nothing about later times.
+    The warning concerns requirements without an end, about which the validation of the policy says nothing at
+    later times.
     """
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
@@ -293,9 +294,9 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
 
 
 def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
-    """Scenarios to simulate in addition to the simulation without a scenario, by name.
+    """Return the scenarios to simulate besides the simulation without a scenario: name -> scenario.
 
-    The mapping is empty if `scenario` names a single one or is None.
+    The mapping is empty if `scenario` is None or the name of a single scenario.
     """
     from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
 
@@ -321,8 +322,8 @@ def _satisfied(document: Simulation, guard: Mode) -> float:
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
     """Simulate without a scenario and with each of `scenarios`, and return one record of all results.
 
-    The record is also written to the run's folder. The trace in that folder is then the one of the simulation
-    without a scenario; the traces of the scenarios are not kept.
+    The record is also written to the run's folder. The folder keeps the trace of the simulation without a
+    scenario. The traces of the scenarios are not kept.
     """
     found: dict[str, ScenarioResult] = {}
     for name, scenario in scenarios.items():
@@ -353,7 +354,7 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate with one kind of guard (`mode`), and show the progress as `watching` says.
+    """Simulate with the guard `mode`, and show the progress with the options in `watching`.
 
     The closed-loop runs are judged by `rules`. If the simulation fails or Ctrl-C ends it, the steps simulated
     until then are saved as a trace.
@@ -372,9 +373,9 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
-    """Write traces, scene (data of the animation) and record of a simulation; return the record.
+    """Write the traces, the scene (data of the animation) and the record of a simulation; return the record.
 
-    `found` holds the results by kind of guard. The trace of the last one is saved as the main one.
+    `found` maps each kind of guard to its results. The trace of the last kind is saved as the main trace.
     """
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded

@@ -53,9 +53,9 @@ def check(
 ) -> Answer[documents.SystemFacts]:
     """Validate a system file with random rollouts.
 
-    With --steps 0 the file is only read, without torch. Otherwise random rollouts find dynamics that diverge,
-    and sections `init` whose conditions reject nearly all states. Kinematics from a URDF are compared with
-    pytorch-kinematics if that is installed.
+    With --steps 0 the file is only read, without torch. Otherwise, random rollouts are simulated. They detect
+    dynamics that diverge, and conditions in the section `init` that reject nearly all states. Kinematics from
+    a URDF are compared with pytorch-kinematics if that is installed.
     """
     decl = _load(system, parse_overrides(set_))
     warnings = [*decl.warnings, *(_roll_out(decl, steps, seed) if steps else ())]
@@ -129,9 +129,10 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Check the kinematics of robots from URDF files against the package pytorch-kinematics.
+    """Compare the kinematics of robots from URDF files with the package pytorch-kinematics.
 
-    Returns one comparison per function. Raises SystemFileError (S208) if the two results differ.
+    Return one comparison for each kinematic function. Raises SystemFileError (S208) if stlc and the package
+    give different results.
     """
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:

@@ -227,7 +227,8 @@ def _method(name: str) -> str:
 def _steps(text: str) -> int | StepSchedule:
     """Parse the value of `--steps`: a number of steps, or a schedule that was recorded by another run.
 
-    A run with a budget records its schedule: the total numbers of steps that it planned.
+    A run with a time budget adjusts its total number of steps as it proceeds, and records these totals as a
+    schedule. In `10000,1240@10` the total is 10000 at first, and 1240 after step 10.
     """
     from stlc.controller.training.budget import StepSchedule
 
@@ -294,8 +295,8 @@ def _resume(
 ) -> Session:
     """Resume a run from its last checkpoint.
 
-    `steps` is the total number of steps after which the training ends; `more` is the time that it may still
-    take, in seconds. If both are None, the training ends where it was planned to end.
+    `steps` is the total number of steps after which the training ends. `more` is the remaining training time
+    in seconds. If both are None, the training ends where it was planned to end.
     """
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
@@ -329,8 +330,8 @@ LOST = "R403"
 def one_voice() -> Iterator[None]:
     """Context for one of several training processes that `torchrun` started: only the first one prints.
 
-    The output of all other processes is dropped, with two exceptions. Errors of the first process on each
-    machine are printed, and so is a missing package in any process.
+    The output of all other processes is dropped, except for two kinds of message. These are errors of the
+    first process on each machine, and missing packages in any process.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

@@ -31,8 +31,8 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
     """Names of requirements that the shell proposes; they begin with the text `incomplete`.
 
-    They are those of the first specification found on the command line. If only a trace is given, the
-    specification stored in it is used.
+    The requirements are those of the first specification on the command line. If the command line names only
+    a trace, they are those of the specification stored in the trace.
     """
     names: dict[str, None] = {}
     for path in _named(context):

@@ -1,7 +1,7 @@
 """Documents that commands print with `--json`, as typed records from which their JSON Schemas are derived.
 
-Times are in seconds, positions in files count from 1; a number (`Num`) that is not finite is written as a
-text. Within one major version of a schema keys are added and never removed.
+Times are in seconds. Positions in files count from 1. A number (`Num`) that is not finite is written as a
+text. Within one major version of a schema, keys are added and never removed.
 """
 
 from types import NoneType
@@ -401,7 +401,7 @@ class TrainingVerdict(TypedDict):
 
 
 def verdict_record(learning: "Learning") -> TrainingVerdict:
-    """JSON record of the assessment of a training: level (such as "undertrained"), advice, next command."""
+    """JSON record of the assessment of a training run: level (such as "undertrained"), advice and command."""
     share, following = learning.share, learning.command
     return record(TrainingVerdict, learning, share_of_feasible=share, next=following)
 

@@ -58,7 +58,10 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
 
 
 def _stopped(code: int, argv: Sequence[str]) -> int:
-    """Return the exit code of a stopped command; print a JSON document if one was requested, else nothing."""
+    """Return the exit code `code` of a command that ended early, for example because of Ctrl-C.
+
+    If the command was interrupted and its options ask for JSON, a JSON document is printed.
+    """
     if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
         emit_json(_schema(argv), ok=False, exit_code=code)
     return code

@@ -106,7 +106,7 @@ def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: st
     `option`, `form` and `example` are named in error messages.
 
     Raises:
-        UsageError: U101, a value is not of the form, or a name is given twice.
+        UsageError: U101, a value is not of the form `NAME=VALUE`, or a name is given twice.
     """
     values: dict[str, str] = {}
     for pair in pairs or ():
@@ -185,7 +185,7 @@ def parse_count(text: str, option: str) -> int:
 
 
 def parse_limit(text: str) -> float | None:
-    """Parse a duration, returned in seconds, or `none`, returned as None. Raises UsageError (U101)."""
+    """Parse a duration and return it in seconds; return None for `none`. Raises UsageError (U101)."""
     return None if text.strip() == "none" else parse_seconds(text)
 
 

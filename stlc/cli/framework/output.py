@@ -158,9 +158,9 @@ def wants_color(stream: TextIO) -> bool:
 
 
 def console(*, stderr: bool = False, width: int | None = None) -> Console:
-    """Return a rich console for results (or, with `stderr`, for messages), without markup.
+    """Return a rich console without markup, for results or, with `stderr`, for messages.
 
-    If the output is a pipe or a file, lines have 120 columns, whatever the width of the terminal window.
+    If `width` is None, lines are as wide as the terminal, or 120 columns wide in a pipe or a file.
     """
     from rich.console import Console
 
@@ -288,7 +288,7 @@ PULSE = Pulse()
 
 
 class _Noted:
-    """Output stream that removes the progress message of `PULSE` before it writes."""
+    """Output stream that removes the progress message (`PULSE`) from the terminal before each output."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -1,8 +1,8 @@
 """Command-line programs: a program is a package with one module per command, each imported only when needed.
 
-`stlc` and `python -m benchmarks` are programs. A new command is a new module in the package of commands, with
-one function marked with `command`, or a group of subcommands named `GROUP`. Modules import little at the top,
-so that `--help` stays fast.
+`stlc` and `python -m benchmarks` are programs. To add a command, add a module to the package. The module has
+one function marked with `command`, or a variable `GROUP` with a group of subcommands. Modules import little
+at the top, so that `--help` stays fast.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ _MARKED: dict[str, tuple[str, ...]] = {}
 
 
 def command(*examples: str) -> Callable[[F], F]:
-    """Mark the function of a module that is its command; `examples` are command lines for the help text.
+    """Return a decorator that marks a function as the command of its module.
 
-    The first paragraph of the function's docstring is the summary of the help text; the other paragraphs
-    follow the examples. Each field of a dataclass parameter becomes an option; see `flat`.
+    `examples` are command lines for the help text. The first paragraph of the function's docstring is the
+    summary of the help text; the other paragraphs follow the examples. Each field of a dataclass parameter
+    becomes an option; see `flat`.
     """
 
     def mark(function: F) -> F:
@@ -100,7 +101,7 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A parameter that is a dataclass becomes several options, one per field. Their defaults are the fields of
     the parameter's default. A function declared to return an `Answer` gets the option `--json`; its value is
-    passed to the function only if that has a parameter `json`.
+    passed to the function only if the function has a parameter `json`.
     """
     signature = inspect.signature(function, eval_str=True)
     groups: dict[str, Any] = {
@@ -165,9 +166,9 @@ class Program:
         return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
 
     def made(self, only: str = "") -> typer.Typer:
-        """Return the typer application with the command `only`.
+        """Return the typer application with the command `only`, or else with all commands.
 
-        If no command is called `only`, all commands are included.
+        All commands are included if no command is called `only`.
         """
         names = self.names()
         app = typer.Typer(
@@ -255,7 +256,7 @@ def _global_options(
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into the options of the program, such as `--quiet`, and the rest.
+    """Split `arguments` into options of the program, such as `--quiet`, and all others; return both lists.
 
     Options of the program may stand anywhere before `--`.
     """

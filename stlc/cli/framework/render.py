@@ -73,10 +73,10 @@ def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
 def render_place(
     place: Label, labels: Iterable[Label], advice: Iterable[tuple[str, str]], *, color: bool
 ) -> str:
-    """Text that shows a place in the source in the layout of a finding, without a headline.
+    """Text that shows `place` in the source, in the layout of a finding without its headline.
 
-    The place is underlined with `^`, the places of `labels` with `-`; the (word, text) pairs of `advice`
-    follow.
+    The location `place` is underlined with `^`, and the locations in `labels` are underlined with `-`. Then
+    follow the (word, text) pairs in `advice`.
     """
     marks = [_Mark(place.span, place.text, primary=True)]
     marks += [_Mark(label.span, label.text, primary=False) for label in labels]
@@ -167,7 +167,7 @@ class _Row:
     def column(self, offset: int) -> int:
         """Display column of the character at `offset` in the source.
 
-        If the character is not displayed, it is the column of the nearest one that is.
+        For a character that is not displayed, the column of the nearest displayed character is returned.
         """
         return self._columns[min(max(offset - self._first, 0), len(self._columns) - 1)]
 
@@ -178,7 +178,10 @@ class _Row:
 
 
 def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
-    """Return the display column of every character of a line and of its end, and the line as printed."""
+    """Return the display columns of a line in the source, and the line as printed.
+
+    There is a column for each character of the line, and one for its end. `indent` is the first column.
+    """
     columns: list[int] = []
     shown: list[str] = []
     column = indent

@@ -1,6 +1,6 @@
-"""Live view of a deployment: robustness margins as bars, agents, and the part of the guard that decided.
+"""Live view of a deployment (closed-loop simulation): robustness margins as bars, agents, and decisions.
 
-Without a terminal it is ten lines of text.
+Without a terminal, the view is ten lines of text.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class LiveView:
     def _bars(self, width: int) -> list[Text]:
         """Return one line for each requirement: a bar and the least robustness over all agents.
 
-        In a narrow terminal the bars become shorter before the names are cut.
+        In a narrow terminal, the bars are shortened first; names are cut only after that.
         """
         margins = self.monitor.margins
         units = {rule.name: margin_unit(rule.typed.formula) for rule in self.monitor.task.rules}
@@ -166,7 +166,7 @@ class LiveView:
         return found
 
     def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
-        """Return three texts on a requirement, whose robustness for each agent is `margin`.
+        """Return three texts about a requirement; `margin` is its robustness for each agent.
 
         The texts are the least robustness with its unit, the agent that has it, and the number of agents that
         violate the requirement.
@@ -250,7 +250,7 @@ def _signed(value: float) -> str:
 def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
     """Least robustness of each agent over all requirements, (agents of all seeds,).
 
-    `margins` has bounds on the robustness by requirement; the upper bounds are used.
+    `margins` maps the name of a requirement to bounds on its robustness. The upper bounds are used.
     """
     least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
     return least

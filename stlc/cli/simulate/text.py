@@ -30,9 +30,9 @@ COMPARED = ("obeyed every rule", "plan accuracy")
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     """Lines of text that show the results of a simulation, whose record is `document`.
 
-    Results on drives (closed-loop runs) come first. With `windows`, results on plans follow, and on the
-    instants at which requirements are evaluated. They are also shown if the system names no specification for
-    drives, because drives are then judged like plans.
+    Results on drives (closed-loop runs) are always shown. Results on plans, such as the share of satisfying
+    plans, are shown if `windows` is True. They are also shown if the system names no specification for
+    drives, because drives are then judged by the specification of the plans.
     """
     from stlc.cli.framework.output import table
 
@@ -143,9 +143,9 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
 def compared(document: Record) -> Iterator[str]:
     """Lines of a table that compares all scenarios, one row per scenario.
 
-    For each guard it shows two results. The first is the number of drives (closed-loop runs) that obeyed
-    every requirement, among those for which a satisfying plan was known. The second is the share of plans
-    that satisfy the specification.
+    Each row has two cells per guard. The first is the number of drives (closed-loop runs) that obeyed every
+    requirement, among those for which a satisfying plan was known. The second is the share of plans that
+    satisfy the specification.
     """
     from stlc.cli.framework.output import table
 
@@ -288,5 +288,5 @@ def _acted(decisions: Mapping[str, float]) -> str:
 
 
 def _part(share: float) -> str:
-    """Text of a share in percent; only 0 is shown as 0 %, and only 1 as 100 %."""
+    """Text of a share in percent; `0 %` stands only for exactly 0, and `100 %` only for exactly 1."""
     return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

@@ -22,7 +22,14 @@ STANDARD_OUTPUT = "-"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """Text of a share in percent; `0 %` stands only for exactly 0, and `100 %` only for exactly 1."""
+    """Options for the output while a deployment (closed-loop simulation) runs.
+
+    Attributes:
+        title: name of the deployment.
+        live: whether the live view is shown instead of a progress bar.
+        margins: file for the robustness margins, as JSON lines; `-` is the standard output. None: no margins
+            are written.
+    """
 
     title: str
     live: bool = False
@@ -32,7 +39,8 @@ class Watching:
     def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
         """Return a context that yields a function to be called after every step of the deployment.
 
-        The function updates the progress bar or the live view, and writes margins to the file.
+        The function updates the progress bar or the live view. It also writes the robustness margins to the
+        file `margins`, if there is one.
         """
         if not self.live and self.margins is None:
             with _bar(self.title) as watch:
@@ -72,7 +80,10 @@ def _present(monitor: LiveMonitor) -> SimulationStep:
 
 
 def require_writable(where: str | None) -> None:
-    """Create the file for JSON lines, before the deployment. Raises MissingError (R201) if that fails."""
+    """Create the file `where` for JSON lines, before the deployment; do nothing if it is `-` or None.
+
+    Raises MissingError (R201) if the file cannot be created.
+    """
     if where is not None and where != STANDARD_OUTPUT:
         _opened(where).close()
 

@@ -1,4 +1,4 @@
-"""Training for several specifications and seeds: one run and process each, and a summary table."""
+"""Training for several specifications and seeds, each run in its own process, and a summary table."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Many:
     def name(self, part: Part) -> str:
         """Name of a run in messages: its specification, its seed, or both.
 
-        Only the parts are named that tell it from the other runs.
+        The name contains only the parts in which the run differs from the other runs.
         """
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
@@ -118,7 +118,7 @@ class Many:
 def train_many(many: Many) -> Answer[TrainedRuns]:
     """Train all runs in processes of their own and return their records.
 
-    The text printed is a table; the exit code is the greatest of all runs.
+    The answer is printed as a table. Its exit code is the greatest exit code of all runs.
     """
     from stlc.controller.parallel import executor
 
@@ -157,7 +157,10 @@ def _line(ended: JobResult) -> str:
 
 
 def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
-    """Text table of trained runs, one row per run; each specification has a row with the mean of its runs."""
+    """Text table of trained runs, one row per run.
+
+    A row with the mean follows the runs of each specification that was trained several times.
+    """
     rows: list[tuple[str, ...]] = []
     for spec, group in groupby(records, key=lambda record: record["spec"]):
         own = list(group)

@@ -1,4 +1,4 @@
-"""The live panel of a training run, and its final screen."""
+"""The live panel of a training run, and the lines printed at its end."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Progress:
             self._print(f"  computed by     {native_text(engine['by_torch'])}")
 
     def update(self, row: Mapping[str, Any]) -> None:
-        """Update the display by a row of `train.jsonl`, which may contain only some of the keys."""
+        """Update the display with a row of `train.jsonl`, which may contain only some of the keys."""
         self._row.update({key: value for key, value in row.items() if value is not None})
         if row.get("accuracy") is not None:
             self._accuracies.append(float(row["accuracy"]))
@@ -129,7 +129,10 @@ class Progress:
             live.stop()
 
     def finish(self, lines: Iterable[str], *, to: Console | None = None) -> None:
-        """Close the panel and print the final lines, to the console `to` if given, else to its own."""
+        """Close the panel and print the final lines.
+
+        They are printed on the console `to`. If `to` is None, they are printed on the console of the panel.
+        """
         self.stop()
         for line in lines:
             (to or self.console).print(_emphasised(self._plain(line)), soft_wrap=True)
@@ -278,9 +281,9 @@ def final_screen(
     unsolved: str = "",
     picture: str = "",
 ) -> list[str]:
-    """Lines printed at the end of a training.
+    """Lines printed at the end of a training run.
 
-    If `result` has an assessment of the training, the last line is the command to run next.
+    If `result` contains an assessment of the run, the last line is the command to run next.
 
     Args:
         result: record of the finished training.

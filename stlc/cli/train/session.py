@@ -1,4 +1,4 @@
-"""Terminal interface of a training: its panel, Ctrl-C, its pictures and its final lines."""
+"""Terminal interface of a training run: its panel, Ctrl-C, its pictures and its final lines."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ FAILURES = "failures.png"
 
 @dataclass(slots=True)
 class Session:
-    """Progress display of a training, as a context manager that also handles Ctrl-C and SIGTERM.
+    """Progress display of a training run, as a context manager that also handles Ctrl-C and SIGTERM.
 
-    During training steps, the first signal ends the training after the present step, with a checkpoint. A
-    second one stops it immediately. Outside of the steps the first signal stops it immediately.
+    During the training steps, the first signal ends the run after the present step, and saves a checkpoint. A
+    second signal ends the run immediately. Before and after the training steps, the first signal does so.
 
     Attributes:
         folder: folder of the run.
@@ -66,7 +66,8 @@ class Session:
     def watch(self) -> Watch:
         """Functions that the training calls while it runs.
 
-        They store a row of results, ask whether to stop, and report the activity, among others.
+        For example, one function stores a row of results, one tells whether to stop, and one shows the
+        current activity.
         """
         stop = lambda: bool(self._signals)  # noqa: E731
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
@@ -74,8 +75,9 @@ class Session:
     def _late(self, budget: float) -> float:
         """Predict by how many seconds the run would exceed `budget` if the training used all of the budget.
 
-        The excess is due to other work, such as imports and pictures. It is estimated from the time that the
-        imports took; a negative value means no excess.
+        The run takes longer than the training because of other work, such as imports and pictures. This time
+        is estimated from the time that the imports took. A negative value means that the run would end within
+        `budget`.
         """
         return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
 
@@ -180,8 +182,8 @@ class Session:
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     """The commands that the final lines suggest, for a run trained by `ranks` processes.
 
-    They name the run as shortly as possible. The newest run is not named; a run below `runs` is named without
-    its path.
+    The commands name the run as briefly as possible. The newest run is not named, and a run below `runs` is
+    named without its path.
     """
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
@@ -191,10 +193,10 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
 
 
 def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: bool) -> list[str]:
-    """Return the lines printed at the end of a training.
+    """Return the lines printed at the end of a training run.
 
-    They describe the held-out initial states (never used in training) from which the worst requirement fails.
-    With `pictures`, the path of their picture is added.
+    The lines describe the held-out initial states (never used in training) from which the requirement with
+    most violations fails. With `pictures`, the path of a picture of these states is added.
     """
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 

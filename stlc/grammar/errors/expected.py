@@ -1,7 +1,7 @@
-"""Diagnostic of a syntax error that is no known mistake (E010): the expected tokens, and a repair.
+"""Diagnostic E010, for a syntax error that is no common mistake: the expected tokens, and a repair.
 
-A message names the terminals of the grammar in words, one by one or as a class; a repair is offered only if
-the repaired text parses.
+A message names the terminals (kinds of token) of the grammar in words, one by one or as a class. A repair is
+offered only if the repaired text parses.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _BEFORE_FORMULA = frozenset(
 
 
 def expected(failure: ParseFailure) -> Diagnostic:
-    """Return E010 for a syntax error that is none of the common mistakes with a message of their own."""
+    """Return the diagnostic E010, with the expected tokens, for an error that is no common mistake."""
     repair = _repair(failure)
     if repair is not None:
         return repair
@@ -308,7 +308,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """Return (name, kind of declaration in words) for the first declaration before the error; else None."""
+    """Return (name, kind in words) of the first declaration before the error; None if there is none."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]

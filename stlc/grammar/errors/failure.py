@@ -33,7 +33,7 @@ class Piece:
         return self.source.text[self.start : self.end]
 
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """True if this part parses with the characters from `start` to `end` replaced."""
+        """True if this part parses with the characters from `start` to `end` replaced by `replacement`."""
         text = self.text[: start - self.start] + replacement + self.text[end - self.start :]
         return parses(text, self.rule)
 
@@ -92,7 +92,7 @@ class ParseFailure:
 
     @property
     def wants_operator(self) -> bool:
-        """True if an operator would be accepted at the error."""
+        """True if an operator is accepted at the error."""
         return "AND" in self.accepts or "CMP" in self.accepts
 
     @cached_property
@@ -109,7 +109,10 @@ class ParseFailure:
         return self.piece.source.span(end, end)
 
     def of(self, first: Lexeme, last: Lexeme | None = None) -> Span:
-        """Return the source location of the lexeme `first`, or from there to the end of the lexeme `last`."""
+        """Return the source location from the lexeme `first` to the lexeme `last`, both included.
+
+        If `last` is None, it is the location of `first`.
+        """
         return self.piece.source.span(first.start, (last or first).end)
 
     def line_with(self, *edits: tuple[int, int, str]) -> str:

@@ -181,7 +181,8 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
 def _behind_interval(failure: ParseFailure, index: int) -> int:
     """Return the index of the first lexeme after a temporal operator and its interval.
 
-    `index` is the index of the operator. Without an interval, the next lexeme is meant.
+    `index` is the index of the operator. If the operator has no interval, the lexeme after the operator is
+    meant.
     """
     items = failure.lexemes
     last = len(items) - 1

@@ -14,7 +14,8 @@ from stlc.grammar.scan import Lexeme, lexemes
 class Replacement:
     """Advice about a character that is not in the language, such as `≤`.
 
-    `text` is its spelling in the language; it is None if there is no unique one.
+    `text` is the spelling of this character in the language, here `<=`. It is None if there is no unique
+    spelling. `help` is the advice in words.
     """
 
     help: str
@@ -75,9 +76,9 @@ def unexpected_character(lexeme: Lexeme) -> bool:
 
 
 def apart(word: str, text: str, at: int) -> str:
-    """Return the text that replaces the one character of `text` at offset `at` by `word`.
+    """Return `word` as the replacement of the character of `text` at offset `at`, with blanks if needed.
 
-    A blank is added on each side on which `word` would join a letter or digit.
+    A blank is added on each side where `word` would otherwise join a letter or digit.
     """
     before = " " if word[0].isalpha() and at and text[at - 1].isalnum() else ""
     behind = " " if word[-1].isalpha() and text[at + 1 : at + 2].isalnum() else ""

@@ -145,7 +145,7 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 def _condition(text: Text, start: int, end: int) -> Group:
     """Return the group of `if … then … else …`, the tokens from `start` to `end`.
 
-    If it is too long for a line, each branch gets its own.
+    If the group is too long for a line, each branch gets its own line.
     """
     marks: list[int] = []
     index, depth = start, 0
@@ -272,7 +272,10 @@ def _item(item: Item, page: _Page, width: int) -> None:
 
 
 def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:
-    """Return tokens without the comments above the first one, which are printed on their own lines."""
+    """Return `tokens` without the comments above the first token.
+
+    The formatter prints these comments on their own lines.
+    """
     return (replace(tokens[0], before=()), *tokens[1:])
 
 
@@ -325,7 +328,8 @@ def _document(text: Text, rule: str) -> tuple[Doc, ...]:
 def _body(text: Text, rule: str) -> int:
     """Return the index of the first token after the `=` or `:` of a declaration.
 
-    `rule` is the grammar rule of the declaration. If it has no such sign, the number of tokens is returned.
+    `rule` is the grammar rule of the declaration. If the declaration has no such sign, the number of tokens
+    is returned.
     """
     sign = "=" if rule in _DEFINED else ":" if rule in _REQUIRED else ""
     index = 0
@@ -339,8 +343,8 @@ def _body(text: Text, rule: str) -> int:
 def _head(text: Text, rule: str) -> int:
     """Return the width of the first part of a declaration, such as `def NAME`, in characters.
 
-    The second parts of adjacent declarations of one kind begin in the same column. The width is 0 if a
-    declaration of the grammar rule `rule` is not divided.
+    In adjacent declarations of one kind, the text after this part begins in the same column. `rule` is the
+    grammar rule of the declaration. The width is 0 for a kind of declaration that is not aligned in this way.
     """
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
@@ -376,7 +380,7 @@ WIDTH = 100
 def format_text(source: Source) -> str:
     """Return the formatted text of a specification, ending with a line break.
 
-    If the text does not parse, it is tried again with symbols such as `□`, `≤`, `∧` spelled in the language.
+    If the text does not parse, it is parsed again with symbols such as `□`, `≤`, `∧` spelled in the language.
 
     Raises:
         SpecError: the text does not parse either way.

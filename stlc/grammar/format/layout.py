@@ -16,7 +16,10 @@ INDENT = 4
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Text that is never broken, with the comments on lines above it (`before`) and behind it (`after`)."""
+    """Text that is never broken, and its comments.
+
+    `before` has the comments on the lines above the text, and `after` is the comment behind it.
+    """
 
     text: str
     before: tuple[Comment, ...] = ()
@@ -166,7 +169,7 @@ class _Page:
     def write(self, word: Word, level: int) -> None:
         """Append a word to the current line.
 
-        A word with comments above it, or after a comment, begins a new line.
+        The word begins a new line if there are comments above it, or if it follows a comment.
         """
         if word.before or self.commented:
             self.end_line(level)
@@ -181,7 +184,7 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """Begin a new line indented by `level` blanks; an empty current line is replaced by it."""
+        """Begin a new line indented by `level` blanks; the current line is dropped if it is empty."""
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -275,7 +278,7 @@ def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[i
 
 
 def _close(items: Iterable[int], widths: Sequence[int], spread: int) -> Iterator[list[int]]:
-    """Split `items` into runs of consecutive items whose widths differ by at most `spread`.
+    """Split `items` into groups of consecutive items whose widths differ by at most `spread`.
 
     `widths` has the width of each item, in characters.
     """

@@ -98,8 +98,8 @@ def _heads(
 def _declaration(kind: Callable[..., ast.Item], *parts: str) -> BuildRule:
     """Return a function that converts declarations with one name to nodes of class `kind`.
 
-    `parts` names the fields of the node that are set from the children after tags and name, in order. A child
-    of the grammar rule `sort` sets the two fields `type` and `unit`.
+    The converted children of a declaration are its tags, its name, and one value for each field in `parts`,
+    in order. The entry `sort` in `parts` stands for the two fields `type` and `unit`.
     """
 
     def build(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.Item:

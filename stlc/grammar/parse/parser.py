@@ -108,7 +108,7 @@ def _build(piece: Piece, context: BuildContext) -> Any:
 
 
 def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Return the offset in the whole text at which the parsing of a part of it (`piece`) failed."""
+    """Return the offset in the whole text at which the parsing of the part `piece` failed."""
     token = getattr(error, "token", None)
     if token is not None and token.type == "$END":
         return piece.end

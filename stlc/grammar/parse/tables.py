@@ -1,8 +1,9 @@
 """Parser of the language, made by Lark from `stl.lark` once per process, with tables cached on disk.
 
-Building the LALR tables takes a tenth of a second, reading them a fifth of that. They are stored as JSON
-(never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar and on the
-versions of Lark and Python. If the cache is missing, damaged or read-only, the tables are built anew.
+Building the LALR tables takes a tenth of a second; reading stored tables takes a fifth of that time. They are
+stored as JSON (never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar
+and on the versions of Lark and Python. If the cache is missing, damaged or read-only, the tables are built
+anew.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def build_parser(grammar: str) -> lark.Lark:
 
 
 def cache_name(grammar: str) -> str:
-    """Return the file name of the cached tables of a grammar, for these versions of Lark and Python."""
+    """Return the file name of a grammar's cached tables, for the installed versions of Lark and Python."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
     return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
 
@@ -80,7 +81,7 @@ def _read(text: bytes | None) -> lark.Lark | None:
 
 
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
-    """Return an object read from JSON in which keys that are digits are integers again.
+    """Return an object read from JSON, with every key that consists of digits converted to an integer.
 
     JSON stores integer keys as strings.
     """

@@ -71,7 +71,10 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class TokenLayout:
-    """Tokens of a whole text, by item (such as a declaration), and the comments after the last (`rest`)."""
+    """Tokens of a whole text, grouped by item (declaration, import, or line such as `time s`).
+
+    `rest` holds the comments after the last item.
+    """
 
     items: tuple[Item, ...]
     rest: tuple[Comment, ...]
@@ -125,7 +128,9 @@ def _at(token: LarkToken) -> int:
 
 
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
-    """Yield the items (pragmas, imports, declarations) with their tokens; `places` are their offsets.
+    """Yield the items (pragmas, imports, declarations) with their tokens.
+
+    `places` has (grammar rule, start offset, end offset) of each item.
 
     A token between two items, such as `;`, belongs to no item; its comments are moved to the next item.
     """

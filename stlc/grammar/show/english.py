@@ -43,8 +43,9 @@ class Meanings:
     def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
         """Return (name, description) for each definition that a requirement uses, directly or indirectly.
 
-        A definition that several requirements use is described again for each of them. Once the descriptions
-        returned by all calls exceed `REPEATED` characters in total, only new definitions are described.
+        A definition that several requirements use is described again for each of them. Once all descriptions
+        returned so far exceed `REPEATED` characters, only definitions that were not yet described are
+        included.
         """
         found: dict[str, str] = {}
         queue = deque(self._used(item.formula))
