@@ -46,6 +46,9 @@ class Streams:
 
 
 def seeded(base: int, key: int) -> torch.Generator:
-    """Generator derived from the seed `base` and the number `key`; different keys are independent."""
+    """Generator derived from the seed `base` and the number `key`.
+
+    The random numbers for different keys are independent.
+    """
     seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

@@ -65,7 +65,7 @@ class World(Protocol):
 class Choosing(Protocol):
     """World in which agents choose among options, such as the station to go to.
 
-    Agents choose whenever they replan, and each takes the option for which its plan is best.
+    Agents choose whenever they replan. Each agent takes the option under which its plan is best.
     """
 
     def options(self) -> Tensor:
@@ -142,7 +142,7 @@ class ModelWorld:
         return self._happen(moved)
 
     def progress(self) -> Mapping[str, float]:
-        """Number of times that each event with a condition fired, over all agents."""
+        """Number of times that each event with a condition happened, summed over all agents."""
         return dict(self._counts)
 
     def units(self) -> Mapping[str, str]:

@@ -36,11 +36,16 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
     `rules`: specification of closed-loop runs; it is stored in the trace.
 
-    The trace has further arrays of shape (traces, steps): `action.NAME`, the actuator command, for every
-    control; `decision`, the source of the followed plan (0 policy, 1 backup, 2 safest, 3 polished); `t0`, its
-    prefix length if it is a plan of the backup policy; `plan_rho`, its robustness; `policy_rho`, robustness
-    of the policy's plan; `foreseen`, 1 if the true next state equals the model's prediction. Arrays of shape
-    (traces,): `seed`, `agent`.
+    Besides the states, a trace contains these arrays of shape (traces, steps):
+
+    - `action.NAME`: the actuator command of control NAME.
+    - `decision`: the source of the followed plan (0 policy, 1 backup, 2 safest, 3 polished).
+    - `t0`: the prefix length of the followed plan if it is a plan of the backup policy, else 0.
+    - `plan_rho`: the robustness of the followed plan.
+    - `policy_rho`: the robustness of the policy's plan.
+    - `foreseen`: 1 if the true next state equals the model's prediction, else 0.
+
+    The arrays `seed` and `agent` have the shape (traces,).
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
@@ -65,7 +70,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Actuator commands, (rows, steps, m), that correspond to the recorded actions of plans."""
+    """Actuator commands, (rows, steps, m), for the recorded actions; equal to them without feedback."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -99,10 +104,9 @@ def save_unguarded(
 ) -> None:
     """Write the results of a deployment without guard into the run folder.
 
-    They are the trace, and the snapshots (arrays for pictures) of the first seed. `rules`: specification of
+    The results are the trace, and the snapshots (arrays for pictures) of the first seed. If `recording` is
+    None, the files that an earlier deployment wrote are deleted instead. `rules`: specification of
     closed-loop runs; it is stored in the trace.
-
-    If `recording` is None, delete the files that an earlier deployment wrote.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -148,9 +152,9 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Constants of the specification text `spec` that are overridden for the run: name -> value as a text.
+    """Changed constants of the specification text `spec`: name -> value as a text.
 
-    Overrides come from training, the scenario, or the command line of the deployment.
+    They were changed when the run was trained, by the scenario, or on the command line of the deployment.
     """
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()

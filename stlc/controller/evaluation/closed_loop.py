@@ -5,8 +5,8 @@ intervenes, and the visited states differ from the training distribution. Theref
 from random seeds that neither training nor `stlc simulate` uses by default, and the runs are judged as `stlc
 simulate` judges them.
 
-All guards are simulated from the same initial states. A more expensive guard is simulated only if a cheaper
-one leaves failures; what remains of the time limit is spent on more runs of the guards that may still be the
+All guards are simulated from the same initial states. A more expensive guard is simulated only if some runs
+fail under the cheaper ones. The remaining time is spent on more runs of the guards that may still be the
 best.
 """
 
@@ -44,11 +44,11 @@ SEED = 1 << 40
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 """Guards by increasing cost."""
 NARROW = 0.005
-"""Half-width of the confidence interval of a guard's share below which it is simulated no more."""
+"""A guard is simulated no more once the confidence interval of its share has at most this half-width."""
 NEAR = 0.02
 """Largest difference in share at which the cheaper of two guards is recommended."""
 LEAST = 20
-"""Number of runs of a guard from which on its share is compared without a probability test."""
+"""A guard with at least this number of runs is compared by its share alone, without a probability test."""
 SURE = 0.9
 """Probability of being better at which a guard with fewer than `LEAST` runs is recommended."""
 FEWER = 4
@@ -62,8 +62,8 @@ class Share:
     Attributes:
         guard: name of the guard.
         runs: number of runs; a run is one agent under one seed.
-        satisfied: number of runs that satisfy the mission: the system's rules (`test: judge`) if it has some,
-            else the specification.
+        satisfied: number of runs that satisfy the mission. The mission consists of the rules that the system
+            file names (`test: judge`); if it names none, it is the specification.
         safe: number of runs that satisfy the requirements tagged `@safety`; None if there are none.
         compared: number of runs that were also made without a guard from the same initial states.
         gained: number of compared runs that satisfy the mission only with the guard.
@@ -89,10 +89,10 @@ class Share:
         return wilson(self.share, self.runs)
 
     def better_than(self, other: Share) -> bool:
-        """True if this share of satisfying runs exceeds that of `other` by more than `NEAR`.
+        """True if this guard's share of satisfying runs exceeds that of `other` by more than `NEAR`.
 
-        If fewer than `LEAST` runs were made, a second condition must hold: the probability that the true
-        share is better by `NEAR` is at least `SURE`.
+        If this guard has fewer than `LEAST` runs, a second condition must hold: with a probability of at
+        least `SURE`, its true share exceeds that of `other` by more than `NEAR`.
         """
         better = self.share > other.share + NEAR
         return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
@@ -132,12 +132,11 @@ class ClosedLoop:
 
     @property
     def recommended(self) -> Share | None:
-        """The cheapest guard that is nearly as good as the best one: its share is at most `NEAR` lower.
+        """Counts of the recommended guard: the cheapest one that is nearly as good as the best one.
 
-        The share is that of the runs that satisfy the mission.
-
-        A more expensive guard with few runs is preferred only if it is better with high probability (see
-        `Share.better_than`). None if there are no runs.
+        Guards are compared by the share of runs that satisfy the mission. A share that is at most `NEAR`
+        lower counts as nearly as good. A more expensive guard with few runs is preferred only if it is better
+        with high probability (see `Share.better_than`). None if there are no runs.
         """
         best: Share | None = None
         for share in self.shares:
@@ -184,7 +183,7 @@ class _Known:
 
     Attributes:
         agents: number of agents per seed in further simulations.
-        found: (seed, agent) -> two verdicts on the run: whether it satisfies the mission, and whether it
+        found: verdicts on each run, by (seed, agent): whether the run satisfies the mission, and whether it
             satisfies the safety requirements (None if there are none).
         seeds: number of simulated seeds.
         cost: measured seconds per seed; 0 before the first seed.
@@ -256,16 +255,16 @@ class _Trial:
         self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
 
     def simulate(self) -> None:
-        """Simulate seeds until the time limit, or until all relevant shares are known precisely."""
+        """Simulate seeds until the time is over or more runs would hardly change which guard is best."""
         while (mode := self._next()) is not None:
             self._more(mode)
 
     def _next(self) -> Mode | None:
-        """Guard to simulate next; None to stop.
+        """Guard to simulate next; None if no further runs are needed.
 
-        Each guard is simulated once, by increasing cost, up to the first guard under which all runs satisfy
-        the mission. After that, of the guards whose share may still be the best, the one with the widest
-        confidence interval is returned.
+        At first, guards are simulated once each, from the cheapest one up to the first guard under which all
+        runs satisfy the mission. After that, only the guards whose share may still be the best are
+        considered: the one with the widest confidence interval is returned.
         """
         if self.left() <= 0.0:
             return None
@@ -322,7 +321,8 @@ class _Trial:
         """Simulate `seeds` with `agents` agents each under the guard `mode` and return the recording.
 
         Raises:
-            _LateError: the simulation takes more than the share `share` of the remaining time.
+            _LateError: the simulation takes more than the share `share` of the remaining time, or will
+                clearly take longer than the remaining time.
         """
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
@@ -340,10 +340,10 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Masks of the recorded runs that satisfy the mission, and of those that satisfy its safety part.
+        """Return a mask of the runs that satisfy the mission, and one of those that satisfy its safety part.
 
-        Both are (rows,). The safety part consists of the requirements tagged `@safety`; if there are none,
-        the second mask is None.
+        The masks are (rows,). The safety part consists of the requirements tagged `@safety`. If there are
+        none, the second mask is None.
         """
         rows = len(recording.states)
         if self.rules is None:

@@ -34,7 +34,7 @@ LATENCY_SECONDS = 5.0
 
 @dataclass(frozen=True, slots=True)
 class DecisionLatency:
-    """Time of a decision for a single agent in seconds: median and 99 % quantile over visited states."""
+    """Seconds that the guard takes to decide for one agent: median and 99 % quantile over visited states."""
 
     median: float
     p99: float
@@ -48,7 +48,7 @@ class Unsafe:
     Attributes:
         seed: index of its seed among the seeds of the deployment.
         agent: index of the agent in its seed.
-        viable: whether a safe plan from its initial state is known.
+        viable: whether a safe plan from the agent's initial state is known.
     """
 
     seed: int
@@ -161,10 +161,11 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
 
 
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
-    """Feasibility of `count` visited states, evenly spread over the recording: (rows, steps).
+    """Determine the feasibility of `count` visited states, evenly spread over the recording.
 
-    An entry is 1 if the followed plan satisfies the specification, or if a search found a plan that does. It
-    is 0 if no satisfying plan was found, and NaN if the state is not among the `count` states.
+    Returns:
+        (rows, steps): NaN for all states except the `count` chosen ones. Of these, an entry is 1 if the
+        followed plan satisfies the specification or a search found a plan that does, else 0.
     """
     known = np.full(recording.rho.shape, math.nan)
     if count:
@@ -189,8 +190,8 @@ def decided(recording: DeploymentRecording) -> dict[str, float]:
 def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
     """Measure the time of single-agent decisions in random visited states, for a few seconds at most.
 
-    As in a deployment, the guard gets the remainder of a previous plan with each state. That plan is made
-    beforehand, in the preceding state; only the decision itself is timed.
+    As in a deployment, the guard gets the remainder of a previous plan together with each state. The previous
+    plan is made in the preceding state, before the time is measured.
     """
     rows, steps = recording.actions.shape[:2]
     picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)

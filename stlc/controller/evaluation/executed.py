@@ -32,16 +32,17 @@ Mask = NDArray[np.bool_]
 class Executed:
     """Verdicts on recorded trajectories. A row is one agent of one seed.
 
-    A requirement that mentions T (the horizon of plans) is judged at every start instant from which a whole
-    planning window is recorded; any other requirement is judged once, from the first sample.
+    A planning window consists of the T steps of a plan. A requirement that mentions the horizon T is judged
+    at every start instant from which a whole planning window is recorded. Any other requirement is judged
+    once, from the first sample.
 
     Attributes:
         rules: requirement -> whether it holds, (starts, rows); one start if it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
         consistent: (starts, rows), whether all steps in the planning window from the start instant equal the
             predictions of the model.
-        eventless: (starts, rows), whether no exogenous event occurs in the planning window, so that all steps
-            equal those of the true dynamics (from which the model may differ); None if not recorded.
+        eventless: (starts, rows), whether no exogenous event occurs in the planning window. All its steps
+            then follow the true dynamics, from which the model may differ. None if events were not recorded.
         viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
     """
 
@@ -89,7 +90,7 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 
 
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """Form of a requirement for trajectories that begin with the mission.
+    """Form of a requirement for trajectories whose first sample is the start of the mission.
 
     The interval of an absolute operator (`always@[a, b]`) counts from the start of the mission. In the
     returned form it counts from the first sample, so the requirement is judged only once per trajectory. A
@@ -136,9 +137,9 @@ def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:
 
 
 def _throughout(right: Mask, task: Task, starts: int) -> Mask:
-    """Mask of the start instants from which `right` is True in all steps of a plan's horizon.
+    """Mask of the start instants from which `right` is True in all steps of a planning window.
 
-    `right`: (rows, steps). `starts`: number of start instants. Returns (starts, rows).
+    `right`: mask of steps, (rows, steps). `starts`: number of start instants. Returns (starts, rows).
     """
     so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon

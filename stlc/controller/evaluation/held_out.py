@@ -101,19 +101,19 @@ def score(
     """Judge a policy on held-out states (initial states that the training does not use).
 
     If the specification has timers, the held-out states also come from later instants of simulated missions.
-    Where the policy's plan fails, a search looks for a satisfying one, from at most `MOST_SEARCHED` random
-    states. It starts from the policy's plan. If it fails, a second search is made that ignores the policy:
-    the feasible share should hardly depend on how well the policy is trained. The second search is slow in
-    torch, so it needs native code.
+    If the policy's plans fail from some states, a search looks for satisfying plans from at most
+    `MOST_SEARCHED` of these states, chosen at random. The search starts from the policy's plan. If it finds
+    none, a second search ignores the policy, because the feasible share should hardly depend on how well the
+    policy is trained. The second search is made only with native code, as it is slow in torch.
 
     Args:
         task: specification and system.
         policy: policy to judge.
         n: number of held-out states.
         seed: seed of their random numbers.
-        enough: function that returns True to end the evaluation early. If that happens while plans are
+        enough: function that returns True to end the evaluation early. If this happens while plans are
             judged, fewer than `n` states are judged. If it happens during the searches, the interrupted batch
-            of states counts as not searched; the first batch always counts as searched.
+            of states counts as not searched, except the first batch, which always counts as searched.
         report: function that receives the progress as a short text.
     """
     if task.compiled.timers:
@@ -161,7 +161,9 @@ def score(
 def _judged(
     policy: Policy, states: Tensor, enough: Stop, report: Callable[[str], None]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Judge the policy's plans in batches of states until `enough` returns True, at least one batch.
+    """Judge the policy's plans from batches of states; end early once `enough` returns True.
+
+    At least one batch is judged.
 
     Returns:
         The judged states, (k, dim), their plans, (k, T, m), the robustness of the plans, (k,), and their
@@ -186,8 +188,8 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
     """Search by exploration from a few failing states, and mark the solved states in `known`.
 
     Exploration builds plans step by step from prefixes. `failing`: indices of the states at which the
-    policy's plan fails, (k,); those at the start of a mission are taken first. `enough` returns True to end
-    the search early.
+    policy's plan fails, (k,). Of these, states at the start of a mission are explored first. The search ends
+    early once `enough` returns True.
     """
     clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
@@ -202,7 +204,7 @@ def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
 
     `known`: mask of the states with a known satisfying plan. `searched`: mask of the states that the policy
     solved or that were searched. `failing`: indices of the states at which the policy's plan fails. Only some
-    of these were searched. The share of them that was solved is assumed for the others.
+    of the failing states were searched. The share of solved states among these is assumed for the others.
     """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried

@@ -42,7 +42,7 @@ class Seed:
         consistent: whether all steps in the planning window from a start instant equal those of the model.
         eventless: whether no exogenous event occurs in the planning window; None if not recorded.
         searched: visited states whose feasibility was determined; None if there are none.
-        feasible: visited states with a known satisfying plan; None if there are no searched ones.
+        feasible: visited states with a known satisfying plan; None if `searched` is None.
     """
 
     followed: Mask
@@ -66,16 +66,16 @@ class Seed:
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """Metric: the share of a population of plans or runs that has a property.
+    """Metric: the share of plans (or of agents, or of start instants) that have a certain property.
 
     Attributes:
         key: name in JSON files.
         label: name in tables.
         meaning: explanation, a sentence without its full stop.
-        mask: function that returns, for a seed, the mask of the plans or runs with the property, or None if
-            it was not recorded.
-        among: function that returns, for a seed, the mask of the population; None: all plans or runs. The
-            share of an empty population is omitted.
+        mask: function from a seed to the mask of the plans, agents or instants with the property; it returns
+            None if the property was not recorded.
+        among: function from a seed to the mask of the population, in which the share is computed; None if the
+            population consists of all plans, agents or instants. The metric is omitted if it is empty.
         unit: unit of the value; shares have none.
         safety: whether the metric is omitted if no requirement is tagged `@safety`.
     """
@@ -89,7 +89,10 @@ class Metric:
     safety: bool = False
 
     def of(self, seed: Seed) -> float:
-        """Value of the metric for a seed; NaN if the population is empty or the property was not recorded."""
+        """Value of the metric for one seed.
+
+        It is NaN if the population is empty or the property was not recorded.
+        """
         mask = self.mask(seed)
         among = None if self.among is None else self.among(seed)
         if mask is None or (self.among is not None and among is None):
@@ -224,7 +227,7 @@ _ALL = (
 METRICS = {metric.key: metric for metric in _ALL}
 """All metrics by key, in display order."""
 HOLDS = "holds."
-"""Prefix of `holds.NAME`: the share of starts from which the run satisfies one requirement."""
+"""Prefix of the keys `holds.NAME`: share of start instants from which a run satisfies requirement NAME."""
 
 
 def is_progress(key: str) -> bool:
@@ -235,9 +238,10 @@ def is_progress(key: str) -> bool:
 def measure(
     recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None = None
 ) -> dict[str, MeanInterval]:
-    """Compute the mean over seeds of every metric, of the share per requirement, and of the world's progress.
+    """Compute means over seeds: of every metric, of the share per requirement, of the world's progress.
 
-    Seeds for which a metric is undefined are left out of its mean.
+    The result maps the key of each value to its mean. If a metric is undefined for a seed, this seed is left
+    out of the mean.
 
     Args:
         recording: trajectories and decisions.

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 JUDGE = "judge"
 _INDEX = f"{JUDGE}/{INDEX}"
 MOST_TIMED = 200
-"""Maximum number of broken rules per guard whose time is located: each takes some milliseconds."""
+"""Maximum number of violations per guard whose time is located, which takes some milliseconds each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +71,19 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Loss of a run: the time since which no plan is known that obeys the broken rule, and the cause.
+    """Loss of a run that broke a rule: since when no good plan was known, and why.
 
-    A plan is known if the followed plan satisfies the specification of the plans, or if a search finds a plan
-    that does. If a safety rule was broken, only the requirements tagged `@safety` have to be satisfied.
+    A plan is good if it satisfies the specification of the plans. If a safety rule was broken, a plan that
+    satisfies the requirements tagged `@safety` is good. A good plan is known at an instant if the followed
+    plan is good, or if a search finds a good plan.
 
     Attributes:
-        why: `start`: no plan is known from the first instant on. `told`: a plan was known until an exogenous
-            event (an obstacle came into view). `later`: a plan was known until an instant without such an
-            event: the horizon of plans was too short, or the model is wrong. `missed`: a plan was known, but
-            another one was followed.
-        time: instant since which no plan is known, in seconds from the start; for `missed`, the last instant
-            at which one was known.
+        why: cause of the loss. `start`: no good plan was known, even at the start. `told`: a good plan was
+            known until an exogenous event; for example, an obstacle came into view. `later`: a good plan was
+            known until an instant without such an event; the horizon of plans was too short, or the model is
+            wrong. `missed`: a good plan was known to the end, but another plan was followed.
+        time: instant from which on no good plan was known, in seconds from the start; for `missed`, the last
+            instant at which a good plan was known.
     """
 
     why: Literal["start", "told", "later", "missed"]
@@ -95,9 +96,10 @@ class Broken:
 
     Attributes:
         row: index of the run in the recording.
-        rules: rule -> time of the violation, in seconds from the start; None if it has no single instant.
-        lost: time and cause of the loss; None if the followed plans were good until a rule was broken, or if
-            the cause was not determined.
+        rules: broken rule -> time of the violation, in seconds from the start; None if no single instant
+            decides.
+        lost: time since which no good plan was known, and the cause; see `Lost`. None if all plans followed
+            until the violation were good, or if the cause was not determined.
     """
 
     row: int
@@ -106,7 +108,7 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """True if the controller is excused: the run was lost from the start or by an exogenous event."""
+        """True if no good plan was known at the start, or none after an exogenous event; see `Lost`."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
@@ -117,9 +119,10 @@ class RunVerdicts:
     Attributes:
         rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the runs that broke a rule, in the order of their rows.
-        viable: (rows,), mask of the runs that could have obeyed the rules, as far as is known. A run that
-            obeyed them is True. A run that broke a rule is False if it was lost from the start or by an
-            exogenous event, else True. An inconclusive run is True if a safe plan from the start is known.
+        viable: mask, (rows,), of the runs that could have obeyed the rules, as far as is known. It is True
+            for a run that obeyed them. It is False for a run that broke a rule if no good plan was known at
+            the start, or none after an exogenous event (see `Lost`). It is True for other runs that broke a
+            rule, and for inconclusive runs from whose start a safe plan is known.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -163,7 +166,7 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
 
 
 def keep_rules(folder: RunDir, task: Task) -> None:
-    """Compile the rules (specifications of closed-loop runs) of a system; copy them to the run folder.
+    """Compile the rules (specifications of closed-loop runs) of a system, and copy them to the run folder.
 
     Raises:
         SystemFileError: S210, a file of rules does not exist.
@@ -196,9 +199,9 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 def rules_of(run: Run) -> Rules | None:
     """Rules for the closed-loop runs of a trained run; None if the specification of the plans judges them.
 
-    The run folder contains a copy of the rules that the system file named at training; they are read from
-    there. Rules that are named later (by the scenario or with `--set test.judge=…`) are read from their own
-    file. For a run that was trained before `test.judge` existed, the present system file names the rules.
+    Training copies the rules that the system file names into the run folder, and they are read from there.
+    Rules that are named later (by the scenario or with `--set test.judge=…`) are read from their own file. If
+    the run was trained before `test.judge` existed, the present system file names the rules.
 
     Raises:
         RunError: R101, the index of the copies in the run folder is damaged.
@@ -314,11 +317,21 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
 ) -> Lost | None:
-    """Time and cause of the loss of a run, for the rule that it broke first; see `Lost`.
+    """Find since when no good plan was known in a run that broke a rule, and why.
 
-    If a rule tagged `@safety` is broken, only rules with this tag are considered. None if the followed plans
-    were good until the rule was broken, or if the cause is unknown. `viable`: whether a safe plan from the
-    first state is known.
+    A plan is good if it satisfies the specification, or its safety requirements if a safety rule was broken.
+
+    Args:
+        broken: the run. The first rule that it broke counts; if it broke rules tagged `@safety`, the first of
+            these.
+        safety: names of the rules tagged `@safety`.
+        task: specification of the plans, and system.
+        recording: all recorded runs.
+        viable: whether a safe plan from the first state of the run is known.
+
+    Returns:
+        Time and cause, see `Lost`. None if the plans followed until the violation were good, or if the
+        cause cannot be determined.
     """
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
@@ -347,10 +360,10 @@ def _lost(
 def judge_runs_by_plans(
     held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
 ) -> RunVerdicts:
-    """Verdicts on runs by the specification of the plans.
+    """Judge closed-loop runs by the specification of the plans, which then serves as their rules.
 
-    A requirement is obeyed if it holds at every start instant; it is broken at the first instant at which it
-    fails.
+    A run obeys a requirement if the requirement holds at every start instant. Otherwise the run breaks it at
+    the first start instant at which it does not hold.
 
     Args:
         held: requirement -> whether it holds, (starts, rows) booleans.
@@ -383,7 +396,10 @@ def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator
 
 
 def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Rule -> time in seconds at which the run `row` broke it; None if no single instant decides."""
+    """Times at which the run `row` broke the rules in `names`: rule -> time in seconds.
+
+    The time is None if no single instant decides.
+    """
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}
@@ -398,10 +414,11 @@ def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str,
 
     `count`: number of runs. `obeyed`: number of runs that satisfy every rule. `undecided`: number of
     inconclusive runs. `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
-    `told`: number of the lost runs that were lost by an exogenous event after the start; the others were lost
-    from the start. `rules`: for each rule, the numbers of obeyed, broken and undecided runs. `broken`: one
-    entry per run that broke rules; its `rules` are the times of the violations in seconds from the start
-    (null if unknown), and its `cause` is the time and the reason of the loss (see `Lost`).
+    `told`: number of the lost runs in which a good plan was known until an exogenous event; in the other lost
+    runs, none was known even at the start. `rules`: for each rule, the numbers of obeyed, broken and
+    undecided runs. `broken`: one entry per run that broke rules. Its `rules` are the times of the violations
+    in seconds from the start (null if unknown). Its `cause` says since when no good plan was known, and why
+    (see `Lost`).
     """
     obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {

@@ -13,7 +13,7 @@ _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 @dataclass(frozen=True, slots=True)
 class MeanInterval:
-    """Mean over seeds with its 95 % confidence interval; for a single seed, `low` and `high` are None."""
+    """Mean over seeds with its 95 % confidence interval; `low` and `high` are None without an interval."""
 
     mean: float
     low: float | None
@@ -22,7 +22,10 @@ class MeanInterval:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> MeanInterval:
-        """Mean of one or more values; without an interval for a single value, or if a value is not finite."""
+        """Return the mean of the values, one per seed, with its interval.
+
+        There is no interval if there is only one value or if a value is not finite.
+        """
         mean = fmean(values)
         if len(values) < 2 or not all(map(math.isfinite, values)):
             return cls(mean, None, None, tuple(values))
@@ -40,9 +43,10 @@ class MeanInterval:
 
 
 def student(freedom: int) -> float:
-    """97.5 % quantile of Student's t with `freedom` degrees of freedom: exact for 1 and 2, else within 0.1 %.
+    """97.5 % quantile of Student's t distribution with `freedom` degrees of freedom.
 
-    Cornish-Fisher expansion (Abramowitz & Stegun 26.7.5).
+    The quantile is exact for 1 and 2 degrees of freedom. For more, a Cornish-Fisher expansion (Abramowitz &
+    Stegun 26.7.5) gives it within 0.1 %.
     """
     if freedom == 1:
         return math.tan(math.pi * CONFIDENCE / 2)

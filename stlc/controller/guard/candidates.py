@@ -25,7 +25,7 @@ RobustnessMargins: TypeAlias = Mapping[str, float]
 
 SOURCES = ("policy", "backup", "safest", "polished")
 TO_SPARE = 0.05
-"""Target robustness of plan repair, as a share of gamma (the robustness that training aims for)."""
+"""Target robustness of plan repair, as a share of gamma (the robustness at which training aims)."""
 POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 """Sources of a plan: the policy; a prefix continued by the policy; the longest safe prefix; plan repair."""
 
@@ -79,7 +79,7 @@ class Candidates:
 
     @classmethod
     def unjudged(cls, plans: Tensor) -> Candidates:
-        """Plans (agents, T, m) that were not judged; source is -1, and they rank below all judged plans."""
+        """Wrap plans (agents, T, m) without judging them; they have source -1 and rank below judged plans."""
         worst = torch.full(plans.shape[:-2], -torch.inf, dtype=plans.dtype, device=plans.device)
         number = torch.zeros(worst.shape, dtype=torch.int64, device=plans.device)
         return cls(plans.clone(), worst, worst.clone(), torch.zeros_like(worst), number - 1, number)
@@ -112,7 +112,10 @@ class Candidates:
             getattr(self, name)[rows] = getattr(other, name)
 
     def improve(self, rows: Tensor, other: Candidates) -> None:
-        """Replace the plans of agents `rows`, (k,), by those of `other`, (k,), where these rank higher."""
+        """Replace the plans of the agents `rows`, (k,), by those of `other`, (k,), if the latter rank higher.
+
+        Each agent is decided separately.
+        """
         better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
         self.put(rows[better], other.of(better))
 
@@ -141,8 +144,8 @@ def rank(plans: Candidates) -> Tensor:
     The order, from best to worst:
 
     1. plans that satisfy phi, by robustness
-    2. safe plans that the policy continues after a sampled prefix: they return to states on which it was
-       trained
+    2. safe plans that consist of a sampled prefix and the policy's continuation: they return to states on
+       which the policy was trained
     3. other safe plans
     4. plans chosen for the longest safe prefix
     5. other plans, by the smaller of the robustness of phi and that of phi_safe
@@ -172,7 +175,7 @@ def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:
-    """Plans (B, T, m) with non-finite entries replaced by the admissible control value nearest to 0."""
+    """Return plans (B, T, m) in which each non-finite entry is replaced by the admissible value nearest 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
 
@@ -181,9 +184,9 @@ def finite(plan: Tensor, task: Task) -> Tensor:
 
 
 class Deadline:
-    """Time by which a decision for a number of agents must be made.
+    """Time by which a decision for `agents` agents must be made.
 
-    `seconds`: time per agent; if None, the time never passes.
+    `seconds`: time per agent, counted from now; None: no time limit.
     """
 
     def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
@@ -191,7 +194,7 @@ class Deadline:
 
     @property
     def over(self) -> bool:
-        """True once the time has passed."""
+        """True once the time limit is exceeded."""
         return perf_counter() >= self.until
 
 
@@ -211,11 +214,11 @@ class Limits:
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
         places: number of best plans of sampled shooting from which local searches start.
-        again: number of plans that each of these local searches judges.
-        rescue: whether to search for a plan that satisfies phi_safe alone, without the policy, if no other
-            stage found a safe plan.
-        margin: name of a safety requirement -> robustness margin, in its unit, by which an accepted plan must
-            satisfy it, in both guards.
+        again: number of plans that each local search from these places judges.
+        rescue: whether to search for a plan that satisfies only phi_safe, without use of the policy, if no
+            other stage found a safe plan.
+        margin: name of a safety requirement -> robustness margin in the unit of the requirement. Both guards
+            accept a plan only if it satisfies the requirement by this margin.
         paper: time limit of the guard "paper" in seconds per agent; None: no limit.
     """
 

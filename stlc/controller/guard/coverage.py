@@ -1,10 +1,10 @@
 """Probability that the backup policy finds a satisfying plan: the paper's lower bound, and the exact value.
 
 The lower bound is Theorem 1 of Meng and Fan (2023). A prefix is a sequence of T0 actions, the first of a
-plan. It is assumed that every prefix near a certain prefix u* leads to a satisfying plan. u* is unknown, and
-uniformly distributed over the control ranges. A prefix is near u* if each of its controls differs from that
-of u* by at most `radius` at every step. The backup policy tries the prefixes of a grid; it finds a satisfying
-plan if one of these is near u*.
+plan. It is assumed that every prefix near a certain prefix u* leads to a satisfying plan. The prefix u* is
+unknown, and uniformly distributed over the control ranges. Another prefix is near u* if, at every step, each
+control differs by at most `radius` between the two. The backup policy tries the prefixes of a grid. It finds
+a satisfying plan if one of these is near u*.
 """
 
 from __future__ import annotations
@@ -60,19 +60,19 @@ class Axis:
 class Chance:
     """Probability that the backup policy finds a satisfying plan, with prefixes of one length.
 
-    A prefix is a sequence of T0 actions, the first of a plan. The backup policy tries the prefixes of a grid.
-    It is assumed that a prefix leads to a satisfying plan if each of its controls is within `radius` of that
-    of an unknown prefix u*. All values of u* within the control ranges are equally likely.
+    A prefix consists of the first T0 actions of a plan. The backup policy tries the prefixes of a grid. It is
+    assumed that a prefix leads to a satisfying plan if it differs from an unknown prefix u* by at most
+    `radius` in each control. All values of u* within the control ranges are equally likely.
 
     Attributes:
         radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
             control's range.
         length: number of actions of a prefix, T0.
         candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
-        theorem: the paper's bound: the product of a factor per control and step, at most 1.
-        bound: the same product, but with each control's factor limited to 1. In the paper's product a factor
-            may exceed 1, because overlapping intervals of a control are counted more than once, so that the
-            product may exceed the exact probability.
+        theorem: the paper's bound, a product with one factor per control and step; limited to 1.
+        bound: the same product, but with each factor limited to 1. In the paper's product a factor may exceed
+            1, because overlapping intervals around the grid values are counted more than once. Therefore
+            `theorem` may exceed the exact probability.
         exact: exact probability under the same assumptions; for a sample of the prefixes, a lower bound.
         sampled: whether only a sample of the prefixes is tried.
     """
@@ -95,10 +95,10 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
     """Compute the probability that the backup policy finds a satisfying plan with prefixes of one length.
 
-    A prefix is a sequence of `length` actions, the first of a plan. The backup policy tries the prefixes of
-    the grid that `axes` describes. It is assumed that a prefix leads to a satisfying plan if each of its
-    controls is within `radius` of that of an unknown prefix u*. All values of u* within the control ranges
-    are equally likely.
+    A prefix consists of the first `length` actions of a plan. The backup policy tries the prefixes of the
+    grid that `axes` describes. It is assumed that a prefix leads to a satisfying plan if it differs from an
+    unknown prefix u* by at most `radius` in each control. All values of u* within the control ranges are
+    equally likely.
 
     If the grid has M > `samples` prefixes, a sample of them is drawn with replacement. A given prefix is then
     tried with probability 1 - (1 - 1 / M)^samples; `bound` and `exact` are multiplied by this number. Both
@@ -132,9 +132,9 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
 def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
     """Compute `chance` for each prefix length of `grid` and each radius in `radii`.
 
-    The result is the probability that the backup policy finds a satisfying plan. It is assumed that a prefix
-    leads to a satisfying plan if each of its controls is within the radius, a share of the control's range,
-    of that of an unknown prefix.
+    Each result is a probability that the backup policy finds a satisfying plan. It is assumed that a prefix
+    (the first actions of a plan) leads to a satisfying plan if it differs from an unknown prefix by at most
+    the radius in each control. The radius is a share of the control's range.
     """
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

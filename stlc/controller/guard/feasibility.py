@@ -42,14 +42,14 @@ def solve(
 ) -> SearchResult:
     """Search for a satisfying plan from each state; equal arguments give equal plans.
 
-    The first pass of local search starts from `start`; each later pass treats the unsolved states and starts
-    from random plans of the library. A returned robustness is exact; a state without a satisfying plan may
-    still be feasible.
+    The first pass of local search starts from the plans `start`. Each later pass starts from random plans of
+    `library` and is made only for the states without a satisfying plan. The returned robustness is exact. If
+    no satisfying plan is found from a state, there may still be one.
 
     Args:
         task: specification and system.
         x0: states, (B, n).
-        start: starting plans, (B, T, m); the middle of every control range if None.
+        start: starting plans, (B, T, m). None: plans that hold each control at the middle of its range.
         library: plans for later passes, (k, T, m); the search also copies parts of them into other plans.
             None: plans of 3 constant pieces at the ends and middles of the control ranges (see `extremes`).
         passes: maximum number of passes.
@@ -58,7 +58,8 @@ def solve(
         stop: function that returns True to end the search early.
 
     Returns:
-        Plans and their robustness in float64; -inf for states whose search was stopped before it began.
+        The best plan found from each state, and its robustness, in float64. The robustness is -inf for a
+        state whose search was stopped before it began.
     """
     generator = generator or torch.Generator().manual_seed(0)
     if library is None:

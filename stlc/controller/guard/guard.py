@@ -80,8 +80,8 @@ class Guard:
     Args:
         task: specification and system.
         policy: proposes plans.
-        mode: how a rejected plan is replaced: "paper" by the paper's backup policy, "full" by the stages of
-            `stlc.controller.guard.stages`; "none": plans are judged but not replaced.
+        mode: method that replaces a rejected plan. "paper": the paper's backup policy. "full": the stages of
+            `stlc.controller.guard.stages`. "none": plans are judged but not replaced.
         grid: control values of the backup policy; by default those of the system file.
         limits: computational limits and robustness margins of a decision. A margin changes which plans are
             accepted; reported robustness and verdicts are those of the task without margin.
@@ -110,15 +110,17 @@ class Guard:
         """Decide which plans the agents follow from states (agents, n); verdicts are computed in float64.
 
         The previous plan is retained if it still satisfies the specification and the new plan ranks no
-        higher; otherwise an agent could postpone a goal at every step. It is also retained if its next step
-        increases the robustness margin of a pending goal (`stlc.controller.problem.pending_goals`).
+        higher. Without this rule, an agent could postpone a goal at every step. The previous plan is also
+        retained if it satisfies the specification and its next step increases the robustness margin of a
+        pending goal (`stlc.controller.problem.pending_goals`).
 
         Args:
             x: (agents, n) states.
             previous: remainder of the previous decision (see `GuardDecision.later`); None at first.
 
         Returns:
-            The decision. With mode "none", a plan that is not finite is followed, with robustness -inf.
+            The decision. With mode "none", even a plan that is not finite is followed; its robustness is
+            -inf.
         """
         x = x.to(torch.float64)
         fresh, judged = self.policy.plan_judged(x)
@@ -150,7 +152,7 @@ class Guard:
 
     @torch.no_grad()
     def endangered(self, x: Tensor, previous: GuardDecision, steps: int | Tensor) -> Tensor:
-        """Mask of the agents whose previous plan, by the model, is unsafe in its next steps.
+        """Mask of the agents whose previous plan is predicted to become unsafe within `steps` steps.
 
         Args:
             x: (agents, n) states.
@@ -158,7 +160,7 @@ class Guard:
             steps: number of steps to check, one number or (agents,).
 
         Returns:
-            (agents,) booleans. Only the guard "full" checks previous plans; with another guard all are False.
+            (agents,) booleans. Only the guard "full" checks previous plans; all are False under other guards.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
         if self.mode != "full" or not formulas:
@@ -168,9 +170,9 @@ class Guard:
 
     @torch.no_grad()
     def prefer(self, options: Tensor, previous: GuardDecision | None = None) -> Tensor:
-        """Index of the option (alternative that the world offers) with the best plan for each agent.
+        """For each agent, the index of the option with the best plan; the first of equally good options.
 
-        Of equally good options the first is taken.
+        An option is an alternative that the world offers, such as the station to go to.
 
         Args:
             options: (agents, k, n), states under the options; option 0 is the present state.
@@ -193,11 +195,11 @@ class Guard:
 
     @torch.no_grad()
     def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
-        """Remainders of plans in states (agents, n), extended at their ends by the policy.
+        """Return the previous decision with its plans extended at their ends by the policy.
 
-        `previous` fills each remainder up to the length of a plan by holding its last action. These actions
-        are replaced: the policy plans from the predicted state at the end of the remainder, and the first
-        actions of that plan are appended.
+        In `previous`, the remainder of each plan is filled up to T steps by repeating its last action. These
+        repeated actions are replaced: the policy plans from the predicted state at the end of the remainder,
+        and the first actions of the new plan are appended.
 
         Args:
             x: (agents, n) states.
@@ -220,10 +222,10 @@ class Guard:
     def _with_previous(
         self, x: Tensor, previous: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
-        """The policy's plans `fresh` with their verdicts `judged`, or previous plans that are better.
+        """For each agent, take the policy's plan (`fresh`, with verdicts `judged`) or the previous plan.
 
-        A previous plan that satisfies the specification is taken if it ranks no lower than the policy's plan,
-        or if it increases the margin of a pending goal; see `decide`.
+        The previous plan is taken if it satisfies the specification and either ranks no lower than the
+        policy's plan or increases the margin of a pending goal; see `decide`.
         """
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
@@ -237,10 +239,10 @@ class Guard:
         return found
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Mask of the agents whose remaining plan increases the margin of a goal in one step, (agents,).
+        """Mask of the agents whose previous plan increases the margin of a goal in its next step, (agents,).
 
-        Only goals count that the present state already satisfies, by less than the margin that plans are to
-        reach. `rest`: verdicts on the remaining plans.
+        A goal counts only if the present state satisfies it, but with a smaller margin than plans are to
+        reach. `rest`: verdicts on the remainders of the previous plans.
         """
         if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)

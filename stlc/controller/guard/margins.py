@@ -1,10 +1,11 @@
 """Robustness margins of guards: requests on the command line, calibration, tightened tasks.
 
-A guard accepts a plan that is safe by the model. Until it judges the rest of the plan, the plan loses
-robustness, because the true dynamics and the true initial state differ from those of the model. If the margin
-is larger than this loss, the rest is still safe by the model, so a safe plan exists. Calibration measures the
-loss of the policy's plans from training states: the first steps of each plan, until the guard judges again,
-are simulated with the scenario's true dynamics, the other steps with the model.
+A guard accepts a plan that is safe according to the model. By the time that the guard judges the rest of the
+plan, the plan has lost robustness, because the true dynamics and the true initial state differ from those of
+the model. If the margin is larger than this loss, the rest is still safe according to the model. So a safe
+plan exists. Calibration measures the loss of the policy's plans from training states. The first steps of each
+plan, until the guard judges again, are simulated with the scenario's true dynamics, and the other steps with
+the model.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ if TYPE_CHECKING:
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
-    """Task with tightened safety requirements: the robustness of each is reduced by its margin.
+    """Return the task with tightened safety requirements: the robustness of each is reduced by its margin.
 
-    Predicates on time and constants are unchanged: they make a formula true or false, but their values never
-    become its robustness.
+    Predicates that read only time and constants are unchanged. They decide whether a formula holds, but the
+    robustness of the formula never depends on their values.
     """
     if not any(margin.values()):
         return task
@@ -59,24 +60,24 @@ def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
 
 
 SHARE = 0.99
-"""Default share of plans whose robustness loss a margin covers."""
+"""Default share of plans whose loss of robustness is at most the margin."""
 STARTS = 4000
 SEED = 20_251
 
 
 @torch.no_grad()
 def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
-    """Margin of each safety requirement: a quantile of the robustness that safe plans lose when executed.
+    """Compute a margin for each safety requirement from the robustness that safe plans lose when executed.
 
     Args:
-        task: specification and system, with the scenario whose errors, disturbances and noise cause the loss.
+        task: specification and system. The errors, disturbances and noise of the scenario cause the loss.
         policy: policy that makes the plans.
         steps: number of steps between two judgements of the guard; the full guard judges at every step.
-        share: share of the plans whose loss is at most the margin.
+        share: share of the plans whose loss is at most the margin; the margin is this quantile of the loss.
 
     Returns:
-        Requirement -> margin, without margins of 0; empty if the scenario has no errors or the policy makes
-        no safe plan.
+        Requirement -> margin, without margins of 0. It is empty if the scenario has no errors or the policy
+        makes no safe plan.
     """
     x0 = task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
     disturbance = Disturbance(task.plain, [seeded(SEED, 1)], STARTS)
@@ -95,7 +96,7 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
 
 
 def _followed(task: Task, disturbance: Disturbance, x: Tensor, plan: Tensor, steps: int) -> Tensor:
-    """States (B, T+1, n) under plans: the first `steps` steps on the true dynamics, the rest on the model."""
+    """States (B, T+1, n) under plans: `steps` steps of the true dynamics, then the rest by the model."""
     (truth,) = disturbance.truths(task.plain.truth)
     count, states = len(task.plain.names), [x]
     for step in range(steps):
@@ -118,7 +119,8 @@ class MarginRequest:
     Attributes:
         every: margin of each safety requirement that `named` does not contain.
         named: requirement -> margin.
-        share: share of plans whose loss of robustness a calibrated margin covers; None without calibration.
+        share: share of the plans whose loss of robustness is at most the calibrated margin; None if margins
+            are not calibrated.
     """
 
     every: float = 0.0
@@ -154,8 +156,8 @@ class MarginRequest:
 def parse_margins(texts: Sequence[str]) -> MarginRequest:
     """Parse texts such as `0.2` (all requirements), `avoid=0.2` (one requirement), `auto` and `auto:99`.
 
-    `auto` calibrates the margins so that they cover 99 % of the plans, or the given percentage. Of several
-    texts for the same entry of the result, the last counts.
+    `auto` calibrates the margins such that 99 % of the plans lose no more robustness than the margin. Another
+    percentage may be given, as in `auto:95`. If several texts set the same margin, the last one counts.
 
     Raises:
         UsageError: U101, a text is not a margin.

@@ -17,12 +17,12 @@ BEYOND = "#beyond"
 
 
 def open_ended(formula: ir.Formula) -> ir.Formula:
-    """Formula whose robustness is an upper bound over all continuations of the known samples.
+    """Return a formula whose robustness bounds that of `formula` over all continuations of known samples.
 
-    At the samples after the known ones every predicate counts as true. The caller marks these samples by a
-    column named `BEYOND`: positive after the known samples, negative before. The formula must be in negation
-    normal form, so that a predicate made true never decreases the robustness. The bound is negative exactly
-    if the known samples already violate the formula.
+    The bound is an upper bound. At the samples after the known ones every predicate counts as true. The
+    caller supplies a column named `BEYOND`, which is positive at these samples and negative at the known
+    ones. `formula` must be in negation normal form, so that its robustness never decreases when a predicate
+    becomes true. The bound is negative exactly if the known samples already violate `formula`.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -30,7 +30,7 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """Formula in which predicates on the initial state count as true or false, whatever their value.
+    """Return a formula in which predicates on the initial state only count as true or false.
 
     Example: in `a -> always b`, let `a` depend on the initial state alone. It is then the same for all plans.
     So plans that violate the formula are compared by the robustness of `b`, not by that of `a`.
@@ -71,9 +71,9 @@ def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tens
         columns: name -> samples, (time, batch).
 
     Returns:
-        (time, batch); entry k is the bound over all continuations of the samples 0 to k, so entries do not
-        increase over time. Predicates on the initial state make a formula true or false, but their values
-        never become the bound. Without formulas, all entries are +inf.
+        (time, batch). Entry k is the bound over all continuations of the samples 0 to k. So entries do not
+        increase over time. Predicates on the initial state decide whether a formula holds, but their values
+        do not enter the bound. Without formulas, all entries are +inf.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

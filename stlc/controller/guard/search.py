@@ -112,9 +112,9 @@ class RelaxedSearch:
             previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan per agent. It is the best plan of the stages, if this has the margin, else the safe plan
-            with the largest margin found. If the present state itself lacks the margin, no plan has it: the
-            stages search without margin, and a search for the largest margin starts from their plans.
+            One plan per agent: the best plan of the stages if it keeps the margin, else the safe plan with
+            the largest margin found. If the present state itself lacks the margin, no plan can keep it. The
+            stages then search without margin, and a search for the largest margin starts from their plans.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -139,10 +139,13 @@ class RelaxedSearch:
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """Plans of the stages, run without margins, for agents whose present state lacks the margin.
+        """Run the stages without margins for the agents whose present state lacks the margin.
 
-        A search for the largest margin then starts from the safe ones of these plans. `lacking`: mask of the
-        agents whose present state lacks the margin, (agents,). All other agents get unjudged plans.
+        A search for the largest margin then starts from the safe plans found. `lacking`: mask of the agents
+        whose present state lacks the margin, (agents,).
+
+        Returns:
+            One plan per agent; the other agents get unjudged plans.
         """
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]

@@ -1,9 +1,9 @@
-"""Time budget of a training: the number of steps is replanned while it runs.
+"""Time budget of a training run, and the number of steps that fits into it.
 
 The duration of a step is known only from measurement, and the machine's load may change. Therefore the number
 of steps is planned again whenever the measured pace would miss the budget. The learning rate depends only on
-the step and on the number of steps planned at that moment: the seed and the recorded `StepSchedule` determine
-the weights, independently of the clock.
+the step and on the number of steps planned at that moment. So the weights depend on the seed and on the
+recorded `StepSchedule`, not on the clock.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Clock = Literal["wall", "processor"]
 """Clock of a budget: wall time, or processor time as on an idle machine."""
 
 PROVISIONAL = 10_000
-"""Planned number of steps until the first ones have been timed."""
+"""Planned number of steps before the first steps have been timed."""
 FIRST = 10
 """Steps that are timed before the first planning."""
 TOLERANCE = 0.015
@@ -33,7 +33,7 @@ TOLERANCE = 0.015
 SLACK = 0.1
 """Predicted miss of the budget that is tolerated, as a share of the remaining time."""
 PATIENCE, HASTE, SOON = 0.05, 0.01, 0.1
-"""Shares of the budget: between plannings, between those of the final phase, length of that phase."""
+"""Shares of the budget: interval between plannings, the same in the final phase, length of this phase."""
 WINDOW = 0.05
 """Time window for measuring the step duration, as a share of the budget; at least `FIRST` steps."""
 ROUNDS = 3
@@ -54,8 +54,8 @@ def cores() -> int:
 def processor() -> float:
     """Processor time in seconds, comparable with wall time on an idle machine.
 
-    It is the larger of two times: that of this thread, and that of all threads divided by the number of
-    cores. The time of child processes that have ended (compilers) is added.
+    It is the larger of two times: the time of this thread, and the time of all threads divided by the number
+    of cores. The time of child processes that have ended, such as compilers, is added to it.
     """
     ended = os.times()
     mine = max(time.thread_time(), time.process_time() / cores())
@@ -79,7 +79,7 @@ def simulation_reserve(seconds: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TimeBudget:
-    """Time budget of a training.
+    """Time budget of a training run.
 
     Attributes:
         now: function that reads the clock, in seconds.
@@ -101,14 +101,16 @@ class TimeBudget:
         allowed: float,
         late: Callable[[float], float] | None = None,
     ) -> TimeBudget:
-        """Make the budget of a training: the time that other work leaves, but at least half of `allowed`.
+        """Make the budget of a training run.
+
+        Its attribute `seconds` is `allowed` less the time for other work, but at least half of `allowed`.
 
         Args:
             now: function that reads the clock, in seconds.
             started: clock reading at the start.
             allowed: the user's budget in seconds; 0: unlimited.
-            late: function that predicts, for a budget, by how many seconds the whole command would exceed it,
-                because of other work such as loading. None: by 0 s.
+            late: function from a budget in seconds to the predicted number of seconds by which the whole
+                command would exceed it, because of other work such as loading. None: no excess.
         """
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
@@ -121,7 +123,7 @@ class TimeBudget:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """Entry of a schedule: from step `step` on, the planned total number of steps of the run is `steps`."""
+    """Entry of a schedule: from step `step` on, the run is planned to have `steps` steps in total."""
 
     step: int
     steps: int
@@ -132,18 +134,20 @@ _TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
 
 @dataclass(frozen=True, slots=True)
 class StepSchedule:
-    """Total numbers of steps planned in the course of a run; with the seed they determine the weights.
+    """Record of how many steps a run was planned to have, and of each change of this number.
+
+    Together with the seed, the schedule determines the weights.
 
     Attributes:
-        plannings: entries in order; the first is at step 0, and of two at the same step the later one
-            applies.
+        plannings: entries in order. The first is at step 0. If two entries are at the same step, the later
+            one applies.
     """
 
     plannings: tuple[Planned, ...]
 
     @classmethod
     def of(cls, steps: int) -> StepSchedule:
-        """Schedule of a fixed number of steps."""
+        """Schedule of a run with a fixed total of `steps` steps."""
         return cls((Planned(0, steps),))
 
     @classmethod
@@ -179,21 +183,21 @@ class StepSchedule:
 
     @property
     def steps(self) -> int:
-        """Total number of steps of the run, as planned last."""
+        """Total number of steps of the run according to the latest entry."""
         return self.plannings[-1].steps
 
     def at(self, step: int) -> int:
-        """Total number of steps of the run as planned after `step` steps."""
+        """Total number of steps of the run that is planned once `step` steps are made."""
         return [each.steps for each in self.plannings if each.step <= step][-1]
 
 
 class Pace:
     """Measured durations in a run, and the number of steps that fit into its budget.
 
-    A search round (validation) judges the policy's plans from new states, and starts a search for better ones
-    that runs concurrently with the steps; the next round, or a checkpoint, waits for the end of that search.
-    The durations of searches and rounds are measured in steps: if the machine becomes twice as slow, all of
-    them are assumed to take twice as long.
+    A search round (validation) judges the policy's plans from new states, and starts a search for better
+    plans. The search runs concurrently with the steps. The next round waits until it ends. The durations of
+    searches and rounds are measured in units of one step, because all three change in proportion when the
+    machine becomes slower.
     """
 
     def __init__(self, *, every: int, searching: bool, now: float, seconds: float = 0.0) -> None:
@@ -231,7 +235,7 @@ class Pace:
             self.searched(step, 0.0)
 
     def searched(self, step: int, waited: float) -> None:
-        """Record that the concurrent search ended at `step`, after the training waited `waited` seconds."""
+        """Record that the concurrent search ended at `step`, after a wait of `waited` seconds for it."""
         self._apart += waited
         if self._running and self._last_validation is not None and self.per_step > 0.0:
             self._search = step - self._last_validation + waited / self.per_step
@@ -279,17 +283,17 @@ class Pace:
         return self.per_step * (steps - step + round_ * rounds + waits)
 
     def plan(self, step: int, steps: int, next_validation: int, left: float) -> int:
-        """Total number of steps of the run that fit into the remaining time.
+        """Plan the total number of steps of the run, so that it ends when the remaining time is over.
 
         Args:
             step: number of completed steps.
-            steps: total number of steps planned at present; returned unchanged if it is predicted to fit, or
-                if too few steps were timed to plan again.
+            steps: total number of steps planned at present.
             next_validation: step of the next search round.
             left: remaining seconds.
 
         Returns:
-            At least 1, and at least `step`.
+            The total number of steps, at least 1 and at least `step`. It is `steps`, unchanged, if that
+            number is predicted to fit, or if it is too early to plan again.
         """
         cost = self.per_step
         if left > 0.0 and (cost <= 0.0 or (steps > step and not self._due(left))):
@@ -315,10 +319,10 @@ class Pace:
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """True once the number of steps is to be planned again.
+        """True if it is time to plan the number of steps.
 
-        It is planned once enough steps were timed, and then whenever a share of the budget has passed.
-        `left`: remaining seconds.
+        The first planning is due once enough steps were timed. The next one is due after a certain share of
+        the budget. `left`: remaining seconds.
         """
         if self._left is None:
             first = self._marks[0][1]

@@ -37,7 +37,7 @@ _NAME = re.compile(r"step-\d{6,}\.safetensors")
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """Saved state of a training: tensors by name, and scalars."""
+    """Saved state of a training run: tensors by name, and scalars."""
 
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
@@ -153,11 +153,11 @@ def _shown(folder: Path) -> str:
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
-    """Weights of one module: tensors whose names begin with `prefix.`, under names without this prefix."""
+    """Weights of one module: the tensors named `prefix.NAME`, each under the key `NAME`."""
     return below(checkpoint.tensors, prefix)
 
 
 def below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    """Tensors whose names begin with `prefix.`, under their names without the prefix."""
+    """Tensors whose names begin with `prefix.`; in the result, the names lack this prefix."""
     start = prefix + "."
     return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}

@@ -21,7 +21,7 @@ ENGINE_VERSION = 2
 """Version of the training engine; results of older versions are recomputed."""
 
 DRIVES = 400
-"""Maximum number of closed-loop runs per guard after a training."""
+"""Maximum number of closed-loop runs per guard after training."""
 HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
 """Seed of the held-out states: used for the final evaluation only, never during training or tuning."""
@@ -39,8 +39,8 @@ class PlannerChoice:
     Attributes:
         name: name in `stlc.registry.PLANNERS`.
         options: options of the planner, name -> text.
-        seconds: processor time per plan, in seconds.
-        evaluations: maximum number of plans judged to find one; None for no limit.
+        seconds: processor time for each plan, in seconds.
+        evaluations: maximum number of candidate plans that are judged to find a plan; None for no limit.
     """
 
     name: str
@@ -105,20 +105,21 @@ class ResolvedConfig:
         hidden: widths of the network's hidden layers.
         plans: number of plans that the network proposes per state.
         batch: number of fresh states per step.
-        hard: number of hard states per step. Only states are used for which the search has found a plan;
-            there are none at first.
+        hard: number of hard states per step. A hard state is used once the search has found a plan for it,
+            so the first steps have none.
         lr: peak learning rate.
         warmup: share of the steps over which the learning rate rises if `hold` is 0.
-        hold: share of the steps at the peak learning rate. If it is positive, the rise to the peak takes a
-            fixed number of steps.
+        hold: share of the steps at the peak learning rate. If it is positive, the learning rate rises to the
+            peak in a fixed number of steps.
         clip: bound on the norm of the gradient.
         average: decay of the moving average of the weights.
         pool: number of fresh states judged per search round.
         every: steps between search rounds.
         most: maximum number of hard states from which a search round searches.
-        slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions at distance x.
+        slope: k in the smooth switch (1 + tanh(k x)) / 2, where x is the distance to a switching condition
+            of the dynamics. In gradients, the smooth switch takes the place of the exact one.
         imitation: weight of the imitation loss, the distance to the plan that the search found.
-        share: weight of the mean loss of all plans of a state; it is added to the loss of the best plan.
+        share: weight with which the mean loss of all plans of a state is added to the loss of its best plan.
         performance: weight of the performance terms in the loss.
         held_out: number of initial states of the final evaluation, on which no policy is trained.
         threads: number of threads of torch, on which the rounding of sums depends; 0: not changed.
@@ -165,7 +166,7 @@ MOST_TEXT = 1000
 
 
 def bounded(default: float, least: float, most: float) -> Any:
-    """Field of an options class: a number from `least` to `most`, which `checked_config` enforces."""
+    """Field of an options class: a number from `least` to `most`; `checked_config` checks these bounds."""
     return field(default=default, metadata={"bounds": (least, most)})
 
 
@@ -277,7 +278,8 @@ def base_config(
         batch: default number of fresh states per step.
         plans: default number of plans of the network.
         rate: default learning rate.
-        searches: whether a search runs concurrently with the training steps; torch then leaves it one core.
+        searches: whether a search runs concurrently with the training steps. If so, torch uses one core less,
+            which is left to the search.
     """
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)
@@ -301,9 +303,10 @@ def base_config(
 
 
 def _threads(*, searching: bool) -> int:
-    """Number of threads of torch: unchanged, or at most the number of cores less one if `searching`.
+    """Return the number of threads for torch.
 
-    `searching`: whether a search runs concurrently; one core is left to it.
+    It is the number that torch uses at present. If `searching` (a search runs concurrently), it is at most
+    the number of cores less one, so that one core is left to the search.
     """
     most = int(torch.get_num_threads())
     return max(1, min(most, cores() - 1)) if searching else most

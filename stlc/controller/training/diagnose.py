@@ -1,12 +1,13 @@
-"""Diagnosis of trainings that fail.
+"""Diagnosis of failed training runs.
 
 It finds a declared mirror symmetry that the system lacks, a non-finite quantity in a training step, or a
 requirement that no plan satisfies.
 
-A training step computes network -> plans -> states -> robustness of each requirement and performance terms ->
-gradient; the first of these that is not finite is reported. If a search finds no plan, this does not prove
-that there is none. Bounds can prove it: interval arithmetic over all plans encloses the states that are
-reachable within the horizon. From these states follows an upper bound on the robustness of a requirement.
+A training step computes, in this order: plans from the network, states, the robustness of each requirement
+and the performance terms, gradients. The first quantity that is not finite is reported. If a search finds no
+plan, this does not prove that there is none. Bounds can prove it: interval arithmetic over all plans encloses
+the states that are reachable within the horizon. These states give an upper bound on the robustness of a
+requirement. If the bound is negative, no plan satisfies the requirement.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class TrainingStep:
     def of(
         cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task
     ) -> TrainingStep:
-        """Training step with all plans that the network proposes for states (B, n)."""
+        """Training step that judges all plans that the network proposes for the states `x0`, (B, n)."""
         with torch.no_grad():
             plans = network(x0)
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
@@ -132,7 +133,9 @@ def _motion(step: TrainingStep) -> StlcError | None:
 
 
 def _robustness(step: TrainingStep) -> StlcError | None:
-    """Error for a requirement whose robustness or gradient is not finite for finite states; None if none.
+    """Error that names a requirement whose robustness or gradient is not finite although the states are.
+
+    None if there is no such requirement.
 
     The values of all requirements are checked before the gradients, since one infinite value makes the
     gradients of all requirements infinite or NaN.
@@ -159,7 +162,7 @@ def _robustness(step: TrainingStep) -> StlcError | None:
 
 
 def _cost(step: TrainingStep) -> StlcError | None:
-    """Error for a performance term whose value or gradient is not finite; None if there is none."""
+    """Error that names a performance term whose value or gradient is not finite; None if all are."""
     declared = step.task.system.decl
     for term in declared.objective.terms:
         alone = replace(declared, objective=replace(declared.objective, terms=(term,)))
@@ -255,10 +258,10 @@ TRIES = 4000
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     """Diagnostic R404, which names requirements that no plan was found to satisfy together.
 
-    If bounds prove for a requirement that no plan satisfies it, the first such requirement is named.
-    Otherwise the requirements are tested one after the other. If no plan is found even without the tested
-    requirement, it is removed, because the others already conflict. The requirements left in the end are
-    named. The tests end once `enough` returns True.
+    If bounds prove that no plan satisfies some requirement, the first such requirement is named. Otherwise
+    the requirements are tested one after the other: a search tries to satisfy all of them but the tested one.
+    If it finds no plan, the tested requirement is removed, because the others already conflict. The
+    requirements that remain after all tests are named. The tests end early once `enough` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -345,7 +348,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Sentence that says how many plans were tried, since a search without result proves nothing.
+    """Sentence for a message: how many plans the search tried, and that this is no proof.
 
     `core`: the conflicting requirements.
     """
@@ -397,8 +400,8 @@ def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
     """Upper bound on the robustness of a formula at time 0; inf if the bounds on the states imply none.
 
-    Formulas are in negation normal form, so their robustness is a nondecreasing function of that of their
-    predicates. Hence each predicate is replaced by its upper bound at every instant.
+    The formula is in negation normal form. So its robustness never decreases when the robustness of one of
+    its predicates increases. Hence each predicate is replaced by its upper bound at every instant.
 
     Args:
         formula: the formula.
@@ -477,7 +480,8 @@ def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, 
         names: names of the last dimension.
         found: values that were computed, (…, len(names)).
         wanted: values that a mirror symmetry would give, of the same shape.
-        what: name of the values in the message, which shows the name for which most rows differ.
+        what: description of the values, for the message. The message also gives the entry of `names` for
+            which most rows differ.
     """
     found, wanted = found.reshape(-1, len(names)), wanted.reshape(-1, len(names))
     off = ~torch.isclose(found, wanted, rtol=NEAR, atol=NEAR, equal_nan=True)

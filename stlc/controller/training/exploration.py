@@ -1,12 +1,12 @@
 """Search for plans by exploration: plans are built step by step from prefixes (their first actions).
 
-Local search changes whole plans; where many goals have to be reached in order, hardly any change reaches one
-more without losing others. Therefore plans are built from prefixes here. For every prefix, bounds over all
-continuations show which parts of the specification every continuation violates, which every continuation
-satisfies, and which are open. Prefixes with a violated part are dropped. The others form layers, one per
-length. Two prefixes of a layer are in the same cell if they satisfy the same parts and end in the same region
-of the state space. A layer keeps only the best prefix of each cell. Advanced prefixes and those in rarely
-visited cells are extended first (Ecoffet et al. 2021, "First return, then explore").
+Local search changes whole plans. If many goals must be reached in order, hardly any change reaches a further
+goal without losing another. Therefore plans are built from prefixes here. For every prefix, bounds over all
+continuations show which parts of the specification are violated by every continuation, which are satisfied by
+every continuation, and which are open. Prefixes with a violated part are dropped. The others form layers, one
+per length. Two prefixes of a layer are in the same cell if they satisfy the same parts and end in the same
+region of the state space. A layer keeps only the best prefix of each cell. Advanced prefixes and those in
+rarely visited cells are extended first (Ecoffet et al. 2021, "First return, then explore").
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ COUNTED = 6
 GROWTH = 0.1
 """Mean share of the horizon by which a prefix is extended at once."""
 NEAR = 8.0
-"""Logarithm of the factor by which prefixes of the greatest worth are preferred to those of the least."""
+"""Logarithm of the factor by which a prefix of greatest worth is preferred to one of least worth."""
 EFFORTS = (8, 24, 72)
 """Sweeps for a plan of `USUAL` steps: first attempt, and increased effort after failures."""
 USUAL = 30
@@ -56,13 +56,13 @@ USUAL = 30
 BATCH = 8
 """Sweeps from one start before the next start's turn."""
 TAILS = 8
-"""Number of instants of a plan at which its remainder is tried as a plan too."""
+"""Number of instants of a plan from which on its remainder is tried as a further plan."""
 RAISED = 250
 """Generations of the local search that increases the margin of a found plan."""
 
 
 def pieces(formula: ir.Formula) -> list[ir.Formula]:
-    """Conjuncts of a formula, after `always` is distributed over `and`."""
+    """Split a formula into conjuncts: `always (a and b) and c` gives `always a`, `always b` and `c`."""
     match formula:
         case ir.BoolOp("and", items):
             return [piece for item in items for piece in pieces(item)]
@@ -79,7 +79,7 @@ class Layer:
     Attributes:
         states: predicted trajectories, (rows, steps + 1, n).
         plans: controls, (rows, steps, m).
-        met: whether every continuation of a prefix satisfies a piece, (rows, pieces).
+        met: True where a piece is satisfied by every continuation of a prefix, (rows, pieces).
         kind: whole numbers that describe each prefix, (rows, entries): its satisfied pieces, and the rounded
             values of its timers. Prefixes with equal rows are of the same kind.
         worth: sum of the lower bounds on the robustness of undecided pieces, (rows,).
@@ -152,13 +152,14 @@ class Exploration:
         generator: torch.Generator,
         enough: Callable[[], bool] = lambda: False,
     ) -> ExplorationResult:
-        """Search for a satisfying plan from the state (n,).
+        """Search for a satisfying plan from the state `x`.
 
         Args:
-            x: the initial state.
+            x: the initial state, (n,).
             sweeps: maximum number of sweeps; a sweep extends every layer (the prefixes of one length) once.
             generator: random numbers of the exploration.
-            enough: called before each sweep after the first; True ends the exploration.
+            enough: function that is called before each sweep after the first; the exploration ends once it
+                returns True.
         """
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         start = x.double().numpy(force=True)[None, None]
@@ -186,18 +187,18 @@ class Exploration:
         spare: float,
         enough: Callable[[], bool] = lambda: False,
     ) -> SearchResult:
-        """Find satisfying plans from some of the initial states, and from states on the way of these plans.
+        """Find satisfying plans from some of the initial states, and from states that these plans visit.
 
         The states are tried in order while sweeps remain. If the specification adds timers to the state, some
-        states on the way of a plan serve as further initial states, since the remainder of the plan may
-        satisfy the specification from there.
+        states that a plan visits serve as further initial states, since the remainder of the plan may satisfy
+        the specification from there.
 
         Args:
             starts: initial states, (k, n).
             sweeps: total number of sweeps for plans of `USUAL` steps; fewer for longer plans.
             generator: random numbers of the exploration.
-            spare: robustness up to which a local search improves the plans found.
-            enough: called repeatedly; True ends the exploration.
+            spare: a local search improves each plan found until its robustness is `spare`.
+            enough: function that is called repeatedly; the exploration ends once it returns True.
 
         Returns:
             The plans found, with their initial states; empty if there are none.
@@ -220,17 +221,20 @@ class Exploration:
     # ------------------------------------------------------------------ found plans
 
     def _raised(self, x: Tensor, plan: Tensor, spare: float) -> Tensor:
-        """Improve a plan (T, m) up to robustness `spare` by local search, if there is a native kernel."""
+        """Improve a plan (T, m) by local search until its robustness is `spare`.
+
+        Without a native kernel the plan is returned unchanged.
+        """
         if self.task.native is None:
             return plan
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
     def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """Initial states with plans: `x` with its plan, and states on the way with remainders of the plan.
+        """Return pairs of an initial state and a plan: `x` with `plan`, and later states with its remainders.
 
-        Only pairs are returned in which the plan satisfies the specification. Remainders are extended to T
-        steps by repeating their last control.
+        The later states are those that `plan` visits. Remainders are extended to T steps by repeating their
+        last control. A pair is left out if its plan does not satisfy the specification.
         """
         states, plans = [x], [plan]
         if self.task.compiled.timers:
@@ -288,9 +292,9 @@ class Exploration:
         return Layer(states, plans, met, kind, worth, np.zeros(len(worth)))
 
     def _bounds(self, states: Numbers, end: Boundary) -> Numbers:
-        """Bounds on the robustness over all continuations of trajectories, (rows, pieces).
+        """Bounds on the robustness of each piece over all continuations of each trajectory, (rows, pieces).
 
-        A piece is a conjunct of the specification; there is one bound per trajectory and piece.
+        A piece is a conjunct of the specification.
 
         Args:
             states: trajectories, (rows, samples, n).
@@ -340,7 +344,7 @@ class Exploration:
         return drawn
 
     def _thinned(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """Keep the prefix of greatest worth in each cell, and of these at most `KEPT`.
+        """Keep the prefix of greatest worth in each cell, but at most `KEPT` prefixes in total.
 
         Prefixes are in the same cell if they are of the same kind (see `Layer.kind`) and end in the same
         region of the state space. If there are more than `KEPT` cells, `KEPT` prefixes are drawn at random,

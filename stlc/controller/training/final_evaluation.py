@@ -1,4 +1,4 @@
-"""Evaluation at the end of a training: held-out states, conflict diagnosis, closed-loop simulations."""
+"""Evaluation after training: held-out states, conflict diagnosis, closed-loop simulations."""
 
 from __future__ import annotations
 
@@ -24,22 +24,24 @@ if TYPE_CHECKING:
 VERDICT_OVER = 0.04
 """Share of a budget by which the evaluation may exceed it before the feasibility search is stopped."""
 SIMULATION_SHARE = 0.15
-"""Time for closed-loop simulations after a training without budget, as a share of its duration."""
+"""Time for closed-loop simulations after training without budget, as a share of the training time."""
 VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
 """Time for the evaluation of a run without budget: seconds, and share of the duration of its steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingOutcome:
-    """Result of a training.
+    """Result of a training run.
 
     Attributes:
         run: the run with its policy.
-        score: result on held-out states; None if training was interrupted, and on ranks after the first.
+        score: result on held-out states; None if training was interrupted. Of several ranks (processes) only
+            the first has a score.
         seconds: duration of the training, evaluation on held-out states included.
         interrupted: whether `Watch.stop` ended it.
         ranks: number of processes that trained together.
-        why: diagnosis of the conflicting requirements if no plan was found from any initial state, else None.
+        why: if no plan was found from any initial state, the diagnosis of the conflicting requirements; else
+            None.
         steps: number of training steps made.
         simulated: closed-loop results; None if there was no simulation.
     """
@@ -56,14 +58,14 @@ class TrainingOutcome:
 
 @dataclass(slots=True)
 class FinalEvaluation:
-    """Evaluation of a trained policy, within the time that the training left of the budget.
+    """Evaluation of a trained policy, in the part of the budget that remains after training.
 
     Attributes:
         writer: writer of the run's folder.
-        task: problem of the training.
+        task: problem that the policy was trained for.
         config: resolved options of the run.
-        time: budget of the training.
-        report: called with the progress as a short text.
+        time: time budget of the run.
+        report: function that is called with the progress as a short text.
         trained: clock reading at the end of the training, when the evaluation begins.
     """
 
@@ -124,7 +126,7 @@ class FinalEvaluation:
     def _late(self) -> bool:
         """True once the diagnosis of conflicting requirements has to end.
 
-        The limit is twice the time for the evaluation on held-out states.
+        Its time limit, counted from the end of training, is twice that of the evaluation on held-out states.
         """
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 

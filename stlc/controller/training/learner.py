@@ -360,7 +360,7 @@ class Trainer(Learner):
         """Tensors from which training resumes exactly, bit for bit.
 
         All ranks (processes that train together) must call this at the same time. The first rank returns the
-        tensors of all ranks.
+        tensors of all ranks; these form the checkpoint. The other ranks return only their own.
         """
         found: dict[str, Tensor] = self._own()
         for index, theirs in enumerate(self.ranks.gather(found), start=1):

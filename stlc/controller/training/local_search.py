@@ -116,7 +116,7 @@ class Search:
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
-        """Wait for the result and return it; None if `stop` ended the wait before."""
+        """Wait for the result and return it; None if `stop` ended the wait early."""
         while not self.done():
             if stop():
                 return None

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 DEFAULT_BUDGET = 60.0
 BARREN_VALIDATIONS, BARREN_SHARE = 5, 0.1
-"""Validations, and share of the steps, after which a search that never found a plan is given up.
+"""Training ends after this many validations and this share of the steps if no plan was ever found.
 
-By then exploration has used its largest effort. If a plan is proved not to exist, the first validation ends
-it.
+By then exploration has used its largest effort. If bounds prove that no plan exists, training ends at the
+first validation.
 """
 SAVE_EVERY = 500
 """Maximum number of steps between checkpoints."""
@@ -52,7 +52,7 @@ def keep_freed_memory() -> bool:
 
     A rollout allocates and frees the same few arrays of some 100 kB in every step. By default glibc returns
     them, and mapping and clearing their pages again takes as long as the rollout itself. The setting affects
-    the whole process, so programs (`stlc train`) call this, not imports.
+    the whole process. So programs such as `stlc train` call this function; importing the package does not.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -66,16 +66,16 @@ def keep_freed_memory() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Callbacks of a training.
+    """Callbacks of a training run.
 
     Attributes:
-        started: called once with the resolved options, which include the margin and the number of steps.
+        started: called once with the resolved options, the margin and the number of steps.
         row: called with every row of `train.jsonl`.
         stop: called after every step; True saves and ends the training.
-        deferring: context manager around the steps, in which an interrupt is deferred until the step is
-            finished and saved; outside of it an interrupt may be raised anywhere.
-        late: function that predicts, for a budget of wall time, by how many seconds the whole command would
-            exceed it, because of other work such as loading.
+        deferring: context manager around the steps. Inside it, an interrupt is deferred until the present
+            step is finished and saved. Outside it, an interrupt may be raised anywhere.
+        late: function from a budget of wall time, in seconds, to the predicted number of seconds by which the
+            whole command would exceed it, because of other work such as loading.
         evaluating: called with the progress of the final evaluation, as a short text.
     """
 
@@ -102,14 +102,14 @@ def train(
         config: the user's options.
         folder: folder of the run.
         watch: callbacks.
-        ranks: processes that train together; all call this function at the same time, and the first one
-            writes.
+        ranks: processes that train together. All of them call this function at the same time; only the first
+            writes files.
 
     Raises:
         SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
             S304, the declared mirror is no symmetry of the system or the specification.
-        MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, a rank is
-            gone.
+        MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, the process
+            of another rank has ended or does not answer.
         RunError: R401, the loss or its gradient is not finite.
 
     """
@@ -147,13 +147,13 @@ def resume(
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
 ) -> TrainingOutcome:
-    """Resume an interrupted run; the weights become those of an uninterrupted run, bit for bit.
+    """Resume an interrupted run. With equal steps, an uninterrupted run has the same weights, bit for bit.
 
     Args:
         folder: folder of the run.
         steps: new total number of steps.
-        budget: additional seconds. If neither `steps` nor `budget` is given, the rest of the run's budget is
-            used, or its step schedule is completed.
+        budget: additional seconds. If neither `steps` nor `budget` is given, the run uses the rest of its
+            budget, or completes its step schedule if it has no budget.
         device: torch device.
         watch: callbacks.
         ranks: processes that train together; their number must be the same as before.
@@ -262,12 +262,12 @@ def find_device(name: str) -> torch.device:
 
 
 class _Session:
-    """Part of a training in one process: from the learner's present state to its end or an interruption."""
+    """Training from the learner's present state to the last step or an interruption, and the evaluation."""
 
     def __init__(
         self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
     ) -> None:
-        """Prepare to complete `schedule`; with a budget, the number of steps is adapted to the pace."""
+        """Prepare to make the steps of `schedule`; with a budget, their number is adapted to the pace."""
         self.writer = writer
         self.learner = learner
         self.watch = watch
@@ -324,7 +324,7 @@ class _Session:
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
-        """Validate if that is due, and decide whether another step follows.
+        """Validate if a validation is due, and decide whether another step follows.
 
         A validation and the end of the training wait for the concurrent search. If the wait is shorter than
         expected, further steps may fit into the budget.
@@ -346,9 +346,9 @@ class _Session:
         return True
 
     def _planned(self) -> int:
-        """Plan the total number of steps by the budget or the schedule, and return it.
+        """Return the total number of steps: planned anew from the budget, or taken from the schedule.
 
-        A changed number is recorded in the schedule and in the learner.
+        If the number changes, it is recorded in the schedule and in the learner.
         """
         learner = self.learner
         if self.time.allowed:
@@ -363,7 +363,7 @@ class _Session:
 
     @property
     def _known_steps(self) -> int | None:
-        """Total number of steps; None with a budget for which no steps have been planned yet."""
+        """Total number of steps; None if it follows from a budget and has not been planned yet."""
         return None if self.time.allowed and not self.pace.planned else self.schedule.steps
 
     def _note_schedule(self) -> None:
@@ -372,8 +372,8 @@ class _Session:
     def _validate(self, began: float) -> None:
         """Validate and write a row of `train.jsonl`.
 
-        `began`: clock reading before the exploration that preceded the validation; the recorded duration
-        begins there.
+        `began`: clock reading before the exploration that precedes a validation. The recorded duration
+        includes this exploration.
         """
         learner = self.learner
         found = learner.validate()
@@ -405,7 +405,7 @@ class _Session:
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
-        """Outcome of a session that ends without evaluation."""
+        """Outcome without evaluation; `interrupted` is stored in it."""
         learner = self.learner
         run = Run(self.writer.folder, learner.task, learner.policy)
         return TrainingOutcome(
@@ -448,7 +448,7 @@ class _Session:
         self.watch.row(row)
 
     def _broken(self) -> StlcError:
-        """Return the error that explains a step without finite loss or gradient; mark the run as failed.
+        """Return the error that explains why a loss or its gradient is not finite; mark the run as failed.
 
         The weights before that step are saved if they are finite.
         """

@@ -25,7 +25,7 @@ class Objective:
     Attributes:
         margin: gamma; robustness above it does not reduce the loss.
         smoothing: k of smooth min and max; None: exact min and max with subgradients.
-        switch: functions whose derivatives replace those of jumps and conditions in the dynamics.
+        switch: functions whose derivatives replace the derivatives of jumps and conditions in the dynamics.
         saturation: s of `s log(1 + hinge / s)`, which keeps infeasible states from dominating; None: plain
             hinge.
         stl_weight: lambda, the weight of the hinge on robustness.
@@ -93,10 +93,10 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
 def native_rolled(
     task: Task, objective: Objective, x0: Tensor, u: Tensor
 ) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Robustness per requirement (B, R), and states name -> (T+1, B), computed in C.
+    """Compute the robustness per requirement, (B, R), and the states, name -> (T+1, B), in C.
 
-    Both are differentiable with respect to `u`. None if there is no native kernel for the objective (smooth
-    robustness), the task or the device.
+    Both are differentiable with respect to `u`. Returns None if there is no native kernel for the task or the
+    device, or if the objective uses smooth robustness.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
@@ -106,7 +106,7 @@ def native_rolled(
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,), and states name -> (T+1, B), computed in C if possible, else in torch.
+    """Compute the robustness, (B,), and the states, name -> (T+1, B), in C if possible, else in torch.
 
     Both are differentiable with respect to `u`.
     """

@@ -46,7 +46,7 @@ class Run:
 
     Attributes:
         dir: folder of the run.
-        task: problem of the training.
+        task: problem that the policy was trained for.
         policy: the trained policy; call it with states (B, n) for plans (B, T, m) in physical units.
     """
 
@@ -105,7 +105,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class RunWriter:
-    """Writer of a run's folder during training; of several ranks (processes) only the first writes.
+    """Writer of a run's folder during training. If several ranks (processes) train, only the first writes.
 
     Attributes:
         folder: folder of the run.
@@ -154,7 +154,7 @@ class RunWriter:
             save_states(self.folder.path / "eval" / "held_out.npz", task, score)
 
     def close(self, status: Status, result: object = None) -> None:
-        """Write the status and the result with which the training ended into `run.json`."""
+        """Write the final status of the run and its result into `run.json`."""
         if self.writes:
             self.folder.finish(status, result)
 
@@ -211,12 +211,12 @@ def system_hash(folder: RunDir) -> str:
 
 
 def trained_on(folder: RunDir) -> str:
-    """Hash of the system file to compare with the one that a run's checkpoint holds.
+    """Hash of the system file, for comparison with the hash that is stored in a run's checkpoint.
 
-    The file in the run's folder may have been edited since the start of the training. If the edits are only
-    in fields that do not affect what a policy learns (worlds, scenarios, backup), the hash at the start of
-    the training is returned, so that the checkpoint is accepted. After any other edit the hash of the present
-    file is returned, so that the checkpoint is refused.
+    The file in the run's folder may have been edited since training began. Edits of worlds, scenarios and
+    backup do not affect what a policy learns. If there are only such edits, the hash at the start of training
+    is returned, so that the checkpoint is accepted. After any other edit the hash of the present file is
+    returned, so that the checkpoint is refused.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")

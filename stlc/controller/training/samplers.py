@@ -4,8 +4,8 @@ If a specification has memory (the time of the mission, satisfied goals, timers)
 reaches are useful for training, because the memory must fit the position. Therefore a pool of missions is
 simulated with the plans of the present policy, and the states on the way are returned. A mission is replaced
 by a new one if it is over or can no longer satisfy the specification, and often if no satisfying plan is
-found from its present state. Early in training missions end soon; later they get further, and plans that
-search found for failing states continue some of them.
+found from its present state. Early in training missions end soon; later they get further. If a search finds
+plans from states at which the policy failed, some missions continue from states that these plans visit.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Supply(ABC):
 
     @abstractmethod
     def _more(self, n: int) -> Tensor:
-        """Draw states, preferably at least `n`: (k, dim)."""
+        """Draw k states, if possible at least `n`; return them, (k, dim)."""
 
     def take(self, n: int) -> Tensor:
         """Return the next `n` states, (n, dim), float32."""
@@ -66,7 +66,7 @@ class Supply(ABC):
         """
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors by name that determine the next states, together with the random numbers."""
+        """Tensors by name; together with the random generator they determine the next states."""
         return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
@@ -118,9 +118,9 @@ Planner: TypeAlias = Callable[[Tensor], "PlanVerdicts"]
 
 POOL = 2048
 GLIMPSES = 4
-"""Number of states returned per leg of a mission (the part of a plan that is followed)."""
+"""Number of states returned per leg of a mission (a leg is the part of a plan that is followed)."""
 STARTS = 0.1
-"""Number of initial states that are added to the returned states, as a share of them."""
+"""Number of initial states added to the visited states, as a share of the number of visited states."""
 ROUNDS = 5
 """Number of periods for which a mission with requirements that recur forever is simulated."""
 GIVE_UP = 0.3
@@ -145,10 +145,10 @@ class Missions(Supply):
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Continue some missions from states on the way of plans that a search found.
+        """Continue some missions from states that are visited by plans that a search found.
 
         `states`: states at which the policy failed, (k, n). `plans`: the plans found from there, (k, T, m).
-        The state after a random number of steps of each plan is used.
+        Each plan contributes one state, which it visits after a random number of steps.
         """
         if len(states) and len(self.pool):
             judged = self.task.judge(states, plans)
@@ -164,7 +164,7 @@ class Missions(Supply):
         """Simulate every mission under its present plan for a random number of steps.
 
         Returns:
-            States visited on the way and some new initial states, in random order, (k, dim).
+            The visited states and some new initial states, in random order, (k, dim).
         """
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
@@ -191,12 +191,15 @@ class Missions(Supply):
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
-        """Draw for each of `n` plans a number of steps to simulate, 1 to half of the horizon: (n,) int64."""
+        """Draw numbers of steps to simulate, one for each of `n` plans, (n,) int64.
+
+        Each is between 1 and half of the horizon.
+        """
         most = max(self.task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
-        """Predicted state after `steps[i]` steps of plan i, for all judged plans: (n,) -> (n, dim)."""
+        """Predicted states of the judged plans: the state of plan i after `steps[i]` steps, (n, dim)."""
         return torch.stack(
             [judged.columns[name].gather(0, steps[None])[0] for name in self.task.system.names], 1
         )
@@ -214,9 +217,9 @@ class Missions(Supply):
 def mission_steps(task: Task) -> int:
     """Number of steps for which a mission is simulated.
 
-    If the specification names no times, the mission ends after four horizons. If it does, the mission ends
-    one horizon after the last of these times. If requirements recur forever, the mission ends `ROUNDS`
-    periods after that time; a period is at least a horizon.
+    If the specification names no times of the mission, a mission takes four horizons. Otherwise let t be the
+    last time that it names. The mission ends one horizon after t. If requirements recur forever, it ends
+    `ROUNDS` periods after t instead, where a period counts as at least one horizon.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:

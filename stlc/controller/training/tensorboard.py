@@ -1,4 +1,4 @@
-"""TensorBoard log of a training (`pip install 'stlc[log]'`)."""
+"""TensorBoard log of a training run (`pip install 'stlc[log]'`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PLAIN = ("accuracy", "feasible", "loss", "lr", "s_per_step")
 
 
 class Writer(Protocol):
-    """Subset of `SummaryWriter` that is used here."""
+    """The methods of TensorBoard's `SummaryWriter` that are used here."""
 
     def add_scalar(self, tag: str, value: float, step: int, /) -> None:
         """Log a number."""

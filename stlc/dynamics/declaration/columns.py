@@ -66,7 +66,10 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
-    """The section `time`: time step, horizon, integration method. A missing or invalid horizon is 0."""
+    """The section `time`: time step, horizon, integration method.
+
+    The horizon is 0 if it is missing or invalid.
+    """
 
     dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
     horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
@@ -287,7 +290,7 @@ def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[list[Assign]
     """Read the timers: states with `timer: up` or `timer: down`.
 
     Returns the assignments of `flow` that advance the timers, and one jump per timer. A timer counts seconds
-    while its condition `run` holds. When `reset_when` holds, the jump sets it to the value of its key `to`.
+    while its condition `run` holds. When `reset_when` holds, the jump sets the timer to the value of `to`.
     """
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
@@ -386,7 +389,7 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 def _even(column: Column) -> tuple[ir.Num, str]:
     """Return the uniform distribution over the values that a column can take.
 
-    It is returned twice: as an expression of the IR, and as text.
+    The result has two entries: the distribution as an expression of the IR, and as text.
     """
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
@@ -398,10 +401,10 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Return the column with a range added, if it declares none.
+    """Return the column with a range that covers nearly all random values that it can get.
 
-    The range covers nearly all random values that the column can get. `assigns` holds the distributions of
-    the columns. A column without a distribution is returned unchanged, and so is one that declares a range.
+    `assigns` holds the distributions of the columns. A column that declares a range is returned unchanged,
+    and so is a column without a distribution.
     """
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)

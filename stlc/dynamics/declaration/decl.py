@@ -55,8 +55,10 @@ class SystemDecl:
         discrete: whether `flow` gives next values of the states instead of derivatives.
         constants: name -> (value in SI units, unit).
         signature: the state columns (one per scalar state or vector component), in order.
-        controls: planned variables, in order: the inputs, or their deviations from `feedback`.
-        flow: derivative in unit per second (or next value) of each column; columns not listed are constant.
+        controls: planned variables, in order: the inputs of the system, or, if there is an inner feedback,
+            the deviations of the inputs from its commands.
+        flow: derivative of each column in its unit per second, or its next value; a column that is not listed
+            is constant.
         jumps: discrete transitions, in file order.
         clamps: column -> (low, high), the range to which the column is limited after every step.
         init, objective, policy, train, backup, test: the sections of these names.

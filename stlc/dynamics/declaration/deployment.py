@@ -105,7 +105,7 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 
 @reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` of a state formula.
+    """Read the condition of an event: a state formula, or `rise(…)` or `fall(…)` around a state formula.
 
     Returns the fields `when` and `edge` of `EventDecl`; None if the text cannot be parsed. `label` names the
     condition in messages.
@@ -133,7 +133,8 @@ def _instant(cx: Context, node: Node, label: str) -> int | None:
 class EventDecl:
     """An exogenous event: a change of states between two steps, which the planner does not foresee.
 
-    With `edge` the event happens only at the step where `when` becomes true (`rise`) or false (`fall`).
+    If `edge` is `rise`, the event happens only at the steps at which `when` becomes true; if it is `fall`,
+    only at the steps at which `when` becomes false.
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -194,7 +195,7 @@ class JudgeRef:
 def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
     """Read the reference `file.py:Class` to a world; the path of the file is relative to the system file.
 
-    Returns None for a null, and for an invalid reference, which is reported.
+    Returns None for the value null, and for an invalid reference, which is reported.
     """
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`world`")
     if text is None:
@@ -210,7 +211,7 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
 def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
     """Read the path of the specification that judges closed-loop runs, relative to the file that names it.
 
-    Returns None for a null, and for an invalid path, which is reported.
+    Returns None for the value null, and for an invalid path, which is reported.
     """
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
     if text is None:
@@ -226,7 +227,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
     """Read the names of uncertain constants; a vector is named as a whole, not by component.
 
-    `label` names the list in messages. A name that is no constant is reported.
+    `label` names the list in messages. A name that does not belong to a constant is reported.
     """
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
     items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]

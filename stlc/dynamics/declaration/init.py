@@ -68,9 +68,9 @@ class Situation:
 
     Attributes:
         name: for messages and tables; "" for an unnamed branch.
-        weight: relative probability of this situation among the alternatives; not normalised.
+        weight: probability of this situation relative to the alternatives; the weights need not sum to 1.
         draws: assignments in order; later ones may read earlier ones. Names that are not columns are local.
-        branches: alternative situations, one of which is drawn by weight after `draws`; may be empty.
+        branches: alternative situations. After `draws`, one of them is drawn by weight. May be empty.
         points: grid or file, from which a state is drawn before `draws`; None if the situation has neither.
     """
 

@@ -65,7 +65,7 @@ def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
 def _term_label(found: Mapping[str, Node]) -> str:
     """Return the name of a performance term in messages, such as "the term `effort`".
 
-    A term without a name is called by its expression. `found` holds the values of the term by key.
+    If the term has no name, its expression is used instead. `found` holds the values of the term by key.
     """
     name = found.get("name")
     shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
@@ -242,10 +242,10 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 @reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the mirror images of states and controls: an expression for each. The others are unchanged.
+    """Read the mirror images of states and controls: an expression for each state or control that changes.
 
-    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`.
-    `stlc.controller.training.diagnose.check_mirror` checks before a training that the dynamics are symmetric.
+    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`. Before training,
+    `stlc.controller.training.diagnose.check_mirror` checks that the dynamics are symmetric.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)

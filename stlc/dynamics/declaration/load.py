@@ -245,8 +245,8 @@ class _Named:
         cx: context that knows all declared names, and the time step.
         clock: the section `time`.
         states: keys of each state, timers included.
-        drawn: assignments that are made before the other states are drawn. They give the parameters, and for
-            each jump with `once` the initial value of the bool state that records whether it has happened.
+        drawn: assignments that are made before the other states are drawn. They draw the parameters, and set
+            to false the bool states that record which jumps with `once` have happened.
         functions: external functions.
     """
 
@@ -276,8 +276,8 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 class MovingParts:
     """YAML nodes of the sections `flow` and `jump` of a valid file.
 
-    `read_flow` and `read_jumps` can read them a second time in the context `cx`, for example with changed
-    numbers.
+    With them, `read_flow` and `read_jumps` can read the sections again in the context `cx`, for example with
+    changed numbers.
     """
 
     cx: Context

@@ -192,7 +192,7 @@ def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 class JumpDecl:
     """A jump: a condition (`guard`) and new values of states (`resets`).
 
-    In a step at whose start the guard holds, the resets give the next values in place of the flow.
+    If the guard holds at the start of a step, the resets, not the flow, give the next values of their states.
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -222,9 +222,9 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
 
 
 def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
-    """Declare a bool state for every jump with `once`: true after the jump has happened.
+    """Declare a bool state for every jump with `once`; it is true once the jump has happened.
 
-    Returns assignments of their initial values, which are false.
+    Returns the assignments that set these states to false at the start.
     """
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):

@@ -53,7 +53,7 @@ class Rows:
         return self._drawn(torch.randn)
 
     def blank(self) -> Tensor:
-        """Zeros, (count,), for adding a constant so that it gets the shape of the random numbers."""
+        """Zeros, (count,). A constant that is added to them gets the shape of the random numbers."""
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
@@ -301,14 +301,14 @@ class InitialStates:
         return Diagnostic(code, message, self.decl.span, label, help=(advice,), note=note)
 
     def _rates(self) -> tuple[str, ...]:
-        """Return lines that state which share of proposed states meets each condition, the smallest first."""
+        """Return one line per condition with the share of proposed states that meet it, smallest first."""
         proposed = self._propose(RATED, torch.Generator().manual_seed(0))
         rates = self._each_holds(proposed).double().mean(1).tolist()
         told = sorted(zip(rates, self.decl.where_text, strict=True))
         return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """Return W601 if less than 1 % of the proposed states was accepted, else nothing."""
+        """Return W601 if less than 1 % of the proposed states were accepted, else an empty tuple."""
         if self.acceptance >= FEW:
             return ()
         message = f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`"
@@ -406,7 +406,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
 def _picked(count: int, rows: Rows) -> Tensor:
     """Return random indices from 0 to `count` - 1, (rows.count,).
 
-    They are drawn evenly: the numbers of times that two indices occur differ by at most one.
+    They are drawn evenly: any two indices occur equally often, or one of them once more than the other.
     """
     generator, device = rows.generator, rows.generator.device
     rounds = -(-rows.count // count)

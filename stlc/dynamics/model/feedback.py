@@ -7,9 +7,9 @@ An open-loop plan over a horizon cannot hold an unstable plant: for x' = 4 x + u
 
 where `v` is planned, so that rollouts, searches and gradients see a stabilised plant. `a` is the authority of
 the feedback, by default half the range of the actuator. The range of `v` is that of the actuator widened by
-`a` on both sides, so that every control remains available in every state. The gain of `lqr` is that of the
-linear-quadratic regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a long
-horizon.
+`a` on both sides, so that every control remains available in every state. With `lqr` the gain K is that of
+the linear-quadratic regulator for the linearised step (R. E. Kalman, 1960). It is computed by a Riccati
+recursion over a long horizon.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Linear:
     Attributes:
         a: A, (n, n).
         b: B, (n, m).
-        rest: (n,), change of the state in one step from (x0, u0).
+        rest: (n,), change of the state in one step from the state x0 under the control u0.
         scale: (n,), half the range of each moving state; 1 for a state without range.
         moving: names of the moving states.
     """
@@ -77,8 +77,8 @@ class Linear:
 def closed(decl: SystemDecl, request: FeedbackDecl) -> SystemDecl:
     """Return the declaration with the inner feedback that `request` describes.
 
-    Its controls then are deviations from the commands of the feedback. Raises NoFeedbackError: an unstable
-    mode is uncontrollable, or a control is an `angle`.
+    The controls of the result are deviations from the commands of the feedback. Raises NoFeedbackError if an
+    unstable mode is uncontrollable, or if a control is an `angle`.
     """
     turning = [control.name for control in decl.controls if control.squash == "angle"]
     if turning:
@@ -138,9 +138,10 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask (n,) of the moving states that have an influence on the change of a state.
+    """Mask (n,) of the moving states on which the change of some state depends.
 
-    The operating point is chosen such that these states stay constant.
+    The operating point is chosen such that these states stay constant. Any other state may drift, such as a
+    position in an open field.
     """
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
@@ -254,7 +255,7 @@ def riccati(a: Doubles, b: Doubles, q: Doubles, r: Doubles) -> Doubles:
 
 
 def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
-    """Return W602 if small errors grow more than tenfold over a horizon (`growth_of`), else nothing."""
+    """Return W602 if small errors grow more than tenfold over a horizon, else an empty tuple."""
     growth = growth_of(decl)
     if not growth > GROWING:
         return ()
@@ -274,7 +275,8 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 def growth_of(decl: SystemDecl) -> float:
     """Factor by which the fastest mode grows over a horizon, linearised at the operating point.
 
-    With an inner feedback it is that of the closed loop. Returns 1 if the factor cannot be computed.
+    If the declaration has an inner feedback, the factor is that of the closed loop. Returns 1 if the factor
+    cannot be computed.
     """
     feedback = decl.feedback
     try:

@@ -30,8 +30,8 @@ class Mirror:
     Applied twice, the map gives the original state.
 
     Attributes:
-        side: index of the column that tells a state from its mirror image. Of the two, the one with the
-            larger value is the representative: the state in which the policy is evaluated.
+        side: index of the column that tells a state from its mirror image. The state with the larger value in
+            this column is the representative of the two: the state in which the policy is evaluated.
     """
 
     def __init__(
@@ -63,8 +63,8 @@ class Mirror:
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map states (B, n) to their representatives (B, n).
 
-        Of a state and its mirror image, one is the representative. Returns the representatives, and a mask
-        (B,) of the states that were replaced by their mirror images.
+        The representative of a state is either the state itself or its mirror image (see `side`). Returns
+        the representatives, and a mask (B,) of the states that were replaced by their mirror images.
         """
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
@@ -72,7 +72,7 @@ class Mirror:
 
 
 def _applied(program: ArrayProgram, x: Tensor, names: Sequence[str]) -> Tensor:
-    """Return `x` (…, k) with the columns replaced that the program computes.
+    """Return `x` (…, k), in which the outputs of `program` replace the columns of the same names.
 
     `names` are the names of all k columns.
     """

@@ -25,8 +25,9 @@ class _Columns:
     """Values of a rollout of T steps while it is computed, for a batch of size B.
 
     Attributes:
-        states: name of a state -> its T+1 samples, or its initial value (B,) before these are computed.
-        now: name of any value -> its values at the T steps, (T, B), or (B,) if constant.
+        states: name of a state -> its samples, (T+1, B); before these are computed, its initial value, (B,).
+        now: name of a state, control or intermediate result -> its values at the T steps, (T, B), or (B,) if
+            they are constant.
     """
 
     states: Columns
@@ -176,8 +177,8 @@ class Stepper:
     def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
         """Roll out from states (B,) under controls (T, B), where T is `steps`; return state -> (T+1, B).
 
-        The tensors of states that do not move are expanded views. `switch` selects exact jumps or their
-        smooth blends.
+        If a state does not move, its tensor is an expanded view of the initial value. `switch` selects exact
+        jumps or their smooth blends.
         """
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}

@@ -1,9 +1,9 @@
 """Order in which the states and intermediate results of a step are computed in a rollout.
 
-Not all states need a loop over time. They are ordered by dependencies: a state that depends only on earlier
-ones is computed for all steps at once, a state to which a known increment is added is a cumulative sum, and
-only states that depend on themselves in another way are stepped in a loop. What is constant in that loop, or
-known for all steps, is computed before it.
+Not all states need a loop over time. States are ordered by dependencies. A state that depends only on earlier
+ones is computed for all steps at once. A state that changes by a known increment is a cumulative sum. Only
+states that depend on themselves in another way are computed in a loop over the steps. Values that are
+constant in that loop, or known for all steps, are computed before it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 @dataclass(frozen=True, slots=True)
 class RolloutStage:
-    """States and expressions that can be computed together once the earlier stages are.
+    """States and expressions that can be computed together after the earlier stages.
 
     Attributes:
         early: name -> expression computed for all steps at once, before the rest of the stage.
@@ -70,8 +70,8 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 class _StageWriter:
     """Builder of one stage: states and expressions that are computed together.
 
-    Groups of names that depend on each other are added one by one. A stage takes the groups at the same depth
-    of the dependency graph, so no group depends on another one of the stage.
+    A group consists of names that depend on each other. Groups are added one by one. A stage takes all groups
+    at the same depth of the dependency graph, so no group depends on another group of the stage.
     """
 
     def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:

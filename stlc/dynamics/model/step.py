@@ -29,9 +29,9 @@ class ModelStep:
 def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.
 
-    With `soft` a jump is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow` of its guard g;
-    otherwise it is an exact choice. Guards and resets read the state at the start of the step, limits
-    (`clamp`) are applied after each substep, and if two jumps set the same state the later one wins.
+    If `soft`, a jump with guard g is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow`; otherwise
+    it is an exact choice. Guards and resets read the state at the start of the step. Limits (`clamp`) are
+    applied after each substep. If two jumps set the same state, the later one wins.
     """
     writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}

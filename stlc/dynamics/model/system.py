@@ -79,8 +79,8 @@ class System:
     def truth(self) -> System:
         """The true system: this model with the model mismatch of the scenario applied.
 
-        Without a mismatch it is this system itself. With one, it has no parameters or timers of a
-        specification.
+        If the scenario has no mismatch, it is this system itself. Otherwise the result lacks the parameters
+        and timers that a specification adds.
         """
         real = truth(self.decl)
         return self if real is self.decl else System(real)
@@ -196,7 +196,7 @@ class System:
     def planned(self, x: Tensor, command: Tensor) -> Tensor:
         """Planned controls (B, m) for which the actuators receive `command` (B, m) in states (B, n).
 
-        This inverts `commanded` where the actuators' ranges allow it.
+        This is the inverse of `commanded`, except where the limits of the actuators take effect.
         """
         if self._commands is None:
             return command
@@ -424,7 +424,7 @@ class System:
 
     @cached_property
     def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
-        """Compiled programs of the two sums that `objective` returns; None in place of a sum that is None."""
+        """Compiled programs of the two sums that `objective` returns; None for a sum without terms."""
         states, controlled = (
             None if total is None else ArrayProgram({"cost": total}) for total in self.objective
         )

@@ -35,10 +35,11 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """Return the other files that a system file refers to: name -> path.
+    """Return the files that a system file refers to: name -> path.
 
-    These are the files that it extends, the files of its functions, and files of initial states. A file
-    below the folder of the system file is named by its path from there, any other file by its file name.
+    These are the files that the system file extends, the files of its functions, and files of initial states.
+    If a file is below the folder of the system file, its name is its path relative to this folder. Otherwise
+    its name is its file name.
     """
     home = decl.path.parent.resolve()
     named = [Path(base.name) for base in decl.bases]

@@ -1,9 +1,10 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
-`test: {uncertain: […]}` lists the uncertain constants. Without it, all constants and literals that `flow` and
-the resets of jumps compute with are uncertain, with two exceptions. A constant that a condition reads is
-exact: it is a place or a time (where a station is, when a light changes), not a property of the plant. A
-constant or literal in an exponent, an index or an argument of a function is exact: it is mathematics.
+`test: {uncertain: […]}` lists the uncertain constants. Without this list, all constants and literals in the
+arithmetic of `flow` and of the resets of jumps are uncertain, with two exceptions. A constant that a
+condition reads is exact: it is a place or a time (where a station is, when a light changes), not a property
+of the plant. A constant or literal in an exponent, an index or an argument of a function is exact, because it
+belongs to the mathematics.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
     """Return the names of the states whose next value depends on the column `factor`.
 
-    Their equation, or a guard or reset that sets them, reads the column.
+    The equation of such a state reads the column, or a jump that sets the state reads it (guard or reset).
     """
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
@@ -176,7 +177,7 @@ def _computed(node: ast.Node) -> tuple[str, ...]:
 
 
 class _UsedNumbers:
-    """Collector of the numbers that expressions compute with, and of the constants that conditions read.
+    """Collector of the numbers in the arithmetic of expressions, and of the constants in conditions.
 
     Attributes:
         names: declared names of the system file.

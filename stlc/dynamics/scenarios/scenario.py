@@ -76,8 +76,8 @@ def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> M
 def under(decl: SystemDecl, name: str) -> SystemDecl:
     """Return the declaration with the scenario called `name` applied.
 
-    Of the scenario, only the constants (`const`) change the model with which controls are planned. Its model
-    mismatch changes only the true system (`truth`).
+    The constants (`const`) of the scenario change the model with which controls are planned. Its model
+    mismatch does not: it changes only the true system (see `truth`).
 
     Raises UsageError (U101) if the scenario does not exist.
     """
@@ -88,8 +88,8 @@ def under(decl: SystemDecl, name: str) -> SystemDecl:
 def truth(decl: SystemDecl) -> SystemDecl:
     """Return the true system, which may differ from the model with which controls are planned.
 
-    It is the declaration `decl` with the model mismatch of its scenario. Without a mismatch it is `decl`
-    itself.
+    It is the declaration `decl` with the model mismatch of its scenario. If the scenario has no mismatch, it
+    is `decl` itself.
     """
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:

@@ -158,7 +158,7 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """Determine names, types and units of an expression by `resolve`, and return the result.
+        """Apply `resolve`, which determines names, types and units of an expression; return its result.
 
         Returns None if `resolve` reports an error. A result that reads a column without a value is reported
         (S202) and also gives None.
@@ -179,7 +179,7 @@ class Expressions:
         return found
 
     def _report(self, findings: Sequence[Diagnostic]) -> None:
-        """Report findings of the compiler; codes of specifications are replaced by those of system files."""
+        """Report findings of the compiler, with the error codes of system files, not of specifications."""
         self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     # --------------------------------------------------------------------- values
@@ -197,8 +197,8 @@ class Expressions:
     def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
         """Read a vector of length `size`; return its components, converted to `unit`.
 
-        A single number is repeated for all components; a single random number is drawn anew for each. Returns
-        None if the value is invalid. `where` names it in messages.
+        A single number is repeated for all components. If it is random, it is drawn separately for each
+        component. Returns None if the value is invalid. `where` names it in messages.
         """
         numbers = self.numbers(node, where)
         if numbers is None:

@@ -59,7 +59,7 @@ def each_number(entry: Entry, change: Callable[[Number], Number]) -> Entry:
 
 
 def base_name(column: str) -> str:
-    """Return the name of the vector that has this column as component; else the column's own name."""
+    """Return the name of a column without its index: `p` for the component `p[0]`, `x` for `x`."""
     return column.partition("[")[0]
 
 
@@ -109,7 +109,7 @@ class Names:
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """Record the source location of the component columns of a vector: that of the vector `name`."""
+        """Record that the component columns of the vector `name` are declared where the vector is."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 

@@ -22,8 +22,8 @@ _OPENING, _CLOSING = "([{", ")]}"
 class Reader:
     """Checked access to the values of a system file; collects findings (errors and warnings) about them.
 
-    A method that reads one value returns None if it has reported a finding; one that reads a mapping or a
-    list returns its valid entries.
+    A method that reads one value returns None if it has reported a finding. A method that reads a mapping or
+    a list returns its valid entries.
     """
 
     source: Source
@@ -48,8 +48,8 @@ class Reader:
     def add(self, *findings: Diagnostic) -> None:
         """Record findings, each once.
 
-        A finding is dropped if one with the same code, source location and message is recorded. An error in a
-        value that is used twice through a YAML anchor is thus reported once.
+        A finding is dropped if a finding with the same code, source location and message is already recorded.
+        Thus an error in a value that is used twice through a YAML anchor is reported once.
         """
         for finding in findings:
             tell(self.findings, finding)
@@ -152,7 +152,7 @@ class Reader:
     # ---------------------------------------------------------------------- scalars
 
     def wrong(self, node: Node, where: str, wanted: str, *help_: str) -> None:
-        """Report S103: the value `where`, at `node`, is not `wanted`.
+        """Report S103: the value named `where`, at `node`, is not `wanted`.
 
         `wanted` describes the accepted values, such as "a list".
         """
@@ -182,7 +182,7 @@ class Reader:
         return False
 
     def _valid(self, node: Node | None, where: str, wanted: str, value: V | None) -> V | None:
-        """Return `value`. If it is None, report that the value `where`, at `node`, is not `wanted`."""
+        """Return `value`. If it is None, report that the value named `where`, at `node`, is not `wanted`."""
         if node is not None and value is None:
             self.wrong(node, where, wanted)
         return value

@@ -88,9 +88,9 @@ def key(
 ) -> Any:
     """Make a field of a dataclass whose value is read from a key of a mapping in a system file.
 
-    The key is called `name`, by default as the field. `kind` is the kind of its values, and `about` their
-    meaning for the documentation; see `Key` for the others. With `shown=False` the field is left out of
-    comparison and `repr`, for values that only the reader uses.
+    The key is called `name`, or like the field if `name` is empty. `kind` is the kind of its values. `about`
+    is their meaning for the documentation. The other arguments are described in `Key`. If `shown` is False,
+    comparison and `repr` leave the field out, because only the reader uses its value.
     """
     described = Key("", name, kind, about, label, required, spread)
     options: Json = {"default_factory": dict} if isinstance(default, dict) else {"default": default}
@@ -137,8 +137,8 @@ def values_of(
 def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
     """Read a mapping into an object of the dataclass `record`.
 
-    A missing value is replaced by its default. So is an invalid one, which is reported. `of` names the
-    mapping in messages, and `label` is the form of the name of a value.
+    A missing value is replaced by its default. An invalid value is reported and replaced by its default. `of`
+    names the mapping in messages, and `label` is the form of the name of a value.
     """
     return record(**values_of(record, cx, node, of, label))
 
@@ -190,7 +190,7 @@ def number(low: float = 0.0) -> Kind:
 def word(options: Iterable[str]) -> Kind:
     """Return the kind of value that is one of the words in `options`.
 
-    If `options` are the names of a registry, they are looked up at each reading.
+    If `options` are the names of a registry, they are looked up anew each time a value is read.
     """
     return Kind(
         lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
@@ -233,7 +233,8 @@ def items_of(schema: Mapping[str, Any]) -> Json:
 def list_of(kind: Kind, label: str) -> Kind:
     """Return the kind of value that is a list of values of the kind `kind`.
 
-    It is read as a tuple of the valid items; `label` names an item in messages.
+    Such a list is read as a tuple. Invalid items are reported and left out. `label` names an item in
+    messages.
     """
 
     def items(cx: Context, node: Node, where: str) -> tuple[Any, ...]:

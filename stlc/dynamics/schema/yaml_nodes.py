@@ -1,8 +1,8 @@
 """YAML nodes with source locations, read strictly and safely.
 
-Built on the event stream of PyYAML: no object is ever constructed from a tag, aliases share one node instead
-of being copied, and depth and size are bounded while reading. Scalars stay text until the reader of a field
-interprets them, by the rules of YAML 1.2 (`1e-3` is a number, `on` and `yes` are words, `012` is twelve,
+The reader uses the event stream of PyYAML. No object is ever constructed from a tag, aliases share one node
+instead of being copied, and depth and size are bounded while reading. Scalars stay text until the reader of a
+field interprets them by the rules of YAML 1.2 (`1e-3` is a number, `on` and `yes` are words, `012` is twelve,
 `12:30` is a word).
 """
 
@@ -85,7 +85,7 @@ class Entry:
     def place(self, key: str) -> Span:
         """Source location of the value of `key` in the mapping that is this entry's value.
 
-        Without this key, it is the source location of the mapping.
+        If the mapping lacks this key, the source location of the mapping is returned.
         """
         node = self.value.get(key) if isinstance(self.value, Mapping) else None
         return self.value.span if node is None else node.span

@@ -50,7 +50,10 @@ class Setup:
 
     @property
     def enough(self) -> float:
-        """Robustness at which the search for a plan ends: a small share of gamma, at which training aims."""
+        """Robustness at which the search for a plan ends.
+
+        It is a small share of gamma, the robustness at which training aims.
+        """
         return TO_SPARE * self.task.system.decl.objective.gamma
 
 
@@ -63,8 +66,8 @@ class Rejected:
         plan: the policy's plans, (agents, T, m); finite.
         previous: remainders of the previous plans, (agents, T, m), or None.
         best: the best plans of the stages that have run, (agents,).
-        tried: plans that the previous stage judged and stored for the next one, by groups of agents; empty if
-            it stored none.
+        tried: plans that the previous stage judged and stored for the next stage, in groups of agents; empty
+            if no plans were stored.
     """
 
     x: Tensor

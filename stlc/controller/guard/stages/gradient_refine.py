@@ -2,9 +2,10 @@
 
 A gradient changes a whole plan at once, and a few steps repair most plans with a small violation. Gradients
 do not lead across an obstacle, so ascent starts from a batch: the policy's plan, the previous plan, and
-copies of these that are perturbed over an interval of time. If none of these satisfies, the best are
-perturbed and refined again, together with plans that hold each control at an end of its range. A repaired
-plan is moved back towards the policy's plan as far as the target robustness allows.
+copies of both that are perturbed over an interval of time. If no plan of the batch reaches the target
+robustness, the best plans are perturbed and refined again, together with plans whose controls are at the
+ends or middles of their ranges. A repaired plan is moved back towards the policy's plan as far as the target
+robustness allows.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 NEAR = 8
-"""Size of a round's batch: given plans and perturbations of them."""
+"""Number of plans in the batch of a round: given plans and perturbations of them."""
 FAR = 24
-"""Plans with controls at ends of their ranges, added to every later round."""
+"""Number of plans with constant pieces that are added to every later round."""
 KEPT = 2
-"""Number of best plans of a round, from which the next round starts or which are returned."""
+"""Number of best plans of a round; the next round starts from them, or they are returned."""
 STEPS = 30
 RATES = 0.1, 0.2, 0.2
 """Initial step size of each round, as a share of the control range; it falls to 0 at the last step."""
 SHARES = 8
 """Number of interpolation steps between the policy's plan and the repaired one."""
 SLOPE = 5.0
-"""Slope that replaces the derivative of a switching condition (straight-through estimator), per unit."""
+"""Slope, per unit, that replaces the derivative of a switching condition (straight-through estimator)."""
 STEEP = 1e100
 """Gradients of at least this magnitude are set to 0."""
 AGENTS = 256
@@ -64,7 +65,7 @@ class GradientAscent:
     Args:
         task: specification and system.
         generator: random numbers of the perturbations, which are drawn once.
-        enough: target robustness; the search for a state ends once one of its plans reaches it.
+        enough: target robustness; the ascent of an agent's plans ends once one of them reaches it.
     """
 
     def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
@@ -127,8 +128,8 @@ class GradientAscent:
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
         """Move repaired plans `found` back towards the policy's plans `own`, (agents, T, m) each.
 
-        Of `SHARES` points on the line between both, the nearest to `own` with the target robustness is
-        returned.
+        The line from `own` to `found` is divided into `SHARES` equal parts. Of the points on it, the one
+        nearest to `own` that reaches the target robustness is returned, (agents, T, m).
         """
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
@@ -187,12 +188,14 @@ class GradientAscent:
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        """Scaled robustness of plans per requirement, (rows, R), and a function for its gradient.
+        """Compute the robustness of plans per requirement, and a function that returns gradients.
 
         `x`: states, (rows, n). `u`: plans, (rows, T, m).
 
-        A robustness of NaN becomes -inf. The function maps weights (rows, R) to the gradient of the weighted
-        sum of the robustness values with respect to the plans (vector-Jacobian product), (rows, T, m).
+        Returns:
+            The robustness, (rows, R), multiplied by the weight of each requirement and divided by its scale;
+            NaN becomes -inf. The function maps weights w, (rows, R), to the gradient of the sum of w times
+            the unscaled robustness with respect to the plans, (rows, T, m).
         """
         if self._native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
@@ -211,10 +214,13 @@ class GradientAscent:
         return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
-        """Unscaled robustness per requirement, (rows, R), and a function for its gradient, computed by torch.
+        """Compute the robustness of plans in torch, and a function that returns gradients.
 
-        `x`: states. `u`: plans. The function maps weights (rows, R) to the gradient of the weighted sum of
-        the robustness values with respect to the plans, (rows, T, m).
+        `x`: states, (rows, n). `u`: plans, (rows, T, m).
+
+        Returns:
+            The unscaled robustness per requirement, (rows, R). The function maps weights (rows, R) to the
+            gradient of the weighted sum of robustness values with respect to the plans, (rows, T, m).
         """
         with torch.enable_grad():
             u = u.requires_grad_()
@@ -264,7 +270,7 @@ class GradientAscent:
 
 
 class GradientRefine(GuardStage):
-    """Guard stage: gradient ascent from the policy's and the previous plan, in half of the decision time."""
+    """Guard stage: gradient ascent from the policy's and the previous plan, in half of the time left."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 10}
 
@@ -277,7 +283,7 @@ class GradientRefine(GuardStage):
         return torch.ones_like(best.is_safe)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best refined plan of each agent; the two best are stored for the next stage."""
+        """Return the best refined plan of each agent; store its two best plans for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
         raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))

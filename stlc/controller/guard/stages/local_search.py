@@ -82,8 +82,8 @@ def climbed_from(
 def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
     """Starting plans for the agents with indices `rows`, (k, starts, T, m).
 
-    They are the plans that the previous stage stored if it did so for all agents; else the policy's plan and
-    the previous plan, if there is one.
+    If the previous stage stored plans for all agents, these are taken; else the policy's plan and, if there
+    is one, the previous plan.
     """
     if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
         order = rejected.tried[0].rows.argsort()

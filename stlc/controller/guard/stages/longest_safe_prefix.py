@@ -37,14 +37,14 @@ class LongestSafePrefix(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Of the plans that prefix shooting tried, the one with the longest safe prefix for each agent."""
+        """Return, for each agent, the plan with the longest safe prefix among those of prefix shooting."""
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
         return found.of(rows)
 
     def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
-        """Plans of prefix shooting for the agents `rows`: stored ones, or else recomputed ones."""
+        """Plans of prefix shooting for the agents `rows`; plans that were not stored are computed again."""
         missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
         missing[rows] = True
         for tried in rejected.tried:

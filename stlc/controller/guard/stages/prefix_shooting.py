@@ -1,11 +1,11 @@
 """Prefix shooting: sampled prefixes, continued by the policy (the paper, section "MPC-based Deployment").
 
 The lengths T0 = 1, 2, … are tried in turn. The prefixes of a length are all sequences of T0 actions on a grid
-of L values per control; these are M = L^(m T0), or a random sample if M is too large. Each prefix is applied
-from the present state, and the policy plans from its end. The first T0 is chosen at which a plan satisfies
-the specification, or at least the requirements tagged `@safety`. One addition to the paper (decision record
-37 in `docs/decisions`): the remainder of the previous plan is also a candidate, so that a safe plan is not
-lost after its first action.
+of L values for each of m controls. There are M = L^(m T0) such prefixes; if M is too large, a random sample
+is tried. Each prefix is applied from the present state, and the policy plans from its end. The search ends at
+the first T0 with which a plan satisfies the specification, or at least the requirements tagged `@safety`. One
+addition to the paper (decision record 37 in `docs/decisions`): the remainder of the previous plan is also a
+candidate, so that a safe plan is not lost after its first action.
 """
 
 from __future__ import annotations
@@ -50,11 +50,10 @@ class PrefixShooting(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """The best plan of each agent, from the shortest prefixes with which some plan is satisfying or safe.
+        """Return the best plan of each agent with the shortest possible prefix.
 
-        Prefixes (first actions of plans) of length T0 = 1, 2, … are tried in turn.
-
-        An agent for which no length gives a safe plan gets an unjudged one.
+        Prefixes (first actions of plans) of length T0 = 1, 2, … are tried in turn, until a plan satisfies the
+        specification or is at least safe. An agent without a safe plan at any length gets an unjudged plan.
         """
         deadline = Deadline() if self.patient else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
@@ -102,11 +101,11 @@ class PrefixShooting(GuardStage):
             yield group, found
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
-        """Let the policy plan from the end of each prefix, (M, T0, m), and judge the plans: (agents, M + 1).
+        """Let the policy plan from the ends of M + 1 prefixes, and judge the plans: (agents, M + 1).
 
-        The first prefix is that of the policy's own plan `own`, (agents, T, m). At most `grid.batch`
-        trajectories are computed at a time; for a single agent, the computation ends after a batch if the
-        deadline is over.
+        The first prefix consists of the first T0 actions of `own`, the policy's plans, (agents, T, m). The
+        others are `prefixes`, (M, T0, m). At most `grid.batch` trajectories are computed at a time. For a
+        single agent, the computation ends early, after a batch, if the deadline is over.
         """
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
