@@ -83,7 +83,10 @@ class Deployment:
 
 
 class InterruptedDeploymentError(Exception):
-    """Error that ends a deployment early; `recording`: the steps before it, None if there are none."""
+    """Error that ends a deployment early.
+
+    Its attribute `recording` holds the steps before the error; None if there are none.
+    """
 
     def __init__(self, recording: DeploymentRecording | None) -> None:
         super().__init__("the deployment ended early")

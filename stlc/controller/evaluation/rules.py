@@ -1,7 +1,8 @@
-"""Rules for closed-loop runs: a second specification, named by `test: {judge: …}`, and its verdicts.
+"""Rules for closed-loop runs, and their verdicts.
 
-The specification of the plans judges each plan over its window. A closed-loop run is judged once, from its
-first to its last sample, by the rules, which may use past operators and describe the world.
+The rules are a second specification, which a system file names by `test: {judge: …}`. The specification of
+the plans judges each plan over its horizon. In contrast, the rules judge a closed-loop run once, from its
+first to its last sample. They may use past operators and describe the world.
 """
 
 from __future__ import annotations
@@ -275,9 +276,9 @@ def judge_runs(
 
     Args:
         rules: specification for closed-loop runs.
-        task: supplies state names, time step and external functions.
-        recording: the runs.
-        viable: (rows,), whether a safe plan from the first state is known.
+        task: task that supplies state names, time step and external functions.
+        recording: the recorded runs.
+        viable: mask, (rows,), of the runs from whose first state a safe plan is known.
 
     Raises:
         SpecError: the rules use names that the system does not have.

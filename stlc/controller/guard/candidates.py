@@ -61,7 +61,7 @@ class Candidates:
     ) -> Candidates:
         """Judge plans (agents, …, T, m) from states (agents, n) float64.
 
-        `source` and `prefix_length` (see `Candidates`) are those of all plans. `cost`: whether to compute
+        `source` and `prefix_length` apply to all plans; see `Candidates`. `cost`: whether to compute
         performance costs.
         """
         shape, rows = plans.shape[:-2], plans.flatten(0, -3)

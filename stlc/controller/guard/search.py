@@ -168,7 +168,7 @@ class RelaxedSearch:
             start: starting plans, (k, T, m).
 
         Returns:
-            The entries of `rows` without a safe plan.
+            The entries of `rows` for which no safe plan was found.
         """
         if not len(rows):
             return rows

@@ -195,9 +195,9 @@ class Pace:
     """Measured durations in a run, and the number of steps that fit into its budget.
 
     A search round (validation) judges the policy's plans from new states, and starts a search for better
-    plans. The search runs concurrently with the steps. The next round waits until it ends. The durations of
-    searches and rounds are measured in units of one step, because all three change in proportion when the
-    machine becomes slower.
+    plans. The search runs concurrently with the steps. The next round waits for the end of the search, and so
+    does the end of training. The durations of searches and rounds are measured in units of one step, because
+    all of these durations grow by the same factor when the machine becomes slower.
     """
 
     def __init__(self, *, every: int, searching: bool, now: float, seconds: float = 0.0) -> None:

@@ -259,9 +259,10 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     """Diagnostic R404, which names requirements that no plan was found to satisfy together.
 
     If bounds prove that no plan satisfies some requirement, the first such requirement is named. Otherwise
-    the requirements are tested one after the other: a search tries to satisfy all of them but the tested one.
-    If it finds no plan, the tested requirement is removed, because the others already conflict. The
-    requirements that remain after all tests are named. The tests end early once `enough` returns True.
+    the requirements are tested one after the other. In a test, a search looks for a plan that satisfies the
+    remaining requirements except the tested one. If it finds none, the tested requirement is removed, because
+    the others already conflict. The requirements that remain after all tests are named. The tests end early
+    once `enough` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:

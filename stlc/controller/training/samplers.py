@@ -181,9 +181,9 @@ class Missions(Supply):
         return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
-        """Restart missions that are over or can no longer succeed, and some others whose plan fails.
+        """Restart missions that are over or can no longer succeed, and some missions whose plan fails.
 
-        `good` tells for each mission whether its present plan satisfies the specification, (POOL,).
+        `good`: mask of the missions whose present plan satisfies the specification, (POOL,).
         """
         given_up = ~good & (self._rand(len(good)) < GIVE_UP)
         ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
@@ -284,7 +284,7 @@ class ReplayBuffer:
 
     @property
     def bank(self) -> Tensor:
-        """Plans of all entries, (len, T, m)."""
+        """Plans of all entries of the buffer, (entries, T, m)."""
         return self.plans[: len(self)]
 
     def add(self, states: Tensor, plans: Tensor) -> None:
@@ -294,6 +294,6 @@ class ReplayBuffer:
         self.count += states.shape[0]
 
     def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw `n` entries with replacement: (n, dim), (n, T, m)."""
+        """Draw `n` entries with replacement; return their states (n, dim) and plans (n, T, m)."""
         index = torch.randint(len(self), (n,), generator=generator).to(self.states.device)
         return self.states[index], self.plans[index]

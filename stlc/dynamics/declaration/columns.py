@@ -367,7 +367,8 @@ def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
 def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
     """Read the keys of a parameter.
 
-    `r: normal(1 m, 0.1 m)` is short for `draw`; the unit of the parameter is then that of the expression.
+    `r: normal(1 m, 0.1 m)` is short for a mapping with the key `draw`; the parameter then has the unit of the
+    expression.
     """
     if isinstance(entry.value, Scalar):
         number = replace(cx.here, reader=Reader(cx.reader.source)).number(entry.value, "")

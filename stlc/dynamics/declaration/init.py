@@ -385,7 +385,10 @@ def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[flo
 
 
 def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
-    """Read the path of a file of initial states, relative to the system file; `names` are its columns."""
+    """Read the path of a file of initial states, relative to the system file.
+
+    `names` are the columns whose values the file gives. Returns None if the path is not a text.
+    """
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None

@@ -122,8 +122,8 @@ def component_texts(node: Node, size: int) -> tuple[str, ...]:
 def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
     """Read the value of one column, and check its unit.
 
-    The value of an enum is the name of a member, that of a bool a formula, and any other value a number.
-    Returns None if the value is invalid.
+    The value of an enum column is the name of a member. The value of a bool column is a formula. Any other
+    value is a number. Returns None if the value is invalid.
     """
     where = f"`{column.name}`"
     boolean, here = column.kind == "bool", cx.here

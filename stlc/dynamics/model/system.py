@@ -434,8 +434,8 @@ class System:
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
         """Two weighted sums of the performance terms, as expressions.
 
-        The first has the terms that read no control, the second those that read one. A sum without terms is
-        None.
+        The first sum has the terms that read no control, the second sum has the terms that read a control. A
+        sum without terms is None.
         """
         sums: list[ir.Num | None] = [None, None]
         given = commands(self.decl)

@@ -117,8 +117,8 @@ def values_of(
 ) -> dict[str, Any]:
     """Read and check the values of a mapping; return the valid ones, by name of the field of `record`.
 
-    `of` names the mapping in messages. `label` is the form of the name of a value in messages; it is used for
-    keys that declare no label of their own.
+    `of` names the mapping in messages. `label` is the pattern of a value's name in messages; `{name}` in it
+    stands for the key. The pattern is used for keys that declare no label.
     """
     keys = keys_of(record)
     found = cx.reader.fields(node, of, tuple(keys), [name for name, each in keys.items() if each.required])
@@ -138,7 +138,7 @@ def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = 
     """Read a mapping into an object of the dataclass `record`.
 
     A missing value is replaced by its default. An invalid value is reported and replaced by its default. `of`
-    names the mapping in messages, and `label` is the form of the name of a value.
+    names the mapping in messages, and `label` is the pattern of a value's name (see `values_of`).
     """
     return record(**values_of(record, cx, node, of, label))
 
