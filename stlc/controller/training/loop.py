@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 DEFAULT_BUDGET = 60.0
 BARREN_VALIDATIONS, BARREN_SHARE = 5, 0.1
-"""Training ends after this many validations and this share of the steps if no plan was ever found.
+"""If no plan was ever found, training ends after this many validations, but not before this share of steps.
 
 By then exploration has used its largest effort. If bounds prove that no plan exists, training ends at the
 first validation.
@@ -147,7 +147,7 @@ def resume(
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
 ) -> TrainingOutcome:
-    """Resume an interrupted run. With equal steps, an uninterrupted run has the same weights, bit for bit.
+    """Resume an interrupted run; its weights become the same as without the interruption, bit for bit.
 
     Args:
         folder: folder of the run.
