@@ -34,7 +34,7 @@ Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 def dump(compiled: Compiled, part: Part = "all") -> str:
     """Return the text of one part of a compiled specification.
 
-    The text depends on nothing but the specification and the time grid.
+    The same specification and time grid always give the same text.
     """
     blocks = ["\n".join(_head(compiled))]
     if part == "all":

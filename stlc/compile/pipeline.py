@@ -1,15 +1,16 @@
 """Compiler pipeline: the stages, in order. Read this module first.
 
     resolve   ast.Spec      -> typed.Spec                 names, types, units; time in seconds
-    place     typed.Formula -> typed.Formula              delays in samples, from here on for one time grid
+    place     typed.Formula -> typed.Formula              delays in samples of a time grid
     augment   typed.Formula -> typed.Formula, Timer…      mission time and the past become added states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
     horizon   ir.Formula    -> int                        lookahead
 
-`resolve_for` runs the first stage, `compile_resolved` the others, so that a monitor that learns the time grid
-later, or uses several grids, resolves the specification only once. `stlc.compile.backends.array.graph`
-evaluates the result. No stage needs torch.
+A time grid is a time step and a horizon. `resolve_for` runs the first stage, which needs no time grid.
+`compile_resolved` runs the others for one time grid. So a monitor that learns the time grid later, or uses
+several grids, resolves the specification only once. `stlc.compile.backends.array.graph` evaluates the result.
+No stage needs torch.
 """
 
 from __future__ import annotations
@@ -58,18 +59,19 @@ class CompiledRequirement:
 
     Attributes:
         name: name of the requirement.
-        doc: text of the `##` comment before it.
+        doc: text of the `##` comment before the requirement.
         tags: names of its tags without arguments (`safety`, `liveness`).
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
         formula: formula in negation normal form, with time in steps.
         lowered: formula before simplification, valid under every semantics.
         reach: lookahead in steps.
-        windowed: whether it mentions the horizon `T`, the length of a plan. If so, it must hold at each
-            sample with at least T samples after it; but if it is also `absolute`, at the first sample only.
-        uses_end: whether it has a window to the end of the trace.
-        absolute: whether it has an operator such as `always@[a, b]`, whose interval counts from the start of
-            the mission.
+        windowed: whether the requirement mentions the horizon `T`, the length of a plan. If so, the formula
+            must hold at each sample with at least T samples after it. But if `absolute` is True as well, the
+            formula must hold at the first sample only.
+        uses_end: whether the formula has a window to the end of the trace.
+        absolute: whether the requirement has an operator such as `always@[a, b]`, whose interval counts from
+            the start of the mission.
         alive: for training, state formula that holds while the requirement can still be satisfied after what
             happened earlier in the mission.
         span: place of the declaration in the source.
@@ -166,7 +168,7 @@ def compile_spec(
         spec: syntax tree of the specification.
         grid: time step and horizon, as far as known.
         interface: interface of the system; None: signals are as declared in the specification.
-        overrides: name of a constant -> text of the value that replaces its own.
+        overrides: text of the new value of a constant or parameter, by its name.
         purpose: "train", or "check" for judging recorded traces.
         end: for training, "truncate" cuts windows that extend beyond the end of a plan; "strict" refuses
             them.
@@ -288,9 +290,9 @@ class _Stage:
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
         """Rewrite a requirement without absolute operators and, for training, without past operators.
 
-        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission. A
-        recorded trace starts with the mission, so there the interval counts from the first sample. For
-        training, formulas over added states replace both kinds of operators.
+        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission. For
+        training, formulas over added states replace absolute operators and past operators. For a recorded
+        trace, which starts with the mission, the interval simply counts from the first sample.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

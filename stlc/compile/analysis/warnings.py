@@ -222,9 +222,10 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
-    """Return a text such as ": `x` is in [0, 5]", the ranges in `facts` of the signals in a formula.
+    """Return a text on the ranges of the signals in a formula, such as ": `x` is in [0, 5]".
 
-    The text is empty if `facts` contains none of the signals. `signature` gives the units of the signals.
+    Only ranges in `facts` are named; the text is empty if there are none. `signature` gives the units of the
+    signals.
     """
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
@@ -242,7 +243,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
 def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
     """Return W502 for a `@safety` requirement that no finite prefix of a trace violates, else None.
 
-    The message points to `tag`, the tag `@safety`, if it is given.
+    The message points to `tag`, the tag `@safety` in the source, unless `tag` is None.
     """
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):

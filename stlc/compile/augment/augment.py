@@ -38,8 +38,9 @@ class Augmented:
         formula: formula that every plan must satisfy.
         alive: formula over the current state that becomes false once the mission up to now has falsified the
             requirement.
-        goal: absolute formulas of the requirement (`always@[a, b] p` and its like, whose intervals count from
-            the start of the mission), joined by `and` and `or`; None if there are none.
+        goal: absolute formulas of the requirement, joined by `and` and `or`; None if there are none. An
+            absolute formula is, for example, `always@[a, b] p`, whose interval counts from the start of the
+            mission.
     """
 
     formula: typed.Formula

@@ -31,7 +31,8 @@ class _Guidance:
 
     Attributes:
         gap: violation of the goal, `max(-margin, 0)`, where the margin is the robustness of p.
-        left: steps until its deadline; `_DONE` if it is already met, `_LOST` if it can no longer be met.
+        left: steps until the deadline of the goal; `_DONE` if the goal is already met, `_LOST` if it can no
+            longer be met.
     """
 
     gap: ir.Num
@@ -69,12 +70,12 @@ def _guidance(goal: Goal) -> _Guidance | None:
 
 
 def _leaf(leaf: GoalLeaf) -> _Guidance | None:
-    """Return the violation of one goal and the time left for it; None if it has no deadline to come.
+    """Return the violation of one goal and the time left for it; None if the goal has no deadline ahead.
 
     The goal is an absolute formula: its interval counts from the start of the mission. The deadline of
-    `eventually@` and `until@` is the end of the interval, that of `always@` is its start. The violation is 0
-    once the formula is true or false, or once the interval of `always@` has begun. Recurring goals
-    (`always@[a, end] once[0, c] p`) have a deadline of their own, see `_recurring`.
+    `eventually@` and `until@` is the end of the interval. The deadline of `always@` is the start of the
+    interval. The violation is 0 once the formula is true or false, or once the interval of `always@` has
+    begun. Recurring goals (`always@[a, end] once[0, c] p`) have another deadline, see `_recurring`.
     """
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (recurring := _recurring(leaf)):
@@ -98,8 +99,9 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
 def _recurring(leaf: GoalLeaf) -> _Guidance | None:
     """Return the violation of a recurring goal and the time left for it; None for any other goal.
 
-    A recurring goal is `always@[a, end] once[0, c] p`. Its deadline is c after the last sample at which p
-    held.
+    A recurring goal is `always@[a, end] once[0, c] p`, or a conjunction such as
+    `always@[a, end] (once[0, c] p and once[0, d] q)`. The deadline of `once[0, c] p` is c after the last
+    sample at which p held.
     """
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
@@ -108,11 +110,14 @@ def _recurring(leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
-    """Return the violation of one part of a recurring goal and the time left for it.
+    """Return the violation and the time left of `part`, one item of a recurring goal.
 
-    A recurring goal is `always@[a, end] once[0, c] p`. Its past operator was rewritten before: `once[0, c] p`
-    is now `p or c - since >= 0`, where the timer `since` counts the steps since p last held. The result is
-    None if `part` does not have this form.
+    A recurring goal is, for example, `always@[a, end] (once[0, c] p and once[0, d] q)`; its items are
+    `once[0, c] p` and `once[0, d] q`. Timers have replaced the past operators: `part` is
+    `p or c - since >= 0`, where the timer `since` counts the steps since p last held. The result is None if
+    `part` does not have this form.
+
+    `leaf` is the recurring goal, with the states that the compiler adds for it.
     """
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
@@ -130,10 +135,10 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
 
 
 def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
-    """Return the violation and the time left of a conjunction of goals; `costs` are those of each goal.
+    """Return the violation and the time left of a conjunction of goals.
 
-    The violation is the sum of the violations of the goals with the earliest deadline. The time left is the
-    time until this deadline.
+    `costs` are the violation and the time left of each goal. The violation of the conjunction is the sum over
+    the goals with the earliest deadline. The time left is the time until this deadline.
     """
     if len(costs) == 1:
         return costs[0]
@@ -143,10 +148,10 @@ def _first_due(costs: Sequence[_Guidance]) -> _Guidance:
 
 
 def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
-    """Return the violation and the time left of a disjunction of two goals.
+    """Return the violation and the time left of a disjunction of two goals, `one` and `other`.
 
-    They are those of the goal with the smaller violation. A goal that can no longer be met is left out; a
-    goal that is already met has no violation.
+    The result is `one` or `other`, whichever has the smaller violation. A goal that can no longer be met is
+    passed over; a goal that is already met has the violation 0.
     """
     first = ir.BoolOp(
         "or",
@@ -169,7 +174,7 @@ def _not_lost(left: ir.Num) -> ir.Formula:
 def _margin(formula: ir.Formula) -> ir.Num | None:
     """Return the robustness of a state formula as a number, without its predicates on the clock and timers.
 
-    The result is None if the formula has no other predicates.
+    The result is None if the formula has only such predicates.
     """
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():

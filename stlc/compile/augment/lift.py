@@ -1,8 +1,9 @@
 """Moving absolute operators (`always@[a, b]`) out of the operators around them.
 
-The interval of an absolute operator counts from the start of the mission, so its truth is the same at every
-instant: `always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. Where this is
-impossible, training reports E307; on recorded traces absolute operators are evaluated where they stand.
+The interval of an absolute operator counts from the start of the mission. The truth of the operator is
+therefore the same at every instant: `always[0, T] (q -> always@[a, b] p)` is
+`eventually[0, T] q -> always@[a, b] p`. Where an absolute operator cannot be moved out, training reports
+E307. On recorded traces, absolute operators are evaluated where they stand.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 
 
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
-    """True if the window of `node` contains the present sample.
+    """True if the window of `node` contains the present sample; `interval` is the interval of `node`.
 
     A past window without the present sample may be empty; the truth of `node` then does not depend on its
     body.

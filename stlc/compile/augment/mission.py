@@ -87,14 +87,17 @@ Goal: TypeAlias = GoalLeaf | GoalBranch
 
 
 def last_step(formula: Absolute) -> int:
-    """Return the mission step at which the window of a formula ends; if it has no end, that of its start."""
+    """Return the mission step at which the window of a formula ends.
+
+    For a window without end, the result is the step at which the window begins.
+    """
     return formula.window.lo if formula.window.hi is None else formula.window.hi
 
 
 def mission_steps(goal: Goal) -> int:
     """Return the mission step at which the last window in a goal ends.
 
-    For a window without end, its start counts.
+    A window without end counts as if it ended where it begins.
     """
     if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
@@ -124,8 +127,8 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     """Return the next status of a formula whose status is open.
 
-    It is true or false if the current sample decides the formula, else open. `clock` is the mission clock
-    (steps since the start of the mission).
+    The next status is true or false if the current sample decides the formula, else open. `clock` is the
+    mission clock (steps since the start of the mission).
     """
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
@@ -165,8 +168,8 @@ def progress(goal: Goal, horizon: int) -> typed.Formula:
     """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal.
 
     The goal consists of absolute formulas (`always@[a, b] p`), joined by `and` and `or`. The result is
-    evaluated over the `horizon` steps of the plan. The status of each absolute formula (open, true or false)
-    stands for the time before the plan.
+    evaluated over the `horizon` steps of the plan. It reads the status of each absolute formula (open, true
+    or false), which sums up what happened before the plan.
     """
     match goal:
         case GoalBranch(op, items, span):

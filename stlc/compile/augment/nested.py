@@ -373,7 +373,10 @@ class _Writer:
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """Return a formula that holds up to step `step` of the mission; always, if `step` is None."""
+        """Return a formula that holds up to and including step `step` of the mission.
+
+        If `step` is None, the formula always holds.
+        """
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._table.clock(step + 1), self._span)

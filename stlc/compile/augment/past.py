@@ -45,13 +45,14 @@ _Op: TypeAlias = Literal["and", "or"]
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """Test `left >= right` between a timer (an added state) and a constant.
+    """Test `left >= right` between an added state and a constant, used in place of a past operator.
 
     Attributes:
-        left: the timer or the constant.
-        right: the constant or the timer.
+        left: the added state or the constant.
+        right: the constant or the added state.
         span: source location of the past operator.
-        later: growth of the timer per step of a plan: 1 for a count of steps, 0 for a truth value.
+        later: growth of the added state per step of a plan. It is 1 if the state counts steps, and 0 if the
+            state stores a truth value.
     """
 
     left: ir.Num
@@ -60,7 +61,7 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test in the form in which it can be an operand of `or`.
+        """Return the test for use in an `or`, as the replacement of a past operator.
 
         Its robustness is +inf where the test holds and -inf where it fails.
         """
@@ -69,7 +70,7 @@ class _Test:
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test in the form in which it can be an operand of `and`.
+        """Return the test for use in an `and`, as the replacement of a past operator.
 
         Where the test fails, its robustness is negative and finite: it is proportional to the number of steps
         that are missing until the test holds.
@@ -296,8 +297,9 @@ class Past:
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
         """Rewrite `p since[a, b] q`, with a > 0, in terms of windows that end now.
 
-        If `positive` is False, its negation is rewritten. The operator holds if `historically[0, a] p` holds
-        now, and `p since[0, b - a] q` held a ago.
+        `node` is the operator, `window` its interval in samples. If `positive` is False, the negation of
+        `node` is rewritten. The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q`
+        held a ago.
         """
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))
@@ -311,8 +313,9 @@ class Past:
     ) -> typed.Formula:
         """Rewrite `p since[a, end] q`, with a > 0, by means of a timer.
 
-        If `positive` is False, its negation is rewritten. `least` is a in samples. The timer starts at a
-        sample at which p and q hold. It counts steps while p holds, and is reset when p fails.
+        `node` is the operator, and `least` is a in samples. If `positive` is False, the negation of `node` is
+        rewritten, and `left` and `right` are the negations of p and q. The timer starts at a sample at which
+        p and q hold. It counts steps while p holds, and is reset when p fails.
         """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))

@@ -33,7 +33,7 @@ MISSING = 1000.0
 class Timer:
     """State that the compiler adds to those of the system.
 
-    It is called a timer, whatever its kind.
+    Such a state is called a timer, whatever its kind.
 
     Attributes:
         name: name of the state.
@@ -82,7 +82,7 @@ class TimerTable:
         return (*clocks, *self._known.values())
 
     def clock(self, latest: int) -> ir.Signal:
-        """Return the signal of the mission clock (steps since the start); it counts to `latest` at least."""
+        """Return the signal of the mission clock: steps since the start, counted to `latest` or further."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")
@@ -91,7 +91,7 @@ class TimerTable:
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
         """Return the signal of the state described by `draft`; add the state unless there is an equal one.
 
-        `update` is the function from the signal of the state to its value one step later.
+        `update` returns the value of the state one step later; its argument is the signal of the state.
         """
         key = (draft.kind, draft.initial, draft.high, update(ir.Signal("")))
         if key not in self._known:
@@ -126,12 +126,12 @@ def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """Return a formula that holds if `left >= right`, with finite robustness where it fails.
+    """Return a formula that holds if `left >= right`, with finite robustness where the formula fails.
 
-    The robustness is +inf where the formula holds. Where it fails, it is `-MISSING` times the number of steps
-    that are missing until it holds. This is less than the robustness of any other predicate. The maximum of
-    an `or` or `eventually` is therefore that of an operand that the plan can influence. The robustness is
-    finite, so that plans that all fail can still be ranked.
+    The robustness is +inf where the formula holds. Where the formula fails, the robustness is `-MISSING`
+    times the number of missing steps, `right - left`. This is less than the robustness of any other
+    predicate. So in an `or` or `eventually`, whose robustness is a maximum, the operands that the plan can
+    influence decide. The robustness is finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))

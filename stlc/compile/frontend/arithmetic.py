@@ -82,7 +82,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         scope: receives findings.
 
     Returns:
-        The converted numbers, and a number with the common unit, whose value the caller sets.
+        The converted numbers, and a template: the number 0 in the common unit. The caller replaces its value.
 
     Raises:
         Failed: the units do not agree (E203).
@@ -118,7 +118,7 @@ def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
 
 
 def rebased(number: Number, unit: Unit) -> Number:
-    """Return the same quantity in `unit`, whose zero point may differ: 20 degC becomes 293.15 K."""
+    """Return `number` converted to `unit`, whose zero point may differ: 20 degC becomes 293.15 K."""
     shift = number.unit.offset - unit.offset
     if not shift:
         return replace(number, unit=unit)
@@ -139,12 +139,12 @@ def rebased(number: Number, unit: Unit) -> Number:
 
 
 def absolute(number: Number) -> Number:
-    """Return the same quantity as a number in SI units without an offset: 20 degC is 293.15 K."""
+    """Return `number` in a unit without an offset: 20 degC becomes 293.15 K."""
     return rebased(number, number.unit.interval)
 
 
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
-    """Return the same quantity in `unit`, a unit of the same dimensions.
+    """Return `number` converted to `unit`, a unit of the same dimensions.
 
     `place` is the source location for the error.
 
@@ -206,10 +206,10 @@ def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> N
 def _units(
     function: Function, args: Sequence[Number], span: Span, scope: Scope
 ) -> tuple[tuple[Number, ...], Number]:
-    """Convert the arguments as the unit rule of the function (`Function.rule`) requires.
+    """Convert the arguments of a function as its unit rule (`Function.rule`) requires.
 
-    The result is the converted arguments, and a number with the unit of the function's result, whose value
-    the caller sets.
+    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
+    caller replaces its value.
     """
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
@@ -247,8 +247,8 @@ Agreed = tuple[tuple[Number, ...], Number]
 def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
     """Convert all arguments of a function to one unit (unit rule `same`).
 
-    The result is the converted arguments, and a number with the unit of the function's result, whose value
-    the caller sets.
+    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
+    caller replaces its value.
     """
     name, verb = function.name, _verb(function)
     if name in ("normal", "truncnorm"):
@@ -279,8 +279,8 @@ def _sense(args: Sequence[Number]) -> Sense:
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
     """True if the result of a function is a temperature difference.
 
-    This is so for a difference multiplied or divided by a plain number, and for a root or power whose result
-    is in kelvin, such as `sqrt(x)` with x in K^2. `unit` is the unit of the result.
+    This is so if a difference is multiplied or divided by a plain number. It is also so for a root or power
+    whose result is in kelvin, such as `sqrt(x)` with x in K^2. `unit` is the unit of the result.
     """
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
@@ -306,7 +306,10 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
     The common unit is kelvin if one of the numbers is a temperature difference. Otherwise it is the unit of
     the numbers that are not constant; if these have different units, or if all numbers are constant, it is
-    degC. The result is the converted numbers, and a number with the common unit, whose value the caller sets.
+    degC.
+
+    Return the converted numbers, and a template: the number 0 in the common unit. The caller replaces its
+    value.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -332,8 +335,8 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
     """Convert the operands of a sum or difference in which a temperature in degC takes part.
 
-    The result is the converted arguments, and a number with the unit of the function's result, whose value
-    the caller sets.
+    Return the converted operands, and a template: the number 0 in the unit of the result. The caller replaces
+    its value.
     """
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
@@ -358,9 +361,11 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
     """Convert the operands of `left - right`, where `right` is a temperature in degC.
 
-    The value is a difference. If `right` may itself be a difference (`Number.sense` is `open`), it may be a
-    temperature too. The result is the converted arguments, and a number with the unit of the function's
-    result, whose value the caller sets.
+    The result of the subtraction is a temperature difference. There is one exception: if it is open whether
+    `right` is a temperature or a difference (`Number.sense` is `open`), the result may be a temperature too.
+
+    Return the converted operands, and a template: the number 0 in the unit of the result. The caller replaces
+    its value.
     """
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
@@ -374,8 +379,10 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
     """Convert the arguments of `normal` and `truncnorm` to one unit.
 
-    Mean and bounds may be temperatures; the standard deviation is a difference. The result is the converted
-    arguments, and a number with the unit of the function's result, whose value the caller sets.
+    Mean and bounds may be temperatures; the standard deviation is a difference.
+
+    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
+    caller replaces its value.
     """
     middle, deviation, *ends = args
     places = [middle, *ends]
@@ -476,7 +483,7 @@ def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
 
 
 def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
-    """Return E203 for a number without a unit that may be in `unit` (degC) or in kelvin."""
+    """Return E203 for the number `bare`, which has no unit: it could be in `unit` (degC) or in kelvin."""
     text, kelvin = (bare.span or span).text, unit.interval
     help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
     message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
@@ -560,7 +567,7 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
 def _fold(function: Function, args: Sequence[Number], template: Number, scope: Scope) -> Number:
     """Compute a function of constants, and return its value as a number with the unit of `template`.
 
-    The value is exact if all arguments are exact and the function preserves this.
+    The value is an exact fraction if all arguments are exact and the function turns fractions into fractions.
 
     Raises:
         Failed: the function has no value for these arguments (E205).
@@ -656,7 +663,7 @@ def negated(number: Number, span: Span) -> Number:
 def half(span: Span) -> Number:
     """Return the number 1/2.
 
-    It is the threshold between neighbouring integers, and between the values 0 and 1 of a bool.
+    This is the threshold between neighbouring integers, and between `false` (0) and `true` (1).
     """
     return literal(Fraction(1, 2), span)
 

@@ -239,7 +239,8 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
     """Return `number`, one component of a vector, shifted in time by `delay`.
 
-    If the component is a choice between bools, its formula (`Number.formula`) is shifted too.
+    A number such as `if c then p else q`, with bools p and q, also has a form as a formula
+    (`Number.formula`). This formula is shifted too.
     """
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
@@ -263,7 +264,7 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
     A time is converted to samples later, when the time step is known.
 
     Raises:
-        Failed: the expression is neither (E205).
+        Failed: the expression is neither a number of samples nor a time (E205).
     """
     match value:
         case TimeExpr(end=False):
@@ -356,7 +357,7 @@ def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
 def count_arguments(name: str, call: ast.Call, least: int, most: int | None, scope: Scope) -> None:
     """Raise Failed (E105) if a call has fewer than `least` or more than `most` arguments.
 
-    If `most` is None, there may be any number of arguments from `least` on.
+    If `most` is None, the number of arguments has no upper limit.
     """
     given = len(call.args)
     if least <= given and (most is None or given <= most):
@@ -425,7 +426,11 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
 
 
 def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """Return `deg(angle)`, an angle as a plain number of degrees, or the inverse conversion `rad(number)`."""
+    """Return `deg(angle)` or `rad(angle)`; `name` is the name of the function.
+
+    `deg` converts an angle in radians to a plain number of degrees. `rad` converts a plain number of degrees
+    to radians.
+    """
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)
     (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)

@@ -20,7 +20,7 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Type that a value must have at its place in an expression, as texts for error messages.
+    """Description of the value that an operator or function needs, as texts for error messages.
 
     Attributes:
         who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".
@@ -34,7 +34,7 @@ class Expectation:
 
 
 def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """Return a value as a real, an integer or an enum member's number.
+    """Return a value as a number; a member of an enum becomes the number that stands for the member.
 
     Raises:
         Failed: the value is a formula or a bool (E202), or anything else that is no number (E205).
@@ -74,7 +74,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
 
 
 def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """Return a value as a formula; a bool signal becomes the formula that it is >= 1/2.
+    """Return a value as a formula; a bool signal `b` becomes the formula `b >= 1/2`.
 
     Raises:
         Failed: the value is neither a formula nor a bool (E201).
@@ -92,7 +92,9 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
 
 
 def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> ir.Formula:
-    """Return a value as a state formula, whose truth depends on one instant, in negation normal form.
+    """Return a value as a state formula: a formula whose truth depends on one instant only.
+
+    The result is in negation normal form: negations are pushed down to the predicates.
 
     Raises:
         Failed: the value is no formula (E201), or its truth depends on several instants (E202).

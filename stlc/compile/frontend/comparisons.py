@@ -87,8 +87,9 @@ def _pair(
 def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Predicate:
     """Return the predicate `big > small` (`strict`) or `big >= small`.
 
-    For integers the threshold is shifted by 1/2, halfway between whole numbers: rounding and ties then do not
-    matter, and the margin agrees with that of `==`.
+    Between integers, `a > b` becomes `a - 1/2 >= b`, and `a >= b` becomes `a + 1/2 >= b`. The threshold is
+    then halfway between two whole numbers. So rounding errors do not matter, and the margin agrees with that
+    of `==`.
     """
     written = _compared(big, small)
     if (big.kind, small.kind) == ("int", "int"):
@@ -108,8 +109,8 @@ def _pred(
 def _compared(*sides: Number) -> Unit:
     """Return the unit in which the robustness of a comparison is reported.
 
-    It is the unit of the first side that is not constant. If all sides are constant, it is that of the first
-    side. Sides without a unit are passed over if another side has one.
+    Sides without a unit are ignored if another side has a unit. Of the remaining sides, the first one that is
+    not constant gives the unit; if all are constant, the first one does.
     """
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
@@ -127,7 +128,7 @@ def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> Non
 def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
     """Return `left == right` for integers, bools or enums, with margin 1/2 - |left - right|.
 
-    Between formulas `==` means `<->`, and the margin is that of `<->`.
+    Between formulas, `==` means `<->`, and has the margin of `<->`.
 
     Raises:
         Failed: a side is real (E204) or has another type (E205).
@@ -147,7 +148,11 @@ def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Sc
 
 
 def _meet(side: Operand, other: Operand, scope: Scope) -> Number:
-    """Return one side of `==` as a number; an enum member gets its number in the enum of the other side."""
+    """Return `side`, one side of `==`, as a number.
+
+    If `side` is a member of an enum, it becomes the number of this member in the enum of `other`, the other
+    side.
+    """
     expr, value = side
     labels = other.value.labels if isinstance(other.value, Number) else ()
     if isinstance(value, Member) and labels:
@@ -179,7 +184,7 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
 
 
 def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
-    """Check that an enum is compared with the same enum, or with the number of one of its members.
+    """Check that a side with an enum type is compared with the same enum, or with the number of a member.
 
     Raises:
         Failed: the enums differ, or no member has this number (E205).

@@ -49,7 +49,7 @@ def check_names(entry: Definition, scope: Scope) -> None:
 
 
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
-    """Yield (name, whether it is called) of each free name in an expression.
+    """Yield each free name in an expression, and whether the name is called as a function.
 
     A name is not free if it is in `bound`, or if a quantifier or a `freeze` in the expression binds it.
     """
@@ -144,9 +144,10 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """Return the unit `text` that a declaration has in brackets; dimensionless if `text` is empty.
+    """Return the unit `text`, which a declaration gives in brackets, as in `[m/s]`.
 
-    W107 is reported for a name such as `temp` in coulombs (`[C]`).
+    If `text` is empty, the result is the unit of dimensionless numbers. W107 is reported for a name such as
+    `temp` in coulombs (`[C]`).
 
     Raises:
         Failed: the unit is unknown (E203).
@@ -187,8 +188,8 @@ def columns_of(
 ) -> tuple[Column, ...]:
     """Return the columns (name, unit, type, role) of a signal or parameter, one per component.
 
-    If there is a system, unit and range are those of its column of the same name. The declared range is added
-    later, by `ranged`.
+    If there is a system, each column gets the unit and range of the system's column of the same name. The
+    range that the file declares is added later, by `ranged`.
 
     Raises:
         Failed: the type is unknown (E101), or the system lacks the signal (E103) or declares it with another
@@ -301,8 +302,8 @@ def _ends(
 ) -> tuple[float | None, float | None] | None:
     """Return the least and greatest value of a declared range or set, in the unit of the column.
 
-    A value is None if the bound is `inf`. The result is None for a distribution, and for a set without
-    values.
+    The least or greatest value is None if the bound is `inf`. The whole result is None for a distribution,
+    and for a set without values.
     """
     if isinstance(domain, tuple):
         low, high = _stored(domain, column, unit, scope)
@@ -325,9 +326,9 @@ def ends_of(
 
 
 def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope) -> Iterator[float | None]:
-    """Yield the values of constant expressions in the unit of the column; None for `inf`.
+    """Yield the values of constant expressions in the unit of `column`; None for `inf`.
 
-    A number without a unit is in the declared `unit`.
+    A number without a unit is taken to be in `unit`, the declared unit, and then converted.
     """
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, TimeExpr) and value.end:
@@ -354,10 +355,10 @@ class Declared:
     """Declarations of a file.
 
     Attributes:
-        entries: entry of each named value (signal, constant, definition, function, enum member), by its name.
-        enums: (member, value) pairs of each enum, by its name.
-        columns: (declaration, columns without the declared range, declared unit) of each signal and
-            parameter.
+        entries: meaning of each declared name (signal, constant, definition, function, enum member), by name.
+        enums: (member, value) pairs of each enum, by the name of the enum.
+        columns: one tuple per signal and parameter: its declaration, its columns, its declared unit. The
+            columns do not yet have the declared range.
         broken: names with an invalid declaration, whose uses are not reported again.
     """
 
@@ -430,8 +431,8 @@ def _check_twice(spec: ast.Spec, scope: Scope) -> None:
 def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]], scope: Scope) -> None:
     """Record the declaration of `name` in `space`; report E102 if the name is already there.
 
-    `enum` is the enum of which the name is a member, "" for any other name. Different enums may have members
-    of the same name.
+    `space` contains the source location and the enum of each name recorded so far. `enum` is the enum of
+    which `name` is a member, "" for any other name. Different enums may have members of the same name.
     """
     if name not in space:
         space[name] = (span, enum)
@@ -523,7 +524,10 @@ def _about(item: ast.Item) -> str:
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """Return the value of a signal in the unit that the file declares, even if the system stores another."""
+    """Return the value of a signal converted to `unit`, the unit that the file declares.
+
+    The system may store the signal in another unit.
+    """
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value

@@ -1,7 +1,8 @@
 """Evaluation of expressions to values: the only recursion over the syntax tree.
 
-The other modules of the front end work on values. This one resolves names, expands macros (hygienically:
-arguments are values), unrolls quantifiers, and reports all independent errors.
+The other modules of the front end work on values. This one resolves names, expands macros, unrolls
+quantifiers, and reports all independent errors. The arguments of a macro are evaluated before it is expanded,
+so names in them cannot clash with names in the macro.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def _module(expr: ast.Expr, scope: Scope) -> Scope:
 def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of `if ... then ... else ...` between formulas, numbers or vectors.
 
-    The choice between two bools is both a number and a formula.
+    If both branches are bools, the result can be used as a number and as a formula.
 
     Args:
         expr: the expression.
@@ -121,9 +122,10 @@ def _choice_of_formulas(
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
-    """Return the number `if cond then yes else no`.
+    """Return the number `if cond then yes else no`; `branches` are the values of `yes` and `no`.
 
-    Between two bools the number also has a formula, the choice between both as formulas (`Number.formula`).
+    If both branches are bools, the number can also be used as a formula. `Number.formula` then holds
+    `(cond and yes) or (not cond and no)`.
     """
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
@@ -150,8 +152,8 @@ class Operation:
 
     Attributes:
         parts: function that returns the operands of a node in order.
-        value: function that computes the value of a node from the node, the values of its operands and the
-            scope.
+        value: function that computes the value of a node. Its arguments are the node, the values of the
+            operands, and the scope.
     """
 
     parts: Callable[[Any], Sequence[ast.Expr]]
@@ -243,10 +245,10 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
 def _refuse_products(
     expr: ast.Binary, sides: Sequence[Number | VectorValue], place: Span, scope: Scope
 ) -> None:
-    """Raise Failed (E205) for an operator that is not defined between a vector and its other operand.
+    """Raise Failed (E205) if an operator is not defined for its operands `sides`, one of them a vector.
 
-    Such operators are the sum or difference of a vector and a number, the product of two vectors, and `/`,
-    `%` or `^` with a vector on the right.
+    Examples are the sum or difference of a vector and a number, the product of two vectors, and `/`, `%` or
+    `^` with a vector on the right.
     """
     vectors = [isinstance(side, VectorValue) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
@@ -398,7 +400,7 @@ def _attr(expr: ast.Attr, scope: Scope) -> Value:
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
     """Return the value of a name that is declared in the file whose names are in `home`.
 
-    `scope` is that of the expression that uses the name; it receives the errors.
+    `scope` is the scope of the expression that uses the name. Errors are reported to `scope`.
 
     Raises:
         Failed: the name is not declared (E101), or stands for a function with arguments (E105).
@@ -426,8 +428,8 @@ def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
 def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
     """Return the value of a definition without arguments.
 
-    The value is computed once. At every use, at the source location `place`, the size of the definition
-    counts towards the limit on the size of expanded expressions.
+    The value is computed at the first use only. But every use adds the size of the definition to the size of
+    the expression around it, which is limited. `place` is the source location of the use.
     """
     if entry.name not in scope.cache:
         if entry.name in scope.open:
@@ -492,7 +494,7 @@ def _charge(cost: Cost, place: Span, scope: Scope) -> None:
 
 
 def _refuse_excess(place: Span, scope: Scope) -> None:
-    """Raise Failed if the expanded declaration exceeds the size limit.
+    """Raise Failed if a declaration is too large once its macros are expanded.
 
     E005 is reported once per declaration.
     """
@@ -603,7 +605,11 @@ def _timed(
 
 @cache
 def _expansion(op: str) -> ast.Expr:
-    """Return the definition of a temporal operator: a formula of `p` and `q`, without intervals."""
+    """Return the formula by which the temporal operator `op` is defined, in terms of `p` and `q`.
+
+    The formula has no intervals. If the operator has no definition, the formula is the operator itself:
+    `p until q`.
+    """
     plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
     return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))
 
@@ -691,8 +697,8 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
     """Return the frozen value of `number`, which a `freeze` binds to `name`.
 
-    The pair (unique name, number) is appended to `bindings`. A constant is returned unchanged, and nothing is
-    appended.
+    The pair (unique name, number in the IR) is appended to `bindings`. For a constant, the result is `number`
+    itself, and nothing is appended.
     """
     if number.constant is not None:
         return number

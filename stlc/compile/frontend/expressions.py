@@ -32,7 +32,10 @@ from stlc.units import Unit, nearest, same_dims
 
 @contextmanager
 def _raising(scope: Scope) -> Iterator[None]:
-    """Context for the evaluation of one expression: if it fails, `scope.error` is raised with its errors."""
+    """Context for the evaluation of one expression.
+
+    If the evaluation fails, an exception of the class `scope.error` is raised, with the errors found.
+    """
     before = len(scope.sink)
     try:
         with scope.meter.fresh():
@@ -101,14 +104,14 @@ def resolve_number(
 ) -> Number:
     """Return the value of an expression as one number.
 
-    The number is in SI units, counted from the zero of its unit: 20 degC is 20.
+    The number is in SI units, but counted from the zero of its own unit: 20 degC is 20, not 293.15.
 
     Args:
         expr: syntax tree of the expression.
         scope: names that the expression may use; findings are appended to `scope.sink`.
-        expected: column that stores the number, if any. The members of its enum are in scope; `true` is 1,
-            and a formula is 1 where it holds; a number without a unit takes the unit of the column, a number
-            in another unit is the error E203.
+        expected: column that stores the number, if any. The expression may then use the members of the
+            column's enum. `true` is 1, and a formula is 1 where it holds. A number without a unit takes the
+            unit of the column. A unit of other dimensions is the error E203.
         what: role of the number, for messages: "the flow of `x`".
 
     Raises:

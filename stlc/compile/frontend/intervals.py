@@ -184,7 +184,7 @@ def interval(
 
 
 def _sign(value: TimeExpr) -> int:
-    """Return -1 if a time is negative for every time step, 0 if it is zero, else 1."""
+    """Return -1 if a time is negative for every time step and horizon, 0 if it is zero, else 1."""
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0

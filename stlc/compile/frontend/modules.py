@@ -46,7 +46,7 @@ class Module:
 
 
 def load_modules(spec: ast.Spec) -> tuple[Module, ...]:
-    """Return the modules that `spec` imports; each contains those that it imports itself.
+    """Return the modules that `spec` imports, each with the modules that it imports in turn.
 
     Raises:
         SpecError: a file cannot be read or imports itself (E106), or has syntax errors.
@@ -94,10 +94,13 @@ class _Loader:
         self.found: dict[str, tuple[Module, ...] | SpecError] = {}
 
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
-        """Return the modules that one file imports.
+        """Return the modules that one file imports. Each file is read once.
 
-        `key` is the path of this file relative to the folder of the main specification, or `@std` for the
-        library. `around` is the chain of the keys of the files that import this file. Each file is read once.
+        Args:
+            spec: syntax tree of the file.
+            key: path of the file relative to the folder of the main specification, or `@std` for the library.
+            around: keys of the files through which this file is imported, from the main specification
+                inwards.
 
         Raises:
             SpecError: a file cannot be read or imports itself (E106), or has syntax errors.

@@ -31,10 +31,10 @@ def read_overrides(
 ) -> dict[str, ast.Expr]:
     """Return the expressions that `--set` gives to constants and parameters of a specification, by name.
 
-    Names of the system are skipped: its constants, states and parameters, and keys with a dot.
+    Overrides of the system are skipped: names of its constants, states and parameters, and names with a dot.
 
     Raises:
-        UsageError: U101, an unknown name, or a value that is not an expression.
+        UsageError: a name is unknown, or a value is not an expression (U101).
     """
     carried = set() if interface is None else {name.partition("[")[0] for name in interface.signature.names}
     systems = set() if interface is None else {*interface.constants, *carried}
@@ -132,8 +132,8 @@ def _even(
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
     """Return the distribution of each column, in the unit of the column.
 
-    If `expr` is a single number, such as `uniform(0, 1)`, it is drawn anew for each column. If it is a
-    vector, each component is the distribution of one column.
+    If `expr` is a single number, such as `uniform(0, 1)`, a new value is drawn for each column. If `expr` is
+    a vector, each component is the distribution of one column.
 
     Raises:
         Failed: the unit is not that of the column (E203), or the distribution depends on a signal (E205).
@@ -155,7 +155,7 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
 
 
 def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
-    """Return a drawn number in the unit that its column stores.
+    """Return a randomly drawn number in the unit in which its column is stored.
 
     Raises:
         Failed: the number depends on a signal (E205), or has another unit than the column (E203).
@@ -197,7 +197,7 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
 
 
 def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
-    """Return the parameters; those named in `values` get a constant in place of their distribution.
+    """Return all parameters; those named in `values` are fixed to a constant, and no longer drawn at random.
 
     A constant may be outside the declared range.
 
@@ -206,7 +206,7 @@ def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> t
         values: value of each parameter to be fixed, as text: `0.8 m`, or `[1 m, 2 m]` for a vector.
 
     Raises:
-        UsageError: U101, a value is not valid for its parameter.
+        UsageError: a value is not valid for its parameter (U101).
     """
     groups: dict[str, list[typed.Parameter]] = {}
     for each in parameters:
@@ -221,7 +221,7 @@ def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed
     """Return the components of one parameter (`group`), fixed to the value in `text`.
 
     Raises:
-        UsageError: U101, the value is not valid for the parameter.
+        UsageError: the value is not valid for the parameter (U101).
     """
     what = f"`{name}`"
     column = group[0].column

@@ -101,7 +101,10 @@ def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
 
 
 def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
-    """True if corner `k` can be cut off: it is convex, and its triangle contains no other corner."""
+    """True if corner `k` of a polygon can be cut off.
+
+    The polygon must be convex at this corner, and the triangle cut off must contain no other corner.
+    """
     a, b, c = (plain[left[i % len(left)]] for i in (k - 1, k, k + 1))
     if turn(a, b, c) <= 0:
         return False
@@ -171,8 +174,8 @@ def composed(
         opposite: function that returns the signed distance to the region of which a complement is taken; the
             sign is reversed afterwards. If `inner` returns the least distance along a segment, `opposite`
             returns the greatest, and vice versa.
-        margin: function from the margin by which a dilation grows its region to the number that is added to
-            the distance.
+        margin: function that returns the number to add to the distance if a region is dilated; its argument
+            is the margin of the dilation.
         span: source location of the expression.
         scope: receives findings.
     """
@@ -188,8 +191,8 @@ def composed(
 def _box(point: VectorValue, lower: VectorValue, upper: VectorValue, span: Span, scope: Scope) -> Number:
     """Return the signed distance to a box.
 
-    Inside the box, it is the distance to the nearest face. Outside, it is the Euclidean distance to the box
-    with a minus sign.
+    For a point inside the box, the result is the distance to the nearest face. For a point outside, the
+    result is minus the Euclidean distance to the box.
     """
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
@@ -229,8 +232,8 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
 def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, scope: Scope) -> Number:
     """Return twice the signed area of the triangle `start`, `end`, `point`.
 
-    The points may vary, unlike those of `turn`. The area is positive if `point` is left of the edge from
-    `start` to `end`.
+    Unlike in `turn`, the points may depend on signals. The area is positive if `point` is left of the edge
+    from `start` to `end`.
     """
     found = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
     assert isinstance(found, Number)

@@ -2,7 +2,8 @@
 
     ast.Spec --declare--> entries --evaluate--> typed.Spec
 
-Formulas keep their negations, implications and source locations; times stay in seconds, steps and horizons.
+Formulas keep their negations, implications and source locations. Times stay as written: in seconds, in steps,
+or as multiples of the planning horizon `T`.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
 
 
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
-    """Return the distinct columns of a file and its imports, and the components of their parameters.
+    """Return the columns and the parameters that a file and its imports declare, without duplicates.
 
     E104 is reported if two files declare a column differently, or if a file and the system disagree on how a
     parameter is drawn.
@@ -124,7 +125,10 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
 
 
 def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """Return a file with `facts`, the ranges that signals never leave, in its scope and in its imports."""
+    """Return a copy of `file` with `facts` in its scope, and in the scopes of all files that it imports.
+
+    `facts` are the ranges that signals never leave.
+    """
     files = tuple(with_facts(part, facts) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
@@ -208,7 +212,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 def _system_hints(interface: Interface | None) -> dict[str, str]:
-    """Return name -> hint to declare it, for each state and constant of the system."""
+    """Return a hint for each state and constant of the system, by its name: how to declare it in the file."""
     if interface is None:
         return {}
     found = {}
@@ -225,7 +229,10 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
 
 
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
-    """Give each override without a unit the unit of the constant that it replaces; change `found`."""
+    """Give each override without a unit the unit of the constant that it replaces.
+
+    The units are entered in `found`, which is changed in place.
+    """
     for item in spec.items:
         entry = found.entries.get(item.name)
         if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
@@ -371,7 +378,11 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """Return the warnings W502, W503 and W505 about a requirement."""
+    """Return the warnings W502, W503 and W505 about a requirement.
+
+    W502 reports a requirement with the tag `@safety` that no finite prefix of a trace violates. W503 reports
+    a requirement that is always satisfied, W505 a conjunction that is never satisfied.
+    """
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
     weak = safety_never_violated(requirement, tag)

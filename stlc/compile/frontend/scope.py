@@ -1,4 +1,4 @@
-"""Scope of name resolution: known names, findings, and limits on the size of expressions."""
+"""Scope of name resolution: known names, findings (errors and warnings), and limits on expression size."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_LEVELS = 120
 
 @dataclass(slots=True)
 class Cost:
-    """Size (number of nodes) and depth of an expression when fully expanded."""
+    """Size (number of nodes) and depth of an expression, with all macros and definitions expanded."""
 
     nodes: int = 0
     levels: int = 0
@@ -33,14 +33,14 @@ class Cost:
 
 @dataclass(slots=True)
 class Meter:
-    """Counter of the nodes of a declaration when fully expanded.
+    """Counter of the syntax nodes of a declaration, with all macros and definitions expanded.
 
     Each definition is evaluated once, but counted at every use.
 
     Attributes:
         nodes: number of nodes counted.
-        level: current nesting level.
-        deepest: greatest nesting level reached.
+        level: nesting depth of the node that is being evaluated.
+        deepest: greatest nesting depth reached.
         reported: whether the current declaration has been reported as too large.
     """
 
@@ -55,26 +55,29 @@ class Meter:
         return self.nodes > MAX_NODES or self.deepest > MAX_LEVELS
 
     def enter(self) -> None:
-        """Count a child node and enter it."""
+        """Count one more syntax node, which is one level deeper than the current node.
+
+        The new node becomes the current one.
+        """
         self.nodes += 1
         self.level += 1
         self.deepest = max(self.deepest, self.level)
 
     def leave(self) -> None:
-        """Return to the parent node."""
+        """Return to the parent of the current syntax node: one level up. The counted nodes are kept."""
         self.level -= 1
 
     def charge(self, cost: Cost) -> None:
-        """Add the cost of an expression that was evaluated before and is used again."""
+        """Add the size and depth (`cost`) of an expression that was evaluated before and is used again."""
         self.nodes += cost.nodes
         self.deepest = max(self.deepest, self.level + cost.levels)
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Context that measures the size of the expressions evaluated in it.
+        """Context that measures the size and depth of the expressions that are evaluated inside the context.
 
-        These expressions do not count towards the size limit. The yielded `Cost` is set when the context
-        ends.
+        These expressions do not count towards the size limit. The context yields a `Cost`, which is filled in
+        when the context ends.
         """
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
@@ -89,8 +92,8 @@ class Meter:
     def fresh(self) -> Iterator[None]:
         """Context in which the counted size of expressions starts again at zero.
 
-        It is entered for each declaration, since the size limit holds per declaration. The previous count is
-        restored at the end.
+        The context is entered once per declaration, since the size limit holds for each declaration alone.
+        The previous count is restored at the end.
         """
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
@@ -218,7 +221,7 @@ class Scope:
 
     @property
     def in_spec(self) -> bool:
-        """True in a specification, where `T`, `end` and `dt` are keywords."""
+        """True for a specification, in which `T`, `end` and `dt` are keywords; False for a system file."""
         return not issubclass(self.error, SystemFileError)
 
     @property
@@ -227,9 +230,9 @@ class Scope:
         return "E205" if self.in_spec else "S203"
 
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
-        """Return the scope with the further names `entries`.
+        """Return a copy of the scope with `entries` as additional names.
 
-        `samplers` sets whether random draws are allowed; None leaves this as it is.
+        `samplers` says whether random draws are allowed in the copy; None: as in this scope.
         """
         return replace(
             self,
@@ -248,7 +251,10 @@ class Scope:
         return replace(self, product=True, cache=broken, modules=modules)
 
     def report(self, finding: Diagnostic) -> None:
-        """Add a finding unless it was reported before, as for a macro that is used twice."""
+        """Add a finding, unless the same finding was reported before.
+
+        For example, an error in a macro is reported once, even if the macro is used twice.
+        """
         tell(self.sink, finding)
 
     def fail(self, finding: Diagnostic) -> NoReturn:
@@ -281,7 +287,8 @@ class Scope:
 def column_value(column: Column, origin: Origin | None = None) -> Number:
     """Return the value of a column as a number in SI units.
 
-    The number is counted from the zero of its unit: 20 degC is 20. `origin` is the declaration of the column.
+    The number is counted from the zero of its own unit: 20 degC is 20, not 293.15. `origin` is the
+    declaration of the column.
     """
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
@@ -340,7 +347,7 @@ def constant_entries(
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
     """Return the ranges that columns never leave, each in the unit of its column.
 
-    These are the ranges of bools and enums, and those that the column marks as enforced (`Column.fact`).
+    Bools and enums have such a range, and so does a column whose range is marked as enforced (`Column.fact`).
     """
     facts: dict[str, Bounds] = {}
     for column in columns:

@@ -2,7 +2,7 @@
 
 `sweep(p) in R` is the least signed distance along the segment to the region R; `sweep(p) not in R` is the
 least signed distance to its complement. Both are exact for balls, boxes, half-spaces and convex polygons. For
-a polygon that is not convex the sign is exact, and so is the value where it is not negative.
+other polygons, the sign is exact, and so is a value that is positive or 0.
 
 For an intersection of regions with exact distances, `in` is exact and `not in` is a lower bound. For a union
 of such regions, `not in` is exact and `in` is a lower bound.
@@ -77,7 +77,7 @@ class _Sweep:
         """Return the least or greatest (`which`) signed distance to a region along the segment.
 
         The distance is positive inside the region. The signed distance to a convex region is concave along
-        the segment, so it is least at an end.
+        the segment, so its least value is at one of the two ends.
         """
         match region:
             case Combined() | Dilated() | Complement():
@@ -129,10 +129,14 @@ class _Sweep:
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
         """Return the greatest signed distance of the segment to a convex region, positive inside.
 
-        `faces` are the signed distances of the start and the end of the segment to each face, positive
-        inside. If the segment enters the region, the result is its greatest depth below the faces (`_depth`).
-        Otherwise it is the greatest number in `outside`. These are signed distances of points of the segment;
-        the point nearest to the region must be among the points.
+        If the segment enters the region, the result is the greatest depth inside it (`_depth`). Otherwise, it
+        is the greatest number in `outside`.
+
+        Args:
+            faces: for each face of the region, the signed distances of both ends of the segment to the face,
+                positive inside.
+            outside: signed distances to the region of some points of the segment; the point that is nearest
+                to the region must be among them.
         """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
@@ -143,9 +147,11 @@ class _Sweep:
 
         `faces` are the signed distances of the start and the end of the segment to each face, positive
         inside. The depth of a point is its least distance to a face. By duality of linear programs, the
-        greatest depth is the least of two kinds of values. For each face: the greater of its distances to the
-        two ends of the segment. For each pair of faces whose distances have opposite slopes along the
-        segment: the distance at the point where the two distances are equal.
+        greatest depth is the least of the following values:
+
+        - for each face, the greater of its signed distances to the two ends of the segment;
+        - for each pair of faces whose distances change in opposite directions along the segment, the
+          distance at the point that is equally far from both faces.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]
@@ -222,7 +228,7 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Return the distance of the segment to every edge of a polygon, negative if it crosses the edge.
+        """Return the distance of the segment to each edge of a polygon, negative where they cross.
 
         The magnitude is the least of the distances from the ends of the segment to the edge and from the ends
         of the edge to the segment.
@@ -256,7 +262,7 @@ class _Sweep:
     def past(self, place: VectorValue) -> Number:
         """Return the least distance of the segment to the point `place`.
 
-        The point may itself move in a straight line between both samples.
+        The point itself may move in a straight line from its present position to that at the next sample.
         """
         now, then = (
             minus(end, there, self.span, self.scope)
@@ -286,7 +292,7 @@ class _Sweep:
         return Number(ir.Where(cond, yes.num, no.num), no.unit, no.flexible, span=self.span)
 
     def apply(self, name: str, *args: Number) -> Number:
-        """Apply a function in `stlc.compile.ir.functions.FUNCTIONS`."""
+        """Return the function `name` applied to `args`; see `stlc.compile.ir.functions.FUNCTIONS`."""
         return apply(name, args, self.span, self.scope)
 
     def negative(self, number: Number) -> Number:
@@ -295,7 +301,10 @@ class _Sweep:
 
 
 def _later(value: T) -> T:
-    """Return a number, vector or region at the next sample; at the last sample, return it unchanged."""
+    """Return `value`, a number, vector or region, at the next sample.
+
+    At the last sample of a trace, which has no next sample, the value is that of the last sample.
+    """
     match value:
         case Number():
             return replace(value, num=shifted(value.num, 1, clamped=True))

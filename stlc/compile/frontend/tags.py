@@ -91,8 +91,9 @@ class Tags:
     Attributes:
         marks: names of tags without arguments (`safety`, `liveness`).
         weight: factor of the robustness.
-        scale: divisor of the robustness. If it is a number that varies, the divisor is the greatest magnitude
-            of that number; if None (`@scale(auto)`), the greatest magnitude of the predicates' margins.
+        scale: argument of `@scale`, by which the robustness is divided. If the argument depends on signals,
+            the divisor is the greatest magnitude that the argument can have. None stands for `@scale(auto)`:
+            the divisor is the greatest magnitude of the predicates' margins.
         scale_span: source location of `@scale`.
         product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)`.
         id: text of `@id("…")`; "" without this tag.

@@ -26,24 +26,26 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """Scalar expression in SI units, counted from the zero of its unit: 20 degC is 20.
+    """Scalar expression in SI units, counted from the zero of its own unit: 20 degC is 20, not 293.15.
 
     A number in a unit with an offset (degC) is a temperature, as opposed to a temperature difference.
 
     Attributes:
         num: the number in the IR, in SI units whatever the scale of `unit`.
         unit: physical unit, for checks and messages.
-        flexible: whether the number agrees with any unit, since its own is unknown: no unit was declared, or
-            a factor is a number without a unit.
-        bare: whether the number consists only of numbers without a unit; it then takes the unit, with its
-            scale, that its place requires (`psi < 30`).
+        flexible: whether the number agrees with any unit. This is so if no unit was declared for it, or if
+            one of its factors has no unit.
+        bare: whether the number consists only of numbers without a unit. It then takes the unit that its
+            place requires, with the scale of this unit: in `psi < 30`, 30 means 30 deg if psi is in deg.
         exact: exact value of a rational constant, else None.
-        sense: `difference`: the difference of two temperatures, so not comparable with a temperature; `open`:
-            a temperature or a difference, since a varying number in kelvin was subtracted from a temperature,
-            or a temperature was scaled; "" otherwise.
+        sense: "difference" for the difference of two temperatures, which cannot be compared with a
+            temperature. "open" if the number may be a temperature or a difference: a varying number in kelvin
+            was subtracted from a temperature, or a temperature was multiplied or divided by a plain number.
+            "" otherwise.
         kind: type of the values; a `bool` is 0 or 1 and is also a formula, an `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
-        formula: for a choice between bools, the choice between formulas, with their margins; else None.
+        formula: for a number such as `if c then p else q` with bools p and q, the same choice as a formula,
+            with the margins of p and q. None for any other number.
         span: source location of the expression.
         origin: declaration of the name that stands for the number, if any.
     """
@@ -97,7 +99,7 @@ class TimeExpr:
     span: Span | None = field(default=None, compare=False, repr=False)
 
     def plus(self, other: TimeExpr, factor: int) -> TimeExpr:
-        """Return the sum of this time and `factor` times another; neither may be `end`."""
+        """Return `this time + factor * other`; neither time may be `end`."""
         return TimeExpr(
             self.seconds + factor * other.seconds,
             self.steps + factor * other.steps,
@@ -174,7 +176,7 @@ class Combined:
 
 @dataclass(frozen=True, slots=True)
 class Dilated:
-    """Region of the points within `margin` of another region; a negative margin shrinks it."""
+    """Region of the points within `margin` of another region; a negative margin shrinks this region."""
 
     region: Region
     margin: Number
@@ -195,7 +197,10 @@ Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region
 
 
 def is_formula(value: Value) -> bool:
-    """True if the value is a formula with a margin of its own, unlike a bool signal, whose margin is 1/2."""
+    """True if a value is a formula with a margin of its own.
+
+    The result is False for a bool signal: its formula only compares the signal with 1/2.
+    """
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 
@@ -207,7 +212,7 @@ def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
 
 
 def at(value: Value, span: Span) -> Value:
-    """Return a value with another source location; a formula keeps its own."""
+    """Return a value with the source location `span`; a formula keeps its own location."""
     return value if isinstance(value, typed.Node) else replace(value, span=span)
 
 

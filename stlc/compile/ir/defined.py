@@ -18,11 +18,11 @@ _Instants: TypeAlias = NDArray[np.int_]
 
 
 def defined(formula: ir.Formula, samples: int) -> Defined:
-    """Return a mask `(samples,)`: at which samples of a trace `formula` is defined.
+    """Return a mask `(samples,)` that is True at the samples of a trace at which `formula` is defined.
 
-    Windows of the future are not cut: a formula is undefined if its window extends beyond the last sample.
-    `prev`, `next` and `shift` are undefined if they read a sample outside the trace. A window "to the end" is
-    defined if it contains a sample.
+    Future windows are not cut: a formula is undefined if its window extends beyond the last sample. `prev`,
+    `next` and `shift` are undefined if they read a sample outside the trace. A window "to the end" is defined
+    if it contains a sample.
     """
     return fold(formula, _Definedness(samples))
 
@@ -40,10 +40,11 @@ class _Definedness(Analysis[Defined]):
         return np.ones(self.samples, dtype=bool)
 
     def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
-        """Return, per sample, whether the operands are defined at every instant at which they are read.
+        """Return a mask `(samples,)` that is True where all operands of an operator are defined.
 
-        `parts` are the masks of the operands; operand i is read at `offsets[i]`. If the window of the
-        operator is empty, no operand is read, and the result is True.
+        An operand must be defined at every instant at which the operator reads it. `parts` are the masks of
+        the operands; operand i is read at `offsets[i]`. If the window of the operator is empty, no operand is
+        read, and the result is True.
         """
         if all(each == ir.NOW for each in offsets):
             return reduce(np.logical_and, parts)

@@ -38,7 +38,7 @@ class Grid:
 
 
 def lacks(grid: Grid, formula: typed.Formula) -> bool:
-    """True if a formula needs a time step or a horizon, and this is unknown in the grid."""
+    """True if a formula needs a time step or a horizon that `grid` does not have."""
     return any(
         (time.seconds and grid.dt is None) or (time.horizons and grid.horizon is None)
         for time in _times(formula)

@@ -1,8 +1,8 @@
 """Table of built-in functions: one entry each, read by all parts of the compiler.
 
-An entry gives arity, units, implementations for numbers, arrays and C, derivative, and range. A function
-added here is available in the resolver, the array back ends, the C code with its gradients, interval
-arithmetic and the editors.
+An entry gives the number of arguments, their units, implementations for numbers, arrays and C, the derivative
+and the range. A function added here is available in the front end, the array back ends, the C code with its
+gradients, interval arithmetic and the editors.
 
 An `ir.Op` refers to an entry by its name. Functions that the front end rewrites to arithmetic (`REWRITTEN`)
 have no entry.
@@ -36,26 +36,26 @@ class Function:
     Attributes:
         name: name of the function in an `ir.Op`.
         least: smallest number of arguments.
-        most: largest number of arguments; None for any.
-        rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
-            `ratio`: the arguments agree, the result has no dimensions; `sign`: arguments of any unit, a
-            result without dimensions; `mul`, `div`, `pow`, `sqrt`, `square`: units are multiplied, divided, …
-            like the numbers.
-        kind: `operator`: written with a sign; `sampler`: draws random values, only in initial sets and
-            events; `function`: any other.
+        most: largest number of arguments; None if there is no limit.
+        rule: units of arguments and result. `same`: arguments and result have one unit. `plain`: neither has
+            dimensions. `ratio`: the arguments have one unit, the result has no dimensions. `sign`: the
+            arguments have any unit, the result has no dimensions. `mul`, `div`, `pow`, `sqrt`, `square`:
+            units are multiplied, divided, … like the numbers.
+        kind: `operator` for a function that is written with a sign; `sampler` for a function that draws
+            random values, only in initial sets and events; `function` for any other.
         doc: one sentence for editors; "" for operators.
         fold: Python function that computes the value for constant arguments (exactly for `Fraction`s if
             `exact`); None for samplers.
         array: function that appends the array operations for the function to a tape
-            (`stlc.compile.backends.array.tape`), a list of such operations, and returns the result; None: the
-            kernel of the same name of the array library is called.
-        numpy: name of the kernel in NumPy; "" if `NumpyOps` defines the kernel itself.
-        torch: name of the kernel in torch; "" if `TorchOps` defines the kernel itself.
+            (`stlc.compile.backends.array.tape`), a list of such operations, and returns the result. If it is
+            None, the function of the same name of the array library is called.
+        numpy: name of the function in NumPy; "" if `NumpyOps` defines the function itself.
+        torch: name of the function in torch; "" if `TorchOps` defines the function itself.
         c: function from the C expressions of the arguments to the C expression of the result; for `min` and
             `max`, of two arguments.
         slopes: function from the C expressions of the result and of the arguments to the C expressions of the
-            derivatives, one per argument. `SHARED` for `min`, `max` and `clip`: equal operands share the
-            derivative.
+            derivatives, one per argument. `SHARED` for `min`, `max` and `clip`, where operands that are equal
+            share the derivative.
         of_each: for a function without `c` and `slopes`: name of the function applied to every argument, and
             name of the function that reduces the results (`norm1` is `abs`, then `add`).
         bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
@@ -185,7 +185,7 @@ def _function(
     bounds: RangeRule | Bounds | None = None,
     **rest: Any,
 ) -> Function:
-    """Return the entry of a function with one argument per slope.
+    """Return the table entry of a function with one argument per slope.
 
     Args:
         name: as in `Function`.
@@ -193,9 +193,9 @@ def _function(
         rule: as in `Function`.
         fold: as in `Function`.
         c: C expression of the result, in the arguments `{0}`, `{1}`, ….
-        slopes: one C expression per argument: the derivative with respect to it, in the arguments `{0}`,
-            `{1}`, … and the result `{r}`.
-        bounds: as in `Function`; None: the function is monotone in each argument.
+        slopes: one C expression per argument, for the derivative of the result with respect to this argument.
+            The expression may use the arguments `{0}`, `{1}`, … and the result `{r}`.
+        bounds: as in `Function`. If it is None, the function is monotone in each argument.
         **rest: other attributes of `Function`.
     """
     return Function(
@@ -213,10 +213,11 @@ def _function(
 
 
 def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) -> Function:
-    """Return the entry of an operator; `symbol` is the sign with which it is written.
+    """Return the table entry of an operator; `symbol` is the sign with which it is written.
 
-    If no NumPy function is given for the operator (`numpy`), the array back ends keep their own list of
-    operations, the tape. They call the method of the tape that has the operator's name.
+    The array back ends compute the operator with the method `name` of a tape, which is a list of array
+    operations (`stlc.compile.backends.array.tape`). If `flags` contains `numpy`, the name of a NumPy
+    function, the array back ends call this function instead.
     """
     flags = {"kind": "operator", "exact": True, "whole": True, **flags}
     if "numpy" not in flags:
@@ -225,7 +226,7 @@ def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) 
 
 
 def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """Return the entry of a step function with whole values, such as `floor`; its slope is 0.
+    """Return the table entry of a step function with whole values, such as `floor`; its slope is 0.
 
     `kernel` is the name of the function in NumPy.
     """
@@ -234,7 +235,7 @@ def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, ru
 
 
 def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
-    """Return the entry of a smooth function of one argument.
+    """Return the table entry of a smooth function of one argument.
 
     `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`. `kernel` is the
     name of the function in NumPy, if it differs from `name`.
@@ -244,9 +245,10 @@ def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str 
 
 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
-    """Return the entry of a function of one or more arguments.
+    """Return the table entry of a function of one or more arguments, such as `min`.
 
-    Scaling all arguments by a positive factor scales the result by that factor (`Function.linear`).
+    Its arguments have one unit, which is that of the result. Scaling all arguments by a positive factor
+    scales the result by that factor (`Function.linear`).
     """
     return Function(name, 1, None, "same", doc=doc, fold=fold, bounds=bounds, linear=True, **rest)
 

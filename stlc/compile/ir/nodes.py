@@ -34,8 +34,8 @@ class Signal:
 class ShiftedSignal:
     """Value of a signal `steps` samples later (negative: earlier).
 
-    Outside the trace the value, and every predicate that reads it, is undefined; a `clamped` signal repeats
-    its first or last sample there.
+    Outside the trace, the value is undefined, and so is every predicate that reads it. A `clamped` signal has
+    a value there: that of its first or last sample.
     """
 
     name: str
@@ -62,9 +62,9 @@ class Op:
 class Indicator:
     """Number that is 1 where a state formula holds, else 0.
 
-    In training it is smoothed by `stlc.compile.semantics.switch`: `sharpness` is the factor w in `(1 + tanh(w
-    rho)) / 2` (Meng and Fan 2023, Eq. 6), where rho is the margin of the formula; None: the default of the
-    switch that evaluates it.
+    In training, it is smoothed to `(1 + tanh(w rho)) / 2` (Meng and Fan 2023, Eq. 6). Here rho is the margin
+    of the formula, and w is `sharpness`. If `sharpness` is None, w is the default of the switch that
+    evaluates the number (`stlc.compile.semantics.switch`).
     """
 
     cond: Formula
@@ -82,10 +82,10 @@ class Where:
 
 @dataclass(frozen=True, slots=True)
 class Extern:
-    """Component number `output` of the result of a function that the system provides.
+    """One component of the result of a function that the system provides.
 
-    `function` is a callable that maps arrays to all components, or the body of the function in the IR; None
-    if the function is not loaded.
+    `output` is the index of the component. `function` is a callable that maps arrays to all components, or
+    the body of the function in the IR; None if the function is not loaded.
     """
 
     name: str
@@ -130,8 +130,8 @@ class Offsets(NamedTuple):
     """Instants at which an operator reads an operand, in samples relative to now; both ends are included.
 
     Attributes:
-        first: least offset, negative in the past; None: from the start of the trace.
-        last: greatest offset; None: to the end of the trace.
+        first: least offset, negative in the past; None if the operand is read from the start of the trace on.
+        last: greatest offset; None if the operand is read up to the end of the trace.
     """
 
     first: int | None
@@ -145,8 +145,8 @@ class Operator:
     """Base of formulas whose value follows from the values of their operands at instants relative to now.
 
     Attributes:
-        names: names of two dual operators: the one that takes the minimum (over its window), then the one
-            that takes the maximum.
+        names: names of two dual operators. The first takes the minimum (over its window), the second the
+            maximum.
     """
 
     __slots__ = ()
@@ -163,9 +163,10 @@ class Operator:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Window of a temporal operator in steps lo..hi, both included; `hi` None: to the end of the trace.
+    """Window of a temporal operator, from `lo` to `hi` steps from now, both included.
 
-    The steps are counted from now; for past operators they are counted backwards.
+    For past operators, the steps are counted backwards. If `hi` is None, the window extends to the end of the
+    trace (for past operators, to its start).
     """
 
     lo: int
@@ -212,8 +213,8 @@ class Predicate:
     """Predicate with robustness `sign * num`; true iff the robustness is > 0 (`strict`) or >= 0.
 
     Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a predicate on
-    clocks and timers: its robustness is +inf or -inf, so it decides whether an enclosing formula holds, but
-    not by how much.
+    clocks and timers, states that the compiler adds to count time. Its robustness is +inf or -inf, so it
+    decides whether an enclosing formula holds, but not by how much.
     """
 
     num: Num
@@ -263,7 +264,10 @@ class PastTemporal(Windowed):
 
 @dataclass(frozen=True, slots=True)
 class Until(Windowed):
-    """Until: sup over t' in the window of min(right(t'), inf over [t, t'] of left); `release` is its dual."""
+    """Until: sup over t' in the window of min(right(t'), inf over [t, t'] of left).
+
+    The dual of `until` is `release`.
+    """
 
     names: ClassVar = ("release", "until")
     op: Literal["until", "release"]
@@ -312,8 +316,9 @@ class Shift(Operator):
     Attributes:
         steps: number of samples.
         body: formula.
-        outside: truth where that sample lies outside the trace. None: undefined, like a window that leaves
-            the trace. False: used by `rise` and `fall` at the first sample.
+        outside: truth of the node where that sample lies outside the trace. None leaves it undefined there,
+            like a window that leaves the trace. `rise` and `fall` are rewritten with False: they never hold
+            at the first sample.
         span: source location.
         weak: whether the node results from a negation. Where windows are cut at the end of the trace
             (`truncate`), an undefined value counts as true if `weak` is True, and as false if it is False.

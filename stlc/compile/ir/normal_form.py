@@ -25,10 +25,10 @@ def flip(sign: Sign) -> Sign:
 
 
 def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
-    """Return `formula` if `sign` is 1, or its negation if -1, in terms of `and`, `or` and temporal operators.
+    """Return `formula` if `sign` is 1, or its negation if -1, with negations pushed down to the leaves.
 
     The result has a `not` only before predicates, `since`, `rise`, `fall`, `prev`, `next`, and `Recalled`
-    nodes (past operators rewritten with timers).
+    nodes (past operators rewritten with timers). `->`, `<->`, `xor` and `unless` are expanded.
     """
     op = getattr(formula, "op", "")
     match formula:
@@ -79,7 +79,7 @@ def _unless(node: typed.Until) -> typed.Formula:
 
 
 def condition(formula: typed.Formula, *, negated: bool = False, flat: bool = False) -> ir.Formula:
-    """Return a state formula as a condition of the IR, simplified where an operand is constant.
+    """Return a state formula as a condition of the IR, simplified where an operand is `true` or `false`.
 
     Args:
         formula: a state formula (`stlc.compile.ir.traverse.is_state`): its truth depends on one instant.

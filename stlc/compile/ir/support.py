@@ -42,10 +42,10 @@ class Analysis(ABC, Generic[V]):
 
     @abstractmethod
     def at_start(self, body: V) -> V:
-        """Value of an `ir.AtStart`, which reads a formula with the value `body` at the first sample."""
+        """Value of an `ir.AtStart` node; `body` is the value of its operand at the first sample."""
 
     def shift(self, body: V, node: ir.Shift) -> V:
-        """Value of the `ir.Shift` `node`, which reads a formula with the value `body` at another sample."""
+        """Value of the `ir.Shift` node `node`; `body` is the value of its operand, read at another sample."""
         return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
@@ -84,20 +84,21 @@ class Reach(NamedTuple):
 def reach(formula: ir.Formula) -> Reach:
     """Return how many samples before and after now a formula requires (lookback and lookahead).
 
-    A window to the end of the trace requires only its start. The interval of an operator such as `always@[a,
-    b]` counts from the first sample, wherever the operator stands; its end counts as lookahead.
+    A window to the end of the trace requires only its first sample. The interval of an operator such as
+    `always@[a, b]` counts from the first sample of the trace, wherever the operator stands; the end of the
+    interval counts as lookahead.
     """
     past, future, clocked = fold(formula, _REQUIRED)
     return Reach(past, max(future, clocked))
 
 
 def reach_of(num: ir.Num) -> Reach:
-    """Return how many samples before and after now a number needs in order to be defined."""
+    """Return how many samples before and after now a numeric expression needs in order to be defined."""
     return _offsets([leaf.steps for leaf in _shifts(num) if not leaf.clamped])
 
 
 def farthest(num: ir.Num) -> Reach:
-    """Return how many samples before and after now a number reads.
+    """Return how many samples before and after now a numeric expression reads.
 
     Unlike `reach_of`, this includes signals that repeat their first or last sample outside the trace
     (`clamped`).
@@ -141,8 +142,8 @@ class _Required(Analysis[_Needs]):
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
         """Return the lookback, lookahead, and lookahead from the first sample that an operator requires.
 
-        They are those of its operands (`parts`), moved by the offsets at which the operands are read. A
-        window without end requires only the sample nearest to now.
+        The values of the operands are in `parts`. They are moved by the offsets at which the operator reads
+        its operands. A window without end requires only the sample nearest to now.
         """
         past = future = clocked = 0
         for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):
@@ -181,7 +182,7 @@ _REQUIRED, _HISTORY = _Required(), _History()
 
 
 def columns_of(num: ir.Num) -> frozenset[str]:
-    """Return the names of the signals that a number reads, at any sample."""
+    """Return the names of the signals that a numeric expression reads, at any sample."""
     read = {leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
     return frozenset(read - {ir.ELAPSED})
 
@@ -192,9 +193,9 @@ def columns(formula: ir.Formula) -> frozenset[str]:
 
 
 def depends_on_ends(num: ir.Num) -> bool:
-    """True if a number depends on where the trace begins or ends.
+    """True if a numeric expression depends on where the trace begins or ends.
 
-    This is so if a signal in it repeats its first or last sample outside the trace (`clamped`).
+    This is so if a signal in the expression repeats its first or last sample outside the trace (`clamped`).
     """
     return any(leaf.clamped for leaf in _shifts(num))
 
@@ -202,8 +203,9 @@ def depends_on_ends(num: ir.Num) -> bool:
 def uses_end(formula: ir.Formula) -> bool:
     """True if a formula depends on where the trace ends.
 
-    This is so if a future window extends to the end of the trace, or if a number repeats the last sample
-    beyond the end. `sweep`, the motion between samples, reads such numbers.
+    There are two cases. A window of the formula may extend to the end of the trace. Or a numeric expression
+    may read a signal after the last sample, where the last sample is repeated; `sweep`, which reads the next
+    sample, is rewritten to such expressions.
     """
     windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
     endless = any(node.window.hi is None and not node.back for node in windowed)
@@ -218,15 +220,18 @@ def uses_end(formula: ir.Formula) -> bool:
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
     """Return an instant from which on the robustness of a formula is constant, +inf or -inf.
 
-    The result is None if no such instant is known. The trace is open: the values beyond its last sample are
-    unknown. For bounds on the robustness, all predicates there count as +inf, or all as -inf. Most formulas
-    are therefore constant from some instant on. An operator with a window far beyond the last sample then
-    needs to read only one of these instants.
+    The trace is open: it continues, but its values beyond the last known sample are unknown. To bound the
+    robustness, all predicates there count as +inf, or all as -inf. Most formulas are therefore constant from
+    some instant on. An operator whose window extends far beyond that instant needs to read only one instant
+    of this constant part.
 
     Args:
         formula: formula in negation normal form.
         samples: number of known samples.
         length: assumed length of the whole trace in samples; windows to the end of the trace end there.
+
+    Returns:
+        The instant, counted in samples from the start of the trace; None if no such instant is known.
     """
     return fold(formula, _Tail(samples, length))
 
@@ -246,9 +251,10 @@ class _Tail(Analysis[int | None]):
     def over(self, parts: Sequence[int | None], offsets: Sequence[ir.Offsets]) -> int | None:
         """Return an instant from which on an operator is constant, or None if none is known.
 
-        `parts` are these instants for the operands; operand i is read at `offsets[i]`. From the returned
-        instant on, the operator reads its operands only where they are constant, or its window is empty. If
-        the window begins at the start of the trace, it must contain all instants at which its operand varies.
+        `parts` are the instants from which on the operands are constant; operand i is read at `offsets[i]`.
+        From the returned instant on, the operator reads its operands only where they are constant, or its
+        window is empty. There is one exception: a window that begins at the start of the trace. From the
+        returned instant on, this window contains all instants at which the operand varies.
         """
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):

@@ -107,7 +107,7 @@ def shown(name: str) -> str:
 def show_number(num: ir.Num, level: int = 0) -> str:
     """Return a number in infix notation.
 
-    It is in parentheses if its operator binds more loosely than the precedence `level`.
+    The text is in parentheses if the outermost operator has a lower precedence than `level`.
     """
     text, own = _number(num)
     return f"({text})" if own < level else text

@@ -35,7 +35,10 @@ _SORTS: Mapping[str, _Sort] = {
 
 @cache
 def _shape(kind: Any) -> tuple[tuple[str, _Sort], ...]:
-    """Return (name, kind of the children) of each field of the node class `kind` that holds children."""
+    """Return (name, sort) of each field of a node class (`kind`) that contains child nodes.
+
+    The sort says whether these children are formulas or numbers, and whether there are one or several.
+    """
     declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(kind))
     return tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
 
@@ -94,9 +97,10 @@ def map_children(
 
 @cache
 def _formulas_of(kind: Any) -> tuple[tuple[str, bool], ...]:
-    """Return the fields of node class `kind` with formulas: (name, whether the value is a tuple of formulas).
+    """Return (name, several) of each field of a node class (`kind`) that contains formulas.
 
-    For `Recalled`, a past operator rewritten with timers, this is only its field `now`.
+    `several` is True for a tuple of formulas, False for a single formula. For `Recalled`, a past operator
+    rewritten with timers, the only field is `now`.
     """
     found = ((name, sort == "formulas") for name, sort in _shape(kind) if sort.startswith("formula"))
     return (("now", False),) if kind is typed.Recalled else tuple(found)
@@ -210,7 +214,7 @@ def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time
 
 
 def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
-    """Replace the free frozen values in a number or a formula by `values`.
+    """Replace free frozen values in a number or a formula; `values` gives the replacement for each name.
 
     Names that an inner `freeze` binds again are not replaced.
     """
@@ -246,7 +250,7 @@ def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
     """Return an operator such as `always@[a, b]` with its interval relative to now (`always[a, b]`).
 
-    At the first sample both operators are equal.
+    At the first sample of a trace, the two operators mean the same.
     """
     return replace(node, interval=replace(node.interval, clock="now"))
 
@@ -289,8 +293,9 @@ def mentions_horizon(formula: typed.Formula) -> bool:
 def timer_form(formula: typed.Formula) -> typed.Formula:
     """Return a state formula with its past operators in the form for a single instant.
 
-    The past operators were rewritten with timers before (`Recalled` nodes). Their form for a single instant
-    is a test of the timers, the field `now`.
+    The past operators were rewritten with timers before, to `Recalled` nodes. A `Recalled` node has two
+    forms: one for a single instant (`now`), one for the samples of a plan (`along`). This function replaces
+    each node by `now`, a test of the timers.
     """
     if isinstance(formula, typed.Recalled):
         return timer_form(formula.now)

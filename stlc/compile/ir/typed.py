@@ -86,11 +86,11 @@ class Predicate(Node):
     Attributes:
         num: the number compared with 0, in SI.
         strict: whether the comparison is `>`.
-        guard: whether the predicate is on clocks and timers: it decides whether an enclosing formula holds,
-            but not by how much.
+        guard: whether the predicate reads clocks and timers, the states that the compiler adds to count time.
+            Such a predicate decides whether an enclosing formula holds, but not by how much.
         unit: unit of the margin, in SI.
         written: unit of the comparison in the source. For recorded traces, `num` and `unit` are converted to
-            it (`stlc.compile.lowering.lower`).
+            this unit (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num
@@ -142,8 +142,8 @@ class Until(Node):
 class Shift(Node):
     """Formula at another sample: `next(p)` (`steps` is 1) or `prev(p)` (-1).
 
-    `outside` is its truth if the other sample lies outside the trace; None: it is undefined there. `delay`,
-    if it is given, is a time that replaces `steps`.
+    `outside` is the truth of the formula where the other sample lies outside the trace; if `outside` is None,
+    the formula is undefined there. If `delay` is given, this time replaces `steps`.
     """
 
     steps: int

@@ -35,7 +35,10 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
 
 
 def _one_unit(formula: typed.Formula) -> Unit | None:
-    """Return the unit in which all predicates are written; None if they differ or there is no predicate."""
+    """Return the unit in which all predicates are written.
+
+    The result is None if the units differ, or if there is no predicate.
+    """
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
     alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
@@ -77,7 +80,7 @@ def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Form
 
     The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
     has no such operator (`stlc.compile.augment`). Findings about intervals are appended to `sink`, such as
-    W304 for a bound that is rounded to a sample. If one of them is an error, the result must not be used.
+    W304 for a bound that is rounded to a sample. If a finding is an error, the result must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 

@@ -1,10 +1,12 @@
 """Local simplification laws on the IR; each preserves robustness wherever both sides are defined.
 
 In the following, `G` stands for `always`; the laws hold in the same form for `eventually`, `historically` and
-`once`. Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`, `true
-until q` becomes `eventually q`, and constants are folded, so that gradients stay finite. If the semantics is
-associative, nested `and`s and nested `or`s are merged. If it is idempotent, repeated items are removed. If it
-is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`.
+`once`.
+
+Some laws hold under every semantics: windows [0, 0] are removed, `G[a,a] G[c,d] p` becomes `G[a+c, a+d] p`,
+`true until q` becomes `eventually q`, and constants are folded, so that gradients stay finite. If the
+semantics is associative, nested `and`s and nested `or`s are merged. If the semantics is idempotent, repeated
+items are removed. If the semantics is both, `G[a,b] G[c,d] p` becomes `G[a+c, b+d] p`.
 """
 
 from __future__ import annotations

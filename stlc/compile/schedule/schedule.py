@@ -99,7 +99,7 @@ def latest(instant: Instant) -> int:
 
 
 def at_least(instant: Instant, least: int) -> Instant:
-    """Return the later of an instant and the sample `least`."""
+    """Return the later of two samples: `instant`, and `least`."""
     if isinstance(instant, int):
         return max(instant, least)
     if instant.low >= least:
@@ -109,7 +109,7 @@ def at_least(instant: Instant, least: int) -> Instant:
 
 
 def at_most(instant: Instant, most: int) -> Instant:
-    """Return an instant, or the sample `most` if the instant may be later."""
+    """Return `most` if `instant` may be later than `most` in some loop iteration, else `instant`."""
     if isinstance(instant, int):
         return min(instant, most)
     return most if instant.high > most else instant
@@ -126,8 +126,8 @@ class IndexRange:
     def count(self) -> int:
         """Number of instants in the range; 0 or less for an empty range.
 
-        If `start` and `last` depend on the indices of loops, it is the number of instants from the earliest
-        `start` to the latest `last` over all iterations.
+        If `start` and `last` depend on the indices of loops, all instants count from the earliest `start` to
+        the latest `last` over all iterations.
         """
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
@@ -156,8 +156,9 @@ class TraceDomain:
     Attributes:
         samples: number of known samples.
         end: treatment of the instants beyond the last sample (`Boundary`).
-        stop: final length of an open trace (one that continues, with unknown predicates), at which windows to
-            the end are cut; None: they are cut at the last known sample.
+        stop: final length of an open trace in samples. An open trace continues, but its predicates are
+            unknown there. Windows to the end of the trace are cut at `stop`; if it is None, at the last known
+            sample.
         counted: whether every instant contributes to the value, even one with unknown predicates, as in a
             mean. If so, no instant may be left out.
     """
@@ -252,9 +253,9 @@ def _last(
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
     """Return how many samples before and after an instant must exist for an expression to be defined there.
 
-    Some expressions read clamped samples: beyond the end of the trace the last sample is repeated, so none
-    need exist there. But if more samples will follow (`domain.stop` is the final length), the last sample is
-    not known yet. The expression then requires the sample that it actually reads.
+    An expression may read the samples after the end of the trace as copies of the last one (`clamped`). These
+    samples need not exist. But if more samples will follow (`domain.stop`, the final length, is given), it is
+    not yet known which sample will be the last. Then all samples that the expression reads must exist.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))

@@ -24,10 +24,10 @@ class Semantics(Protocol):
             apply.
         idempotent: whether repeated operands make no difference, so that overlapping blocks may cover a
             window.
-        associative: whether the extremum of extrema is that of all their operands.
-        sound: whether no value has the opposite sign of the exact one.
+        associative: whether operands may be grouped: `min(min(a, b), c)` is then `min(a, b, c)`.
+        sound: whether every value has the sign of the exact value, or is 0.
         bounded: whether replacing unknown operands by their lower (upper) bounds, even infinite ones, gives a
-            lower (upper) bound on the value. Means have no such bound, since they omit infinite operands.
+            lower (upper) bound on the value. This is not so for means, since they omit infinite operands.
     """
 
     exact: ClassVar[bool]
@@ -37,10 +37,16 @@ class Semantics(Protocol):
     bounded: ClassVar[bool]
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the partial result (`Parts`) of each operand taken alone, for the extremum `pick`."""
+        """Return the partial result (`Parts`) of each operand in `x`, taken alone.
+
+        `pick` is the extremum to be computed, "min" or "max".
+        """
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """Return the partial result of two disjoint sets of operands together, elementwise."""
+        """Return the partial result of the union of two disjoint sets of operands, elementwise.
+
+        `a` and `b` are the partial results of the two sets.
+        """
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
         """Return the minimum or maximum (`pick`) of a set of operands from their partial result `parts`."""
@@ -75,5 +81,5 @@ class Associative:
         return (self.pair(a[0], b[0], pick, ops),)
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:  # noqa: ARG002
-        """Return the partial result itself, which is the extremum of its operands."""
+        """Return the partial result itself, which is the minimum or maximum of its operands."""
         return parts[0]

@@ -53,7 +53,7 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
             `smooth`.
 
     Raises:
-        UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.
+        UsageError: the semantics is unknown, or `smoothing` is given for a semantics without a scale (U101).
     """
     chosen: Semantics = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
     if smoothing is None:

@@ -1,7 +1,8 @@
 """Switches: how conditions become numbers from 0 to 1, and how a condition chooses between two values.
 
-A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the smooth
-approximation of Meng and Fan 2023 (Eq. 6); `StraightThrough` has exact values with smooth gradients.
+For example, the next state of a hybrid system is the result of its jump where the jump condition holds, and
+of its flow elsewhere. `Hard` is exact. `Tanh` is the smooth approximation of Meng and Fan 2023 (Eq. 6).
+`StraightThrough` has exact values with smooth gradients.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from stlc.compile.backends.array.namespace import Array, Ops
 
 
 class Switch(Protocol):
-    """Protocol of a switch, which evaluates conditions as numbers and chooses between values by them.
+    """Protocol of a switch, which evaluates conditions as numbers and uses them to choose between values.
 
     Attributes:
         exact: whether conditions are evaluated as masks, by comparisons instead of margins, so that each
@@ -60,7 +61,7 @@ class Hard:
         return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """Return `yes` or `no`, whichever the indicator `weight` selects, bit for bit."""
+        """Return exactly `yes` where the indicator `weight` is 1, and exactly `no` where it is 0."""
         return ops.where(ops.gt(weight, 0.5), yes, no)
 
 
@@ -77,12 +78,12 @@ class Tanh:
     sharpness: float = 500.0
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
-        """Return `(1 + tanh(w rho)) / 2`, where w is `sharpness` or, if None, that of the switch."""
+        """Return `(1 + tanh(w rho)) / 2`, where w is `sharpness`, or `self.sharpness` if this is None."""
         width = self.sharpness if sharpness is None else sharpness
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Return `weight` unchanged: where the margin is 0, it is 1/2 for `>` and for `>=`."""
+        """Return `weight` unchanged; where the margin is 0, `weight` is 1/2, both for `>` and for `>=`."""
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -95,8 +96,8 @@ class Tanh:
 class StraightThrough:
     """Exact evaluation of conditions as 0 or 1, with the gradient of `(1 + tanh(slope rho)) / 2`.
 
-    The argument `sharpness` is not used. `if cond then a else b` has the value and gradient of the branch
-    taken, plus the gradient of the condition.
+    The argument `sharpness` is not used. `if cond then a else b` has the value of the branch taken. Its
+    gradient is that of this branch, plus `a - b` times the gradient of the smooth indicator of `cond`.
     """
 
     exact: ClassVar[bool] = False

@@ -1,8 +1,8 @@
 """Mean-based semantics: extrema replaced by means of all operands with the same sign.
 
-If all operands are positive, their minimum becomes their geometric mean, which the smallest dominates.
-Otherwise it becomes a power mean of the negative operands, in which the others count as 0. A maximum is
-`max(x) = -min(-x)`. Both means are functions of sums over the operands.
+If all operands are positive, their minimum becomes their geometric mean, in which the smallest operand has
+the most weight. Otherwise it becomes a power mean of the negative operands, in which the others count as 0. A
+maximum is `max(x) = -min(-x)`. Both means are functions of sums over the operands.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ class Mean(ABC):
         """
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """Return the partial result of each operand in `x`.
+        """Return the partial results of the operands in `x`, each operand taken alone.
 
-        It consists of four arrays: the value, its terms `gain` and `loss`, and 1 if it is finite, else 0. For
-        a maximum (`pick` "max") the operands change sign first.
+        There are four arrays of the shape of `x`: the operands; their terms `gain`; their terms `loss`; and 1
+        where an operand is finite, else 0. For a maximum (`pick` "max") the operands change sign first.
         """
         x = x if pick == "min" else -x
         known = ops.gt(math.inf, ops.abs(x))

@@ -19,8 +19,9 @@ class ArithmeticGeometricMean(Mean):
     operands and larger margins. Predicates should be of similar magnitude: the authors normalise them to [-1,
     1].
 
-    Sound: the sign is that of the exact robustness. But a change of predicates by less than the value can
-    change the verdict. The gradient is discontinuous where an operand changes sign.
+    Sound: the sign is that of the exact robustness. But the value is not a tolerance: the verdict can change
+    although every predicate changes by less than the value. The gradient is discontinuous where an operand
+    changes sign.
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:

@@ -19,12 +19,12 @@ class GeneralizedMean(Mean):
     n operands, `M0(z) = (eps^n + prod z)^(1/n)` and `Mp(z) = (eps^p + mean(z^p))^(1/p)`. The measure is
     continuously differentiable.
 
-    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). But a change
-    of predicates by less than the value can change the verdict.
+    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). But the value
+    is not a tolerance: the verdict can change although every predicate changes by less than the value.
 
     Attributes:
         eps: smoothing near 0; margins below its square root have little weight.
-        p: order of the mean over violated operands; larger values weight the worst one more.
+        p: order of the mean over violated operands; larger values give more weight to the worst operand.
     """
 
     eps: float = 1e-8
