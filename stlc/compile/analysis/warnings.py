@@ -118,7 +118,9 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W403 for each predicate with a modulo that jumps within the ranges of its signals.
+    """Yield W403 for each predicate with a modulo that may jump within the ranges of its signals.
+
+    A modulo such as `x % 360` jumps from 360 back to 0 where x is a multiple of 360.
 
     Args:
         formula: formula whose names and units are resolved.

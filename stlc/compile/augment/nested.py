@@ -66,8 +66,8 @@ def in_past_form(
     """Rewrite a formula so that the operands of its absolute operators contain only past operators.
 
     Args:
-        formula: formula in negation normal form: absolute operators (`always@[a, b]`), and relative ones at
-            the start of the mission, joined by `and` and `or`.
+        formula: formula in negation normal form. It consists of operators that are evaluated at the start of
+            the mission, absolute (`always@[a, b]`) or relative (`always[a, b]`), joined by `and` and `or`.
         grid: time step and horizon.
         table: table of added states. The mission clock (steps since the start of the mission) is added to it
             if the rewritten formula reads the clock.

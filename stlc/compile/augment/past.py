@@ -81,7 +81,10 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides of the test at any sample of a plan, from the timer's value at the first sample."""
+        """Both sides of the test at any sample of a plan.
+
+        They are computed from the timer's value at the first sample of the plan.
+        """
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -109,7 +112,7 @@ class Past:
     name: str
 
     def rewrite(self, formula: typed.Formula) -> typed.Formula:
-        """Return a formula in negation normal form with its past operators replaced by timers."""
+        """Return `formula`, which is in negation normal form, with its past operators replaced by timers."""
         if not looks_back(formula):
             return formula
         match formula:
@@ -225,9 +228,9 @@ class Past:
     ) -> typed.Recalled:
         """Add a timer; return the test that q held earlier and p from then to the previous sample.
 
-        p and q are the operands of `node`, `p since q`. The sample at which q held is at most `most` samples
-        ago; if `most` is None, it may be any earlier sample. If `positive` is False, the test is negated, and
-        `left` and `right` are the negations of p and q.
+        p and q are the operands of `node`, `p since q`. q must have held at a sample at most `most` samples
+        ago; if `most` is None, at any earlier sample. If `positive` is False, the test is negated, and `left`
+        and `right` are the negations of p and q.
         """
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
@@ -268,10 +271,10 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Return the truth that `body` had `steps` samples ago; one state is added per sample of delay.
+        """Return a formula with the truth that `body` had `steps` samples ago.
 
-        Before the start of the mission the truth is `before`. `body` belongs to the operator `node`. E309 is
-        appended to `sink` if more than `REGISTER` states are needed.
+        One state is added per sample of delay. Before the start of the mission, the truth is `before`. `body`
+        belongs to the operator `node`. If more than `REGISTER` states are needed, E309 is appended to `sink`.
         """
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")

@@ -334,7 +334,9 @@ def _value(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
-    """Return the values of independent expressions, all of which are evaluated.
+    """Return the values of independent expressions.
+
+    All expressions are evaluated, even if one of them fails.
 
     Raises:
         Failed: an expression has errors; the errors of all expressions are in `scope.sink`.
@@ -343,7 +345,7 @@ def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
 
 
 def _all(steps: Iterable[Callable[[], T]]) -> list[T]:
-    """Return the results of `steps`, all of which are executed.
+    """Return the results of `steps`; all steps are executed, even if one of them fails.
 
     Raises:
         Failed: a step failed.

@@ -72,8 +72,9 @@ class _Definedness(Analysis[Defined]):
     def _instants(self, first: int | None, last: int | None) -> _Ranges:
         """Return the first and last instant of a window at each sample, as two arrays `(samples,)`.
 
-        `first` and `last` are offsets from the sample; None extends to the start or end of the trace. Windows
-        that begin before the start of the trace are cut there.
+        `first` and `last` are offsets from the sample. If `first` is None, the window begins at the start of
+        the trace; if `last` is None, it ends at the end of the trace. Windows that begin before the start of
+        the trace are cut there.
         """
         now = np.arange(self.samples)
         start = np.zeros_like(now) if first is None else np.maximum(now + first, 0)

@@ -271,9 +271,9 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
 
     Args:
         formula: typed formula.
-        augmented: whether the formula is for training. `Recalled` nodes, which are past operators rewritten
-            with timers, then count as state formulas. Formulas with frozen values do not, since frozen values
-            come from other instants.
+        augmented: whether the formula is for training. If so, two rules change. `Recalled` nodes, which are
+            past operators rewritten with timers, count as state formulas. Formulas with frozen values do not
+            count as state formulas, since frozen values come from other instants.
     """
     state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
     elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)

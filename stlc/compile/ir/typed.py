@@ -177,8 +177,9 @@ class Recalled(Node):
     Attributes:
         now: state formula that is equivalent to the operator at one instant. In it, tests of timers stand for
             the past; their robustness is +inf or -inf.
-        along: formula that is equivalent to the operator along a plan or another part of a trace; its
-            robustness is used there. It reads the timers only at the first sample of that part.
+        along: formula that is equivalent to the operator along a plan or another part of a trace. The
+            robustness of the node on this part is that of this formula. The timers are read only at the first
+            sample of the part.
     """
 
     now: Formula

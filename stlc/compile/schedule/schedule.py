@@ -291,7 +291,7 @@ class Step:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Numbers of the steps that compute the operands, without operands that are needed at no instant."""
+        """Numbers of the steps that compute the operands; operands that are not needed are left out."""
         return tuple(number for number in self.args if number is not None)
 
 
@@ -343,7 +343,7 @@ class Scheduler:
         return found
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add the step of a formula after those of its operands; return its number."""
+        """Add steps for the operands of a formula, then a step for the formula; return its number."""
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
         return self.add(Step(node, run, args, number=self.number(run)))
 
