@@ -46,7 +46,7 @@ def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, fr
     Args:
         axes: matplotlib axes.
         paths: picture coordinates of agents, (frames, agents, 2); NaN breaks a path.
-        scene: recorded snapshots; `decision` is read.
+        scene: recorded snapshots; their entry `decision` gives the source of each followed plan.
         index: the present frame.
         frames: number of past frames.
     """

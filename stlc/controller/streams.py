@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """Generators of one world, derived from its own generator.
+    """Generators of one world, derived from the generator that the world receives.
 
     Attributes:
         shared: generator for draws common to all agents.

@@ -108,8 +108,8 @@ def deploy(
     them.
 
     Raises:
-        InterruptedDeploymentError: the deployment ended early; `__cause__` is the SystemFileError or RunError
-            of `simulate`, or the interruption by the user.
+        InterruptedDeploymentError: the deployment ended early. Its `__cause__` tells why: a SystemFileError
+            or RunError that `simulate` raised, or an interruption by the user.
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)

@@ -37,7 +37,8 @@ class Executed:
     once, from the first sample.
 
     Attributes:
-        rules: requirement -> whether it holds, (starts, rows); one start if it does not mention T.
+        rules: requirement -> whether it holds, (starts, rows). There is a single start for a requirement
+            that does not mention T.
         safety: names of the requirements that are tagged `@safety`.
         consistent: (starts, rows), whether all steps in the planning window from the start instant equal the
             predictions of the model.

@@ -75,8 +75,7 @@ class Metric:
         mask: function from a seed to the mask of the plans, agents or instants with the property; it returns
             None if the property was not recorded.
         among: function from a seed to the mask of the population, in which the share is computed; None if the
-            population consists of all plans, agents or instants. An
-            empty population has no value.
+            population consists of all plans, agents or instants. An empty population has no value.
         unit: unit of the value; shares have none.
         safety: whether the metric is omitted if no requirement is tagged `@safety`.
     """

@@ -106,7 +106,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
 
 @contextmanager
 def restoring(run: RunDir) -> Iterator[None]:
-    """Context for restoring objects from a checkpoint: errors caused by damage become RunError (R101)."""
+    """Context manager for restoring objects: if the checkpoint is damaged, RunError (R101) is raised."""
     try:
         yield
     except _DAMAGE as error:

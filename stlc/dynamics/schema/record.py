@@ -44,7 +44,8 @@ class Kind:
     Attributes:
         read: (context, node, label for messages) -> value; None if a finding was reported.
         schema: JSON Schema of the accepted values.
-        record: the record that the value, or each of its items, is read into; None for other kinds.
+        record: the dataclass into which the value, or each of its items, is read; None if it is not read into
+            a dataclass.
     """
 
     read: _Read

@@ -57,7 +57,7 @@ def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], leng
 
 
 def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
-    """Return the weighted sum of the derivatives of state `name`; `groups`: weight -> derivatives with it."""
+    """Return the weighted sum of the derivatives of state `name`; `groups`: weight -> derivatives."""
     total: ir.Num | None = None
     for weight, slopes in groups.items():
         part = slopes[0][name]
