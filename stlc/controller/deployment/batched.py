@@ -92,14 +92,14 @@ class Worlds:
     def reset(self) -> Tensor:
         """Return the initial states, (rows, n).
 
-        Parameters of the specification are drawn at random; timers start at their initial values. If the
-        system accepts only initial states from which a plan is known (`test: {starts: …}`), the world redraws
-        the initial states from which none is known. Sets `redrawn`, the number of redrawn initial states.
+        Parameters of the specification are drawn at random; timers start at their initial values. The system
+        file may require that a plan is known from each initial state (`test: {starts: …}`). Then the world
+        draws an initial state again if no plan is known from it; the attribute `redrawn` counts these draws.
 
         Raises:
             SystemFileError: S211, a world cannot redraw the initial state of an agent.
-            RunError: R405, after the maximum number of draws, an agent has no initial state from which a plan
-                is known.
+            RunError: R405, after the maximum number of draws, there is an agent whose initial state has no
+                known plan.
         """
         given = []
         for world in self.worlds:
@@ -115,7 +115,10 @@ class Worlds:
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
-        """Redraw initial states `x` of a seed, (agents, n), until a plan is known from each; return all.
+        """Redraw those initial states `x` of a seed from which no plan is known, until none of these is left.
+
+        Returns:
+            All initial states of the seed, (agents, n).
 
         Raises:
             SystemFileError: S211, the world cannot redraw an initial state.
@@ -142,10 +145,10 @@ class Worlds:
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """Advance all worlds by step number `step`: states (rows, n), actions (rows, m) -> (rows, n).
 
-        A world's states contain neither the parameters nor the timers of the specification: parameters stay
-        constant, and timers are updated from the true states. Sets `eventless`, (rows,): True where no
-        exogenous event occurred, that is, the next state in the world equals the state that the true dynamics
-        give.
+        A world computes the states of the system only. The parameters and timers that the specification adds
+        to them are computed here: parameters stay constant, and timers are updated from the true states. Sets
+        `eventless`, (rows,): True where no exogenous event occurred, that is, where the next state in the
+        world equals the state that the true dynamics give.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -163,10 +166,10 @@ class Worlds:
     def options(self, x: Tensor) -> Tensor | None:
         """Return the states that the agents would have under each option.
 
-        An option is an alternative, such as a goal, among which a world lets its agents choose.
+        Options are alternatives, for example goals, among which a world lets its agents choose.
 
         Returns:
-            (rows, k, n) for k options; None if the worlds offer none.
+            States under each of k options, (rows, k, n); None if the worlds offer no options.
         """
         given = []
         for world in self.worlds:
@@ -190,11 +193,11 @@ class Worlds:
         """Apply to every agent the option with the index in `pick`, (rows,), and return the new states.
 
         Args:
-            pick: (rows,) int64.
+            pick: index of the option that each agent takes, (rows,) int64.
             x: states before the choice, (rows, n); only their parameters and timers are used.
 
         Returns:
-            (rows, n).
+            States after the choice, (rows, n).
         """
         given = []
         for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):

@@ -33,7 +33,9 @@ _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
 
 
 class Disturbance:
-    """Disturbance, measurement noise and model errors of a system's scenario; none without a scenario.
+    """Disturbance, measurement noise and model errors that the scenario of a system declares.
+
+    Without a scenario, nothing is disturbed.
 
     The scenario's expressions `disturb` and `noise` read the present state and the time `t` since the start
     of the deployment, and may draw random numbers.
@@ -57,7 +59,7 @@ class Disturbance:
         self._spread = self._errors.sensor_noise * _ranges(system)
 
     def acted(self, action: Tensor) -> Tensor:
-        """Actuator outputs, (rows, m), for commands (rows, m), with the scenario's actuator errors."""
+        """Outputs of the actuators, (rows, m), for the commands `action`, including actuator errors."""
         given = action
         if self._errors.actuator_gain:
             given = given * self._factor.to(given) + self._offset.to(given)
@@ -76,7 +78,10 @@ class Disturbance:
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets of the actuator errors, (rows, m) each; their signs are random."""
+        """Factors and offsets that turn a command into the output of a faulty actuator, (rows, m) each.
+
+        The sizes of the errors are given by the scenario; their signs are random.
+        """
         off, angle = self._errors.actuator_gain, self._angle
         signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
@@ -151,7 +156,7 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Errors of the system's scenario (model, actuators, sensors) that are not 0: name -> relative size.
+    """Nonzero errors (of model, actuators and sensors) in the system's scenario: name -> relative size.
 
     The entry `parameters` is the error of the constants in the dynamics. If it is present, there is a further
     entry `numbers`: the list of these constants.

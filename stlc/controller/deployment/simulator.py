@@ -36,7 +36,8 @@ class DeploymentRecording:
         source: (rows, steps), source of the followed plan, an index into
             `stlc.controller.guard.candidates.SOURCES`.
         t0: (rows, steps), prefix length of the followed plan: number of its first actions that the backup
-            policy took from a grid; 0 for the policy's own plan.
+            policy chose from a few fixed control values (a grid); 0 if there are none, as in the policy's
+            own plan.
         rho: (rows, steps), robustness of the followed plan.
         policy_rho: (rows, steps), robustness of the policy's own plan.
         safe: (rows, steps), whether the followed plan satisfies the requirements tagged `@safety`.
@@ -47,7 +48,7 @@ class DeploymentRecording:
             picture coordinates, there are two more arrays: `rejected`, the policy's plans that a guard
             replaced, and `taken`, the plans followed instead. Both are float32, (frames, agents, horizon + 1,
             2 or 3), and NaN where no plan was replaced.
-        eventless: (rows, steps), whether there was no exogenous event; None if not recorded.
+        eventless: (rows, steps), True where no exogenous event occurred; None if this was not recorded.
         options: (rows, steps, k, n), states under the options (alternatives that a world offers to its
             agents); None if there are none.
         redrawn: number of initial states that were drawn again because no plan is known from them.
@@ -78,8 +79,8 @@ class DeploymentRecording:
 class Recorder:
     """Recorder of a deployment. It stores each step when it happens: a failure loses no earlier step.
 
-    `agents`: number of agents per seed. `pictured`: whether to record also the plans that a guard replaces;
-    pictures show them.
+    `agents`: number of agents per seed. `pictured`: whether the plans that a guard replaces are recorded too,
+    so that pictures can show them.
     """
 
     agents: int
@@ -153,7 +154,7 @@ class SimulationStep:
     """One step of a deployment, after the decision and before the worlds advance.
 
     Attributes:
-        step: index of the step, from 0; `steps` after the last one, when nothing is decided any more.
+        step: index of the step, from 0. After the last step, when nothing is decided, it equals `steps`.
         steps: total number of steps.
         x: states, (rows, n).
         decision: the guard's decision; None after the last step.
@@ -190,10 +191,10 @@ class _Pilot:
 
         All rows replan every `replan` steps. At other steps a row replans for one of two reasons: an
         exogenous signal has changed in its true state `x`, or the rest of its plan violates a safety
-        requirement. The rest is checked only with the guard "full". The model predicts it from the measured
-        state `seen`. If a plan ends before the next regular replanning, its last action is held in this
-        prediction. The last sample of a plan is not checked: a `sweep` predicate is evaluated between a
-        sample and the next one, and the plan has no next sample.
+        requirement. The second reason applies only with the guard "full", which predicts the rest of the plan
+        from the measured state `seen`. If a plan ends before the next regular replanning, the prediction
+        holds its last action. The last sample of a plan is not checked: a `sweep` predicate is evaluated
+        between a sample and the next one, and the plan has no next sample.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -204,8 +205,11 @@ class _Pilot:
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
         """Index of the option (alternative offered by the world) that each row takes, (rows,).
 
-        It is 0, which changes nothing, for the rows that do not replan. `options`: states under the options,
-        (rows, k, n). `due`: indices of the rows that replan, (k,).
+        Rows that do not replan get option 0, which changes nothing.
+
+        Args:
+            options: states under each option, (rows, k, n).
+            due: indices of the rows that replan, (d,).
         """
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
@@ -228,11 +232,11 @@ class _Pilot:
         return self.decision, action
 
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
-        """Remainders of the previous plans of the rows in `due`, from the measured states `seen`, (rows, n).
+        """Remainders of the previous plans of the rows in `due`; None at the first step.
 
-        None at the first step. If `replan` > 1, the policy supplies the actions after the end of each plan.
-        If the last action were repeated instead, the plan might violate the specification. Then the guard
-        would never retain a previous plan.
+        A remainder lacks the actions already executed. If `replan` > 1, the policy appends as many new ones,
+        for which the measured states `seen`, (rows, n), are needed. If the last action were repeated instead,
+        the plan might violate the specification, and the guard would hardly ever retain a previous plan.
         """
         if self.decision is None:
             return None
@@ -286,7 +290,7 @@ def _replaced(
 
     Returns:
         `rejected`: the policy's plans, and `taken`: the plans followed instead, (agents, T + 1, 2 or 3) each;
-        NaN for agents whose plan was not replaced. None without a guard, and if the world does not map
+        NaN for agents whose plan was not replaced. None if there is no guard, or if the world cannot map
         planned states to picture coordinates.
     """
     if guard.backup is None or not worlds.charting:

@@ -36,13 +36,14 @@ if TYPE_CHECKING:
 class Method(ABC):
     """Interface of a training method, or of planning without training.
 
-    It resolves the options of a run, makes the learner (the state of a training), and loads the policy of a
-    run.
+    It determines ("resolves") the options of a run from the command line, the system file and defaults. It
+    makes the learner (the state of a training run), and loads the policy of a run.
 
     Attributes:
         options: class of the resolved options. A method with options of its own declares a subclass of
             `ResolvedConfig`, whose added fields are int, float or str and have defaults.
-        learns: class of the learner; None if the method plans without training, or overrides `learner`.
+        learns: class of the learner; None if the method plans without training, or if the subclass defines
+            the function `learner` itself.
     """
 
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
@@ -54,10 +55,10 @@ class Method(ABC):
         return self.learns is not None or type(self).learner is not Method.learner
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve the options of a run.
+        """Determine the options of a run, and return them.
 
-        An option that the user gave is taken first, then one in the system file, then the default of the
-        method.
+        The value of an option is the one that the user gave; if there is none, the one in the system file; if
+        there is none either, the default of the method.
         """
         return base_config(task, config, kind=self.options)
 
@@ -88,7 +89,7 @@ class Validation:
     """Result of a validation: verdicts on the policy's plans from newly drawn states.
 
     At every validation, some methods start a search for satisfying plans from the states where the policy's
-    plans fail. It ends by the next validation, whose result includes that of the search.
+    plans fail. The search ends before the next validation, which reports what the search found.
 
     Attributes:
         accuracy: share of states whose plan satisfies the specification.
@@ -98,8 +99,10 @@ class Validation:
             last search; None if no search has ended.
         failing: number of states from which the last search started; 0 without a search.
         repaired: number of states for which the last search found a satisfying plan.
-        explored: number of plans that exploration (search over plan prefixes) has found since the previous
-            validation. The remainder of a plan from a later state on its way counts as a further plan.
+        explored: number of plans that exploration has found since the previous validation. Exploration is a
+            search that extends plan prefixes step by step. Of each plan found, the remainders after its first
+            steps are also tried as plans, from the states then reached; those that satisfy the specification
+            are counted too.
     """
 
     accuracy: float
@@ -111,7 +114,7 @@ class Validation:
 
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
-        """Validation with the shares of satisfying plans among the judged plans, without a search."""
+        """Return a validation with the shares of satisfying plans in `judged`; there was no search."""
         shares = satisfied(judged.requirements).double().mean(0)
         return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
 
@@ -134,26 +137,27 @@ class Validation:
 
 
 class Learner(ABC):
-    """State of a training, which the training loop advances, validates and saves step by step.
+    """State of a training run; the training loop advances, validates and saves it step by step.
 
-    A subclass supplies the steps, the policy and the contents of a checkpoint. By default there is neither a
-    search for better plans nor an exploration (search over plan prefixes).
+    A subclass supplies the steps, the policy and the contents of a checkpoint. Some subclasses also search
+    for better plans, concurrently with the steps, or explore (extend plan prefixes step by step). This class
+    does neither.
 
     Attributes:
-        task: problem of the training.
-        config: resolved options of the training.
+        task: the specification and system for which a policy is trained.
+        config: options of the run.
         steps: planned total number of steps, which the training loop adapts to a time budget.
         device: torch device.
         ranks: processes that train together.
         step: number of completed steps.
         next_validation: step of the next validation.
         generator: source of all random numbers of this rank (process).
-        margin: gamma of the objective, the robustness that training aims at.
+        margin: robustness that training aims at (gamma of the objective).
         loss: loss of the last step; NaN before the first.
-        searches: whether, concurrently with the steps, a search improves plans that fail.
-        searching: whether the concurrent search is running.
+        searches: whether a search for better plans runs concurrently with the steps.
+        searching: whether this search is running now.
         solved: whether a search has found a satisfying plan.
-        exhausted: whether exploration with the largest effort has found no plan.
+        exhausted: whether exploration has found no plan, even with its largest effort.
     """
 
     searches: bool = False
@@ -181,7 +185,7 @@ class Learner(ABC):
     @property
     @abstractmethod
     def policy(self) -> Policy:
-        """Policy as trained by the steps made until now, on the CPU."""
+        """Policy with the weights after the latest step, on the CPU."""
 
     @property
     def rate(self) -> float:
@@ -189,7 +193,7 @@ class Learner(ABC):
         return self.config.lr
 
     def validate(self) -> Validation:
-        """Judge the policy's plans from newly drawn states, and set the step of the next validation."""
+        """Judge the policy's plans from newly drawn states; set `next_validation`."""
         x0 = self.task.sample(self.config.pool, generator=self.generator)
         self.next_validation = self.step + self.config.every
         return Validation.of(self.policy.plan_judged(x0)[1]).mean(self.ranks)
@@ -197,19 +201,19 @@ class Learner(ABC):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly, bit for bit.
 
-        All ranks (processes that train together) must call this at the same time. The first rank returns the
-        tensors of all ranks.
+        All ranks (processes that train together) must call this at the same time. Only the result on the
+        first rank is complete: it contains the tensors of all ranks, and is stored in a checkpoint.
         """
         return {"generator": self.generator.get_state()}
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that are stored in a checkpoint together with `tensors`."""
+        """Numbers that a checkpoint stores in addition to `tensors`."""
         last = {"loss": self.loss} if math.isfinite(self.loss) else {}
         facts = {"step": self.step, "steps": self.steps, "margin": self.margin}
         return last | facts | {"next_look": self.next_validation}
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state that the methods `tensors` and `facts` returned."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
         self.loss = float(facts.get("loss", math.nan))
@@ -219,13 +223,13 @@ class Learner(ABC):
         """Find the cause of a step whose loss or gradient was not finite on any of the ranks (processes).
 
         Returns:
-            The error that describes the cause, and whether the weights before the step gave finite plans.
+            The error that describes the cause; and True if the weights before the step gave finite plans.
         """
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
         return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reasons why parts of the training run in torch: name of the part -> reason; "" if it runs in C.
+        """Parts of the training, and for each the reason why it runs in torch; "" if it runs in C.
 
         The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
         """
@@ -234,7 +238,7 @@ class Learner(ABC):
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
         """Search for satisfying plans by exploration, if the last search found too few.
 
-        Exploration builds plans step by step from prefixes. This default method does nothing.
+        Exploration extends plan prefixes step by step. The method of this class does nothing.
 
         Returns:
             False if `stop` ended the exploration early, else True.
@@ -242,7 +246,7 @@ class Learner(ABC):
         return True
 
     def wait(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Wait for the end of the concurrent search; return False if `stop` ended the wait, else True."""
+        """Wait for the end of the concurrent search; return False if `stop` ended the wait early."""
         return True
 
     def close(self) -> None:  # noqa: B027

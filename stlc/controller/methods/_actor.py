@@ -45,7 +45,8 @@ class ActorPolicy(Policy):
 
     Args:
         task: specification and system.
-        actor: network from observations (B, k) float32 to controls (B, m) in physical units; see `observe`.
+        actor: network from observations (B, k) float32 to controls (B, m) in physical units. The function
+            `observe` computes the observations.
     """
 
     def __init__(self, task: Task, actor: Callable[[Tensor], Tensor]) -> None:
@@ -77,7 +78,7 @@ class ActorPolicy(Policy):
 
 
 class ActorLearner(Learner):
-    """Training of an actor (a network that chooses one action per step) by rewards."""
+    """Reinforcement learning of an actor (a network that chooses one action per step)."""
 
     def torch_reasons(self) -> Mapping[str, str]:
         """Reason, under the name `verdicts`, why plans are judged in torch; "" if they are judged in C."""

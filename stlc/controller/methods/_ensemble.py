@@ -2,8 +2,8 @@
 
 The networks, their loss and their bounded variances follow Chua, Calandra, McAllister and Levine, "Deep
 reinforcement learning in a handful of trials using probabilistic dynamics models" (NeurIPS 2018), Section 4
-and Appendix A.1. The training ends when the error on validation data stops falling, and then the best
-networks are selected; both follow Janner, Fu, Zhang and Levine, "When to trust your model" (NeurIPS 2019).
+and Appendix A.1. Two more rules follow Janner, Fu, Zhang and Levine, "When to trust your model" (NeurIPS
+2019): training ends when the error on validation data stops falling, and then the best networks are selected.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class BatchedMlp(nn.Module):
         count: number of networks, E.
         widths: number of inputs, of units in each hidden layer, and of outputs.
         activation: function between the layers.
-        generator: random numbers of the initial weights, which are normal with standard deviation
-            1 / (2 sqrt(inputs)), cut off at twice that value (Chua et al. 2018); biases are 0.
+        generator: source of the random initial weights. They are normal with standard deviation
+            1 / (2 sqrt(inputs)), cut off at two standard deviations (Chua et al. 2018); biases are 0.
     """
 
     def __init__(
@@ -144,11 +144,11 @@ class Ensemble(nn.Module):
         return len(self.body.weights[0])
 
     def normalise(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set the means and standard deviations of the normalisation.
+        """Compute the means and standard deviations of the normalisation from training data.
 
         Args:
-            inputs: (N, inputs).
-            targets: (N, outputs); component i is the change of component i of the input.
+            inputs: samples of the inputs, (N, inputs).
+            targets: their targets, (N, outputs); component i is the change of component i of the input.
         """
         spread = inputs.std(0)
         scale = targets.std(0)
@@ -302,9 +302,9 @@ def train_ensemble(
         generator: source of all random numbers.
 
     Returns:
-        Mean over the elites of the mean squared error on the validation data (on the training data if there
-        are none), in units of the spread of the targets; NaN if a loss was not finite, which ends the
-        training.
+        Mean squared error of the elites on the validation data, or on the training data if there are no
+        validation data. Targets are divided by their standard deviation first. NaN if a loss was not finite;
+        training ends at once in this case.
     """
     ensemble.normalise(inputs, targets)
     order = torch.randperm(len(inputs), generator=generator)

@@ -39,7 +39,7 @@ class ModelConfig(ActorConfig):
 
     Attributes:
         networks: number of networks of the ensemble.
-        elites: number of networks that predict: those with the least validation error.
+        elites: number of networks, those with the least validation error, that are used for predictions.
         width: number of units per hidden layer.
         layers: number of hidden layers.
         model_lr: learning rate of the networks.
@@ -49,8 +49,9 @@ class ModelConfig(ActorConfig):
         model_patience: number of passes without improvement after which training of the networks ends; 0: all
             passes are made.
         model_held: share of the samples held out for validation of the networks.
-        growth: share by which the data have to grow before the networks are trained again; 0: every time.
-        first: number of episodes with random controls before the first training of the networks.
+        growth: share by which the number of episodes has to grow before the networks are trained again (0.5:
+            by 50 %). 0: the networks are trained in every training step.
+        first: number of episodes with random controls before the networks are trained for the first time.
         capacity: number of episodes that are stored; new ones replace the oldest.
     """
 
@@ -104,7 +105,10 @@ def rewards(task: Task, kind: Reward, states: Tensor, actions: Tensor) -> Tensor
 
 
 def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
-    """Reward `robustness` or `accuracy` of whole episodes, from their states (B, T+1, n): (B,)."""
+    """Reward of whole episodes, (B,), computed from their states, (B, T+1, n).
+
+    `kind`: `robustness` or `accuracy`, the two rewards that an episode earns at its end.
+    """
     rho = task.robustness(states)
     if kind == "accuracy":
         return SATISFIED * satisfied(rho).to(rho)
@@ -112,7 +116,9 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
-    """Reward `task`, which the system file declares, of single steps: (…).
+    """Reward `task` (the one that the system file declares) of single steps, one number per step.
+
+    `…` in the shapes stands for any leading dimensions, which the result has too.
 
     Args:
         task: specification and system.
@@ -160,8 +166,8 @@ class Episodes:
             own: number of states of the system itself, without those that the specification adds.
 
         Returns:
-            Inputs (states and controls), (N, own + m), and targets (changes of the states in a step), (N,
-            own).
+            Inputs (states and controls), (N, own + m), and targets (changes of the states in a step),
+            (N, own).
         """
         states, actions = self.states[: self.count, :, :own], self.actions[: self.count]
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
@@ -185,10 +191,12 @@ class Episodes:
 
 @torch.no_grad()
 def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[Tensor, Tensor]:
-    """Simulate episodes from states `x0`, (N, n), under the controls `act(states, step)`, clipped to range.
+    """Simulate episodes from the states `x0`, (N, n), with the model of the system.
+
+    `act(states, step)` gives the controls of a step. They are clipped to the control ranges.
 
     Returns:
-        States (N, T+1, n) and controls (N, T, m).
+        States (N, T+1, n) and clipped controls (N, T, m).
     """
     system = task.system
     states, actions = [x0], []
@@ -199,7 +207,7 @@ def play(task: Task, x0: Tensor, act: Callable[[Tensor, int], Tensor]) -> tuple[
 
 
 def random_controls(task: Task, count: int, generator: torch.Generator) -> Tensor:
-    """Draw `count` plans, (count, T, m), with random controls that are constant over `PIECE` steps."""
+    """Draw `count` random plans, (count, T, m); their controls change only every `PIECE` steps."""
     system = task.system
     pieces = -(-system.horizon // PIECE)
     drawn = torch.rand(count, pieces, len(system.control_names), generator=generator)
@@ -241,16 +249,17 @@ class LearntModel:
 
 
 class ModelLearner(Learner):
-    """Training with a learnt model: an ensemble that learns the system from observed episodes.
+    """Training with a learnt model. An ensemble of networks learns the system from observed episodes.
 
     One step of the training simulates `config.environments` episodes, trains the ensemble if enough episodes
     were added, and then does what the subclass adds. A checkpoint holds the networks, the stored episodes and
-    the state of the random numbers.
+    the state of the random number generator.
 
     Attributes:
         episodes: the stored episodes.
         ensemble: the learnt model.
-        fitted: number of episodes ever observed (`episodes.total`) at the latest training of the ensemble.
+        fitted: value of `episodes.total`, the number of episodes ever observed, when the ensemble was last
+            trained.
         error: validation error of the ensemble after its latest training; NaN before the first.
     """
 
@@ -262,8 +271,8 @@ class ModelLearner(Learner):
         """Make an untrained ensemble and an empty memory of episodes.
 
         Raises:
-            UsageError: U101, there are several ranks (processes), the device is not the CPU, no reward is
-                named `config.reward`, or this name is `task` and the system declares no reward.
+            UsageError: U101, there are several ranks (processes); or the device is not the CPU; or
+                `config.reward` is unknown, or is `task` although the system declares no reward.
         """
         super().__init__(task, config, steps=steps, device=device, ranks=ranks)
         if ranks.size > 1:
@@ -322,20 +331,21 @@ class ModelLearner(Learner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly.
 
-        They hold the random numbers, the stored episodes, the ensemble and its optimiser.
+        They contain the state of the random number generator, the stored episodes, the ensemble and its
+        optimiser.
         """
         found = super().tensors() | self.episodes.tensors()
         found |= {f"ensemble.{name}": value for name, value in self.ensemble.state_dict().items()}
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars that are stored together with `tensors`."""
+        """Numbers that a checkpoint stores in addition to `tensors`."""
         error = {"model_error": self.error} if not math.isnan(self.error) else {}
         own = {"fitted": self.fitted, "environment_steps": self.environment_steps}
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state that the methods `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))

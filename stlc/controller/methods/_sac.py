@@ -37,9 +37,9 @@ class SacConfig(ActorConfig):
 
 
 class SacActor(nn.Module):
-    """Network from observations to the most probable controls of the actor of stable-baselines3.
+    """Copy of the actor of stable-baselines3: a network from observations to the most probable controls.
 
-    Its weights have the same names as in that actor, so that they can be copied. The package
+    Its weights have the same names as those of the original actor, from which they are copied. The package
     stable-baselines3 is not needed to use this class.
 
     Attributes:

@@ -71,7 +71,7 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         return self.observed()
 
     def observed(self) -> np.ndarray[Any, Any]:
-        """Normalised observations of the present states, which must be initial states, (N, k)."""
+        """Normalised observations of the present states, (N, k); correct only when the episodes begin."""
         return self._seen(self.environments.observe(self.environments.states, 0))
 
     def step_async(self, actions: np.ndarray[Any, Any]) -> None:
@@ -82,9 +82,9 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         """Advance all episodes by one step under the stored controls.
 
         Returns:
-            Normalised observations (N, k), rewards (N,), whether the episodes ended (N,), and one dictionary
-            per episode. If the episode ended, its dictionary holds `terminal_observation` (k,), the last
-            observation before the restart.
+            Normalised observations (N, k); rewards (N,); flags (N,), True for episodes that ended; and one
+            dictionary per episode. It is empty, unless the episode ended: then `terminal_observation`, (k,),
+            is the last observation before the restart.
         """
         result = self.environments.step(self._actor.controls(self._actions))
         done = result.done.numpy()
@@ -119,7 +119,9 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
 
 
 class RandomState:
-    """Random numbers of stable-baselines3, which draws from the global generators of torch and NumPy.
+    """Random numbers of stable-baselines3, kept apart from those of other code.
+
+    The library draws from the global generators of torch and NumPy.
 
     Attributes:
         torch: state of torch's generator.
@@ -132,10 +134,10 @@ class RandomState:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Context in which the global generators continue from the states stored here.
+        """Context in which the global generators continue from the states that this object stores.
 
-        At the end of the context, the states then reached are stored here. The global generators get back the
-        states that they had before the context.
+        At the end of the context, the object stores the new states of the generators, and the generators get
+        back the states that they had before the context.
         """
         others = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002 - the library's
         torch.set_rng_state(self.torch)
@@ -154,7 +156,7 @@ class RandomState:
         return {"torch": self.torch, "numpy": torch.tensor([*keys.tolist(), position])}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the states from what `tensors` returned."""
+        """Restore the states that the method `tensors` returned."""
         *keys, position = tensors["numpy"].tolist()
         self.torch = tensors["torch"]
         self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
@@ -214,7 +216,7 @@ class SacLearner(ActorLearner):
         return ActorPolicy(self.task, self.actor)
 
     def advance(self) -> float:
-        """Play one episode in every environment, with gradient steps after each step of the episodes.
+        """Play one episode in every environment; after each step of the episodes, make gradient steps.
 
         Returns:
             The mean loss of the critics; NaN if it is not finite.
@@ -244,7 +246,8 @@ class SacLearner(ActorLearner):
         """Find the cause of a step whose loss was not finite.
 
         Returns:
-            The error that describes the cause, and False: the weights before the step are lost.
+            The error that describes the cause; and False, since the weights before the step are lost, so that
+            their plans cannot be shown to be finite.
         """
         return super().diagnose()[0], False
 
@@ -262,7 +265,8 @@ class SacLearner(ActorLearner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly.
 
-        They hold networks, optimisers, entropy coefficient, replay buffer, states and random numbers.
+        They contain networks, optimisers, entropy coefficient, replay buffer, the states of the episodes, and
+        the states of the random number generators.
         """
         found = super().tensors()
         found |= {f"policy.{name}": value for name, value in self.policy.actor.state_dict().items()}  # type: ignore[attr-defined]
@@ -278,7 +282,7 @@ class SacLearner(ActorLearner):
         return found | {f"random.{name}": value for name, value in self._random.tensors().items()}
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars that are stored together with `tensors`."""
+        """Numbers that a checkpoint stores in addition to `tensors`."""
         model = self.model
         return super().facts() | {
             "transitions": model.num_timesteps,
@@ -287,7 +291,7 @@ class SacLearner(ActorLearner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state that the methods `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         model, buffer = self.model, self.model.replay_buffer
         self.actor.load_state_dict(below(tensors, "policy"))

@@ -27,7 +27,7 @@ LOG_LOW, LOG_HIGH = -5.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Transitions in B steps of episodes.
+    """B transitions; each is one step of an episode.
 
     Attributes:
         seen: observations before the step, (B, k).
@@ -139,8 +139,8 @@ class SoftActorCritic(nn.Module):
     def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Make one gradient step of critics, actor and temperature; return the loss of the critics, ().
 
-        The losses are those of Equations 5, 7 and 18 of Haarnoja et al., where the value of an action is the
-        smaller of the values that the two critics give.
+        The losses are those of Equations 5, 7 and 18 of Haarnoja et al. Each critic values an action; the
+        smaller of the two values is used.
         """
         seen, after = self._normalised(batch.seen), self._normalised(batch.after)
         weight = self.temperature.detach().exp()
@@ -204,7 +204,7 @@ class SoftActorCritic(nn.Module):
         return found
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore weights and optimisers from what `tensors` returned."""
+        """Restore the weights and optimisers that the method `tensors` returned."""
         self.load_state_dict(below(tensors, "sac.weights"))
         for name, optimizer in self.optimizers.items():
             restore_optimizer(optimizer, below(tensors, f"sac.{name}"))

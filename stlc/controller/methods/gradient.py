@@ -23,7 +23,7 @@ class Gradient(NetworkMethod):
     """
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve the options.
+        """Determine the options.
 
         As in Meng and Fan (2023), every step uses newly drawn states. With `train: {samples: N}` in the
         system file, a fixed training set of N states is used instead.
@@ -32,7 +32,7 @@ class Gradient(NetworkMethod):
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective of Meng and Fan (2023); its margin is the gamma of the system file."""
+        """Objective of Meng and Fan (2023); it rewards robustness up to gamma, given in the system file."""
         return paper_objective(learner.task)
 
 

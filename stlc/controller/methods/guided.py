@@ -1,8 +1,8 @@
-"""Search and distil: plans of failing states are repaired by local search and imitated.
+"""Search and distil: a local search repairs the policy's bad plans, and the policy imitates the results.
 
-Every few dozen steps the policy's plans from newly drawn states are judged; failing plans are repaired by a
-search that starts from them, and repaired plans are imitated for as long as the policy fails at their state
-(docs/decisions/0007-training-engine.md).
+Every few dozen steps the policy's plans from newly drawn states are judged. A search starts from the plans
+that violate the specification and tries to repair them. The policy imitates a repaired plan for as long as
+its own plan from the same state violates the specification (docs/decisions/0007-training-engine.md).
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ class Guided(NetworkMethod):
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """Resolve the options.
+        """Determine the options.
 
-        By default the network proposes four plans. Half of the states of a step are newly drawn, the other
-        half are states at which the policy failed before and for which the search found a plan.
+        By default the network proposes four plans per state. Half of the states of a training step are newly
+        drawn. The other half are states from which the policy failed before, but the search found a plan.
         """
         found = base_config(task, config, kind=self.options, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective with exact min and max, and a saturating hinge at `learner.margin`.
+        """Objective on exact robustness (not smoothed); it rewards robustness up to `learner.margin`.
 
-        This margin is a robustness that the search for plans reaches on most states.
+        The search for plans can reach this margin from most states. The loss of a plan far below it grows
+        only slowly, so that states without a satisfying plan do not dominate.
         """
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance

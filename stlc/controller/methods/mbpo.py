@@ -1,13 +1,14 @@
 """MBPO: model-based policy optimisation (Janner, Fu, Zhang and Levine, NeurIPS 2019).
 
-An ensemble learns the system from episodes of the policy. Short imagined episodes begin at observed states,
-and soft actor-critic learns from their transitions, together with a few observed ones. The reward of imagined
-steps is not learnt, but computed by the task. If an imagined episode reaches the last step of a plan, its
-robustness is computed on the observed states before its beginning together with the imagined states.
+An ensemble learns the system from episodes of the policy. Short imagined episodes (predicted by the ensemble)
+begin at observed states. Soft actor-critic learns from their transitions, together with a few observed ones.
+The reward of imagined steps is not learnt, but computed by the task. If an imagined
+episode reaches the last step of a plan, the robustness of the whole trajectory is computed: of the observed
+states up to the beginning of the imagined episode, followed by the imagined states.
 
-The settings of Meng and Fan (2023) for their comparison: the options `environments=1 growth=0 imagined=400
-longest=15 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
-temperature=0.2`, and `--lr 3e-4`. Unlike here, they also learn the reward.
+Meng and Fan (2023) compare with MBPO under these settings: `environments=1 growth=0 imagined=400 longest=15
+growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256 temperature=0.2`, and
+`--lr 3e-4`. Unlike here, they also learn the reward.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ class MbpoConfig(ModelConfig):
     """Options of MBPO.
 
     Attributes:
-        imagined: number of imagined episodes that begin for every observed step.
-        shortest: length of imagined episodes at first, in steps.
-        longest: length of imagined episodes in the end, in steps.
-        growing_from: training step from which the length grows linearly.
-        growing_to: training step at which the length reaches `longest`.
+        imagined: number of imagined episodes per observed step.
+        shortest: number of steps of an imagined episode at first.
+        longest: number of steps of an imagined episode in the end.
+        growing_from: training step from which this number of steps grows linearly.
+        growing_to: training step at which this number reaches `longest`.
         observed: share of observed transitions in a batch; the others are imagined.
         updates: number of gradient steps of actor and critics for every observed step.
         critic_width: number of units per hidden layer of actor and critics.
@@ -149,7 +150,10 @@ class MbpoLearner(ModelLearner):
         return loss
 
     def _seen(self, states: Tensor, steps: Tensor) -> Tensor:
-        """Observations of states (B, n) at steps (B,), with the elapsed share of the episode: (B, k)."""
+        """Observations of states (B, n) at the steps `steps` (B,) of an episode: (B, k).
+
+        The last entry is the elapsed share of the episode.
+        """
         seen = self.task.system.observe(states)
         return torch.cat((seen, (steps / self.task.horizon)[:, None].to(seen)), 1)
 
@@ -190,8 +194,10 @@ class MbpoLearner(ModelLearner):
     def _imagined(self, count: int) -> Batch:
         """Imagine at least `count` episodes of up to `length` steps, from random observed states.
 
+        `count` is rounded up to a multiple of the number of networks that predict.
+
         Returns:
-            The transitions of all steps; those with non-finite states or rewards are left out.
+            The transitions of all steps, without those whose states or rewards are not finite.
         """
         model, horizon, length = self.model, self.task.horizon, self.length
         members = model.predictor.elites
@@ -226,11 +232,11 @@ class MbpoLearner(ModelLearner):
         """Rewards of one imagined step of B episodes: (B,).
 
         Args:
-            paths: states of the episodes, including those after the step, (B, T+1, n).
+            paths: states of the whole episodes, filled up to the state after the step, (B, T+1, n).
             x: states before the step, (B, n).
             moved: states after the step, (B, n).
             controls: controls of the step, (B, m).
-            ends: whether the episode ends with the step, (B,).
+            ends: True for the episodes that end with this step, (B,).
         """
         if self.reward == "task":
             return step_rewards(self.task, x, moved, controls)
@@ -248,7 +254,7 @@ class MbpoLearner(ModelLearner):
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state that the methods `tensors` and `facts` returned."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 
@@ -260,7 +266,7 @@ class Mbpo(Method):
     learns = MbpoLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> MbpoConfig:
-        """Resolve the options; `--batch` and `--lr` are those of actor and critics."""
+        """Determine the options; `--batch` and `--lr` apply to actor and critics, not to the ensemble."""
         found = base_config(task, config, kind=MbpoConfig, rate=RATE)
         return replace(found, hidden=HIDDEN, plans=1, batch=config.batch or BATCH, every=EVERY, pool=POOL)
 

@@ -1,13 +1,13 @@
 """PETS: probabilistic ensembles with trajectory sampling (Chua et al., NeurIPS 2018).
 
-An ensemble learns the system from episodes. The policy searches for a plan whenever it is called, by the
-cross-entropy method over control sequences. The value of a sequence is the mean reward of several imagined
-episodes (particles), predicted by different networks. By default a search covers the whole plan, with
-controls that are constant over a few steps.
+An ensemble of networks learns the system from episodes. Whenever the policy is called, it searches for a plan
+by the cross-entropy method: it samples control sequences and keeps the best. The value of a sequence is the
+mean reward of several imagined episodes (particles), each predicted by one of the networks. By default a
+search covers the whole plan, with controls that are constant over a few steps.
 
-The settings of Meng and Fan (2023) for their comparison: `--reward task`, and the options `ahead=5 piece=1
+Meng and Fan (2023) compare with PETS under these settings: `--reward task`, and `ahead=5 piece=1
 population=350 rounds=5 particles=20 model_lr=7.5e-4 model_decay=3e-5 model_held=0 model_epochs=25 growth=0
-environments=10`. For the deployment of the policy they use `ahead=3 particles=3`.
+environments=10`. In closed-loop simulations they use `ahead=3 particles=3`.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ class PetsConfig(ModelConfig):
     """Options of PETS.
 
     Attributes:
-        ahead: number of steps that a search covers; 0: one search covers the whole plan. If it is positive, a
-            search is made for every step of the plan, and only the first control of its result is used. It
-            has no effect with rewards other than `task`: these need a whole episode, so one search covers the
-            whole plan.
+        ahead: number of steps that a search covers. If it is positive, a search is made for every step of the
+            plan, and only the first control of its result is used. If it is 0, one search covers the whole
+            plan. The same holds for the rewards `robustness` and `accuracy`, which need a whole episode.
         piece: number of steps over which a control is constant.
         population: number of control sequences in a round.
         rounds: number of rounds of the cross-entropy method.
-        elite_share: share of the population, the best sequences, from which the next round is sampled.
-        inertia: weight of the former mean and variance (alpha of Chua et al. 2018).
-        particles: number of imagined episodes per control sequence, distributed evenly over the elites (the
-            networks with the least validation error).
+        elite_share: share of the population that counts as best. These sequences determine the mean and
+            variance of the next round.
+        inertia: weight of the mean and variance of the round before (alpha of Chua et al. 2018).
+        particles: number of imagined episodes per control sequence. They are distributed evenly over the
+            elites, the networks with the least validation error.
     """
 
     environments: int = 8
@@ -110,9 +110,9 @@ class PetsPolicy(Policy):
     def sequence(self, x0: Tensor, generator: torch.Generator) -> Tensor:
         """Search for plans from states: (B, n) -> (B, T, m).
 
-        If `config.ahead` is 0, one search finds the whole plan. Otherwise a search is made for each step, and
-        the first control of its result is used. The state after this step is computed by the model of the
-        system, not by the learnt one.
+        If `config.ahead` is 0 or the reward is not `task`, one search finds the whole plan. Otherwise a
+        search is made for each step, and the first control of its result is used. The next search starts from
+        the state after this step, computed by the exact model of the system, not by the learnt one.
         """
         if not self._config.ahead or self._reward != "task":
             return self._optimised(x0, self.task.horizon, generator)
@@ -180,7 +180,7 @@ class PetsPolicy(Policy):
         return chosen.repeat_interleave(config.piece, 1)[:, :steps]
 
     def _values(self, x0: Tensor, sequences: Tensor, generator: torch.Generator) -> Tensor:
-        """Mean over the particles of the reward of imagined episodes under control sequences, (B, P).
+        """Value of control sequences, (B, P): the mean reward of their particles (imagined episodes).
 
         Args:
             x0: states, (B, n).
@@ -206,7 +206,7 @@ class PetsPolicy(Policy):
 
 
 class PetsLearner(ModelLearner):
-    """Training by PETS: a search with the ensemble finds plans; the ensemble learns from their episodes."""
+    """Training by PETS: plans are found with the ensemble, which then learns from the resulting episodes."""
 
     config: PetsConfig
 
@@ -243,7 +243,7 @@ class Pets(Method):
     learns = PetsLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
-        """Resolve the options; a validation judges few states, since planning takes long."""
+        """Determine the options; a validation judges plans from few states, since planning takes long."""
         found = base_config(task, config, kind=PetsConfig)
         return replace(found, hidden=(200,) * 4, plans=1, every=EVERY, pool=POOL)
 

@@ -28,7 +28,7 @@ class PlanConfig(ResolvedConfig):
         planner: name of the planner.
         options: JSON object with the options of the planner, name -> text.
         seconds: processor time per plan, in seconds.
-        evaluations: maximum number of plans judged to find one; 0 for no limit.
+        evaluations: maximum number of plans that the planner judges in one search; 0 for no limit.
     """
 
     planner: str = PLANNERS.default
@@ -43,7 +43,7 @@ class PlanMethod(Method):
     options = PlanConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> PlanConfig:
-        """Resolve the options; the options of the planner are taken from `config.planner`."""
+        """Determine the options; the options of the planner are taken from `config.planner`."""
         found = base_config(task, config, kind=PlanConfig)
         asked = config.planner
         if asked is None:
@@ -79,8 +79,8 @@ def planner_of(name: str, options: Mapping[str, str]) -> Planner:
     """Return the planner `name` with its options, for planning in closed loop.
 
     Raises:
-        UsageError: U101, the planner is `policy` (to simulate a trained policy, simulate its own run), or
-            there is no such planner or option.
+        UsageError: U101, there is no such planner or option; or `name` is `policy`, the planner that takes
+            the plans of a trained policy. The run of this policy is to be simulated instead.
     """
     if name == "policy":
         raise usage(

@@ -63,8 +63,8 @@ class PpoConfig(ActorConfig):
     Attributes:
         epochs: number of passes over the transitions of a training step.
         minibatches: number of gradient steps in a pass.
-        discount: discount factor of the return; 1 since episodes are finite and their elapsed share is
-            observed.
+        discount: discount factor of the return. By default 1: episodes are finite, and the policy observes
+            their elapsed share.
         trace: lambda of the generalised advantage estimation.
         ratio: bound on the change of the probability ratio (epsilon of Schulman et al. 2017).
         entropy: weight of the entropy bonus.
@@ -85,7 +85,7 @@ class PpoConfig(ActorConfig):
 
 
 class Moments(nn.Module):
-    """Running mean and standard deviation of vectors; 0 and 1 until the first vectors are added.
+    """Running mean and standard deviation of vectors; 0 and 1 before the first vectors are added.
 
     Attributes:
         mean: mean, (k,) float32.
@@ -158,7 +158,7 @@ class ActorCritic(nn.Module):
         return self.controls(mean)
 
     def judged(self, seen: Tensor, noise: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithm of the probability density of raw controls, and values of the states, (B,) each.
+        """Logarithm of the probability density of the controls `raw`, and the critic's values, (B,) each.
 
         Args:
             seen: normalised observations, (B, k).
@@ -220,8 +220,8 @@ class Episodes:
     Attributes:
         seen: observations, (T, N, k).
         raw: controls before squashing, (T, N, w).
-        noise: exploration noise of the step before (of the first step: a random draw), in standard
-            deviations, (T, N, w).
+        noise: exploration noise of the step before, in standard deviations, (T, N, w); for the first step, a
+            random draw.
         density: logarithm of the probability density of the controls, (T, N).
         rewards: rewards of the steps, (T, N).
     """
@@ -326,9 +326,7 @@ class PpoLearner(ActorLearner):
         return (advantages - mean) / (spread + 1e-8), advantages + values
 
     def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
-        """Make all gradient steps of a training step on its episodes.
-
-        They end early if a loss or gradient is not finite.
+        """Make all gradient steps of one training step; stop early if a loss or gradient is not finite.
 
         Args:
             episodes: transitions, with normalised observations.
@@ -364,8 +362,8 @@ class PpoLearner(ActorLearner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly: random numbers, network, optimiser.
 
-        All ranks (processes that train together) must call this at the same time. On the first rank, the
-        result contains the random numbers of all ranks.
+        All ranks (processes that train together) must call this at the same time. Only on the first rank
+        does the result contain the random numbers of all ranks; it is the one to be stored.
         """
         own = super().tensors()
         found = dict(own)
@@ -375,7 +373,7 @@ class PpoLearner(ActorLearner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state that the methods `tensors` and `facts` returned."""
         own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
         super().restore(tensors | own, facts)
         self.network.load_state_dict(below(tensors, "network"))
@@ -389,7 +387,7 @@ class Ppo(Method):
     learns = PpoLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> PpoConfig:
-        """Resolve the options; `--batch` sets the number of episodes that are simulated in parallel."""
+        """Determine the options; `--batch` sets the number of episodes that are simulated in parallel."""
         found = base_config(task, config, kind=PpoConfig, batch=ENVIRONMENTS, rate=RATE)
         return replace(found, hidden=HIDDEN, plans=1, every=EVERY, environments=found.batch)
 

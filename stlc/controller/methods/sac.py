@@ -36,7 +36,7 @@ class Sac(Method):
     options = SacConfig
 
     def resolve(self, task: Task, config: TrainConfig) -> SacConfig:
-        """Resolve the options; `--batch` is the number of transitions of a gradient step."""
+        """Determine the options; `--batch` is the number of transitions of a gradient step."""
         found = base_config(task, config, kind=SacConfig, batch=BATCH, rate=RATE)
         return replace(found, plans=1, share=0.0, every=EVERY)
 

@@ -1,8 +1,8 @@
 """Job bundles for other machines: inputs are sent, and runs returned, as archives.
 
-A worker (machine that runs a job) with the caller's file system uses the caller's folders. Any other worker
-recreates them in a temporary folder, with every file under its whole path, so that references between files
-stay valid.
+A worker is a machine that runs a job. If it shares the caller's file system, it uses the caller's folders.
+Any other worker copies them to a temporary folder. A copy keeps the whole path of the original below this
+folder (`/home/ann/a.stl` becomes `TEMPORARY/home/ann/a.stl`), so that references between files stay valid.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class JobBundle:
     def of(cls, job: Job, cores: int) -> JobBundle:
         """Pack the input files of a job, and create its probe file.
 
-        The probe file can be seen only by machines that share the file system of this machine. Its deletion
-        asks them to stop the job.
+        The probe file can be seen only by machines that share the file system of this machine. When it is
+        deleted, such a machine saves and stops the job.
 
         Raises:
             MissingError: R201, the folder of the job's runs cannot be written.
@@ -96,9 +96,9 @@ class BundleResult:
     """Result of a job, as a worker returns it.
 
     Attributes:
-        code: exit code of the training.
-        out: standard output of the training.
-        said: the last lines of the standard error of the training.
+        code: exit code of the training process.
+        out: standard output of this process.
+        said: the last lines of its standard error.
         cores: number of cores that the job had.
         run: path of the run on the caller's machine; None if nothing has to be transferred.
         files: archive of the run.
@@ -208,9 +208,9 @@ def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, s
 
 @contextmanager
 def claimed(count: int) -> Iterator[frozenset[int]]:
-    """Context that reserves `count` cores which no other job on this machine uses; yields their numbers.
+    """Context that reserves `count` cores that no other job on this machine uses; yields their numbers.
 
-    If too few are free, all cores are yielded.
+    If fewer cores are free, the numbers of all cores are yielded.
     """
     everything = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     try:
@@ -274,7 +274,7 @@ def unpack(data: bytes, folder: Path) -> None:
 def input_files(
     path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
 ) -> tuple[Path, ...]:
-    """Paths of the input files of a training.
+    """Paths of the input files of a training run.
 
     If a file has errors, the files that it names may be missing; the training itself reports the errors.
 

@@ -1,4 +1,4 @@
-"""Data-parallel training by several processes (`torchrun`): ranks, collectives, agreement.
+"""Data-parallel training by several processes (ranks), started by `torchrun`.
 
 Every rank draws its own states, searches on its own, and learns from the mean of all gradients, so that all
 ranks have the same weights. Decisions that must be equal on all ranks (steps, margin, when to save, when to
@@ -33,9 +33,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Ranks:
-    """Process of a training that is distributed over several processes (ranks).
+    """One of the processes (ranks) of a distributed training run, and its communication with the others.
 
-    If it is the only one, its collective operations do not communicate.
+    The methods that communicate (`learn`, `mean`, `any`, `gather`, and those that begin with `agree`) are
+    collective: all ranks must call them at the same time. If there is only one process, nothing is sent.
 
     Attributes:
         rank: index of this process, from 0.

@@ -29,9 +29,9 @@ class Job:
     Attributes:
         name: identifies the job.
         arguments: arguments of `stlc train`, without `--json`.
-        inputs: input files and folders; they are sent to a worker that does not share the file system.
-        runs: folder on this machine in which the run is stored, also if a worker sends it; None: the default
-            one.
+        inputs: input files and folders; they are sent to workers that do not share the file system.
+        runs: folder on this machine in which the run is stored, even if another machine trains; None: the
+            default folder.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Executor(Protocol):
 
 @dataclass(slots=True)
 class LocalExecutor:
-    """Executor of `workers` local processes at a time; each is pinned to its share of the cores.
+    """Executor of up to `workers` local processes at a time; each is pinned to its share of the cores.
 
     A second interrupt kills all processes. The method `run` of an object may be called only once.
     """
@@ -145,7 +145,7 @@ class LocalExecutor:
         return process
 
     def stop(self) -> None:
-        """Ask every process to save and stop, and wait; a further interrupt kills them."""
+        """Ask all processes to save and stop, and wait for them; an interrupt meanwhile kills them."""
         with self.lock:
             self.stopped = True
             going = tuple(self.live)

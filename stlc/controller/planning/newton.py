@@ -1,8 +1,8 @@
 """Gauss-Newton steps towards plans whose states meet conditions at given samples.
 
-Each step linearises the rollout of a plan and its conditions, and changes the controls as little as possible
-such that the linearised conditions hold (a damped least-squares problem with bounds). Derivatives are
-differences: no gradient of the system is needed.
+Each step linearises the predicted states of a plan and the conditions on them. Then it makes the smallest
+change of the controls for which the linearised conditions hold (a damped least-squares problem with bounds).
+The derivatives of the conditions are approximated by differences.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ PROJECTIONS = 10
 class GaussNewton:
     """Gauss-Newton steps for plans of one task.
 
-    Distances from a condition are those of its linearisation, in units of `spread`.
+    The distance of a state from a condition is measured to the boundary of the linearised condition. Each
+    state component is first divided by its `spread`, so that distances have no unit.
 
     Attributes:
         spread: typical range of each state, (n,).
@@ -65,10 +66,10 @@ class GaussNewton:
             task: specification and system.
             conditions: formulas over the states of one sample.
             spread: typical range of each state, (n,).
-            pull: derivative of linear forms of the states, of `state_gradient`.
+            pull: function that `state_gradient` returned for the system.
             rows: maximum number of conditions, the worst ones, that a step considers.
-            margin: distance by which the conditions shall hold.
-            damping: damping of the least-squares problem, relative to its diagonal.
+            margin: distance from their boundaries at which the conditions shall hold.
+            damping: damping of the least-squares problem, relative to the mean of its diagonal.
         """
         self.task, self.spread = task, spread.clamp(min=TINY)
         self._conditions, self._rows, self._margin, self._damping = conditions, rows, margin, damping
@@ -86,11 +87,11 @@ class GaussNewton:
         Args:
             x0: initial states, (B, n).
             plans: plans, (B, T, m).
-            needed: whether a condition is needed at a sample, (B, conditions, T + 1).
+            needed: True where a condition must hold at a sample, (B, conditions, T + 1).
 
         Returns:
-            The changed plans, and the sum of the distances by which the plans before missed their conditions,
-            (B,).
+            The changed plans, (B, T, m); and for each plan before the change, the sum of the distances by
+            which its states missed the needed conditions, (B,).
         """
         states = self.task.rollout(x0, plans)
         values, slopes = self._linear(states)
@@ -108,10 +109,11 @@ class GaussNewton:
 
     @torch.no_grad()
     def nearest(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """States near `state`, (n,), that meet one condition each, whatever the dynamics.
+        """For each condition, find a state near `state`, (n,), that meets it; dynamics are ignored.
 
         Returns:
-            The states, (conditions, n), and whether `state` itself violates the condition, (conditions,).
+            The states, (conditions, n); and True for each condition that `state` itself violates,
+            (conditions,).
         """
         count = len(self._conditions)
         places, index = state.repeat(count, 1), torch.arange(count)
@@ -126,9 +128,11 @@ class GaussNewton:
         return places, violated
 
     def _linear(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (conditions, T + 1, B) and slopes (conditions, T + 1, r, B) at states (B, T + 1, n).
+        """Values of the conditions at states (B, T + 1, n), and derivatives of these values.
 
-        The slopes are those by the `r` states that the conditions read.
+        Returns:
+            Values, (conditions, T + 1, B); and derivatives, (conditions, T + 1, r, B), with respect to the r
+            components of the state that occur in the conditions.
         """
         probe = PROBE * self._scale
         moves = states.new_zeros(1 + len(probe), states.shape[2])
@@ -139,16 +143,16 @@ class GaussNewton:
         return values[:, :, 0], (values[:, :, 1:] - values[:, :, :1]) / probe[:, None]
 
     def _effects(self, x0: Tensor, plans: Tensor, rows: Tensor, when: Tensor) -> Tensor:
-        """Derivatives of linear forms of states by the plan.
+        """Derivatives of weighted sums of state components with respect to the controls of the plans.
 
         Args:
             x0: initial states, (B, n).
             plans: plans, (B, T, m).
-            rows: the linear forms, (B, K, n).
-            when: sample of each form, (B, K).
+            rows: weights of K sums per plan, (B, K, n).
+            when: sample at which the state of each sum is taken, (B, K).
 
         Returns:
-            Derivatives, (B, K, T * m).
+            Derivatives of each sum with respect to all controls of its plan, (B, K, T * m).
         """
         batch, count, size = rows.shape
         columns = rows.new_zeros(size, plans.shape[1] + 1, batch * count)
@@ -157,9 +161,17 @@ class GaussNewton:
         return self._pull(*each, columns).view(batch, count, -1)
 
     def _change(self, plans: Tensor, effect: Tensor, missing: Tensor) -> Tensor:
-        """The smallest change of plans (B, T, m) that makes up for what is `missing`, (B, K), within bounds.
+        """Smallest change of plans, within the control bounds, after which each plan meets K conditions.
 
-        Controls that would leave their bounds are put there; the others then make up for the rest.
+        Controls that would leave their bounds are set to them; the other controls then make up for the rest.
+
+        Args:
+            plans: plans, (B, T, m).
+            effect: derivative of each condition's distance with respect to the controls, (B, K, T * m).
+            missing: distance by which each condition is missed, (B, K).
+
+        Returns:
+            The change, (B, T, m).
         """
         span = self._span
         now = (plans / span).flatten(1)
@@ -190,10 +202,11 @@ def values_of(task: Task, conditions: Sequence[ir.Formula], states: Tensor) -> T
 
 
 def state_gradient(system: System) -> Pull:
-    """Return a function for the derivative, by the plan, of a linear form of the states.
+    """Return a function that differentiates weighted sums of predicted states with respect to plans.
 
-    Its arguments are initial states (B, n), plans (B, T, m) and the coefficients (n, T + 1, B), all float64;
-    its result is (B, T, m). It runs in C if a compiler is installed.
+    The arguments of this function are initial states (B, n), plans (B, T, m), and the weight of every state
+    at every sample, (n, T + 1, B), all float64. It returns the derivative of the B weighted sums with respect
+    to the controls, (B, T, m). It runs in C if a compiler is installed.
     """
     try:
         fixed = [timer.name for timer in system.timers]

@@ -127,8 +127,8 @@ class PlanSearch:
     def open(self) -> Tensor:
         """Indices of the initial states for which the search is to continue, (k,).
 
-        For these states the best robustness is below the target, and some budget is left. The planner has
-        neither proved that no plan satisfies the specification, nor ended its search.
+        The search for a state ends when the best plan reaches the target robustness, when the budget is
+        spent, or when the planner sets `infeasible` or `ended` for the state.
         """
         if self.budget.stop():
             return torch.zeros(0, dtype=torch.int64)
@@ -182,7 +182,7 @@ class PlanSearch:
     def charged(self, rows: Tensor) -> Iterator[None]:
         """Context whose processor time is added to `seconds`, in equal parts for the states `rows`, (k,).
 
-        At its end, the search's function `progress` is called.
+        At the end of the context, the function `progress`, if given to the search, is called.
         """
         before = process_time()
         try:
@@ -278,8 +278,8 @@ def plan(
         The best plans, judged exactly in float64.
 
     Raises:
-        UsageError: U101, there is no such planner or option, the planner cannot plan for this task, or `x0`
-            has another number of states than the system.
+        UsageError: U101, there is no such planner or option; or the planner cannot plan for this task; or the
+            last dimension of `x0` differs from the number of states.
         MissingError: R301, the planner needs a package that is not installed.
     """
     given = torch.as_tensor(x0, dtype=torch.float64)
@@ -294,7 +294,7 @@ def plan(
 
 
 class PlannerPolicy(Policy):
-    """Policy that searches for a plan from each state with a planner, within the budget per state."""
+    """Policy that lets a planner search for a plan from each state, within the planner's budget."""
 
     def __init__(self, task: Task, planner: Planner, budget: PlanBudget, *, seed: int = 0) -> None:
         super().__init__(task)
@@ -309,7 +309,7 @@ class PlannerPolicy(Policy):
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans by a short local search instead of the policy's planner: (B, n) -> (B, T, m)."""
+        """Plans found by a short local search; the policy's planner is not used: (B, n) -> (B, T, m)."""
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]

@@ -1,7 +1,10 @@
-"""Schedules: random choices of when, and by which alternative, the parts of a formula shall hold.
+"""Schedules: random choices of the samples at which the parts of a formula shall hold.
 
-A schedule decides every `or`, `eventually` and `until` of a specification. What remains are conditions on
-states that must hold at known samples. A trajectory that meets them satisfies the specification.
+A schedule selects one sample for every `eventually` and `until` of a specification, and one operand of every
+`or` of temporal formulas. Conditions on states remain, which must hold at known samples. A trajectory that
+meets them satisfies the specification.
+
+Example: for `eventually@[0 s, 9 s] x > 1`, one schedule is "x > 1 at 4 s".
 """
 
 from __future__ import annotations
@@ -24,14 +27,15 @@ MOST_INSTANTS = 16
 
 
 class GoalScheduler:
-    """Draws schedules of some formulas.
+    """Generator of random schedules for given formulas.
 
-    Sub-formulas that cannot be decided in advance (those of the past, `freeze`, an `always` over a long
-    window of choices, conditions that read other signals than states) are left out: a trajectory may meet the
-    schedule and still violate them.
+    A formula that only compares the states of one sample is called a condition. Schedules leave out some
+    parts of the formulas: past operators, `freeze`, an `always` over a long window whose operand needs
+    choices, and comparisons that read other signals than states. Therefore a trajectory may meet a schedule
+    and still violate the formulas.
 
     Attributes:
-        conditions: the conditions on states that schedules refer to.
+        conditions: the conditions in the formulas. A conjunction is split into its parts.
     """
 
     def __init__(self, formulas: Sequence[ir.Formula], states: Sequence[str], steps: int) -> None:
@@ -52,7 +56,7 @@ class GoalScheduler:
         """Draw `count` schedules, and drop those that contradict themselves.
 
         Returns:
-            Whether a condition is needed at a sample, (schedules, conditions, T + 1).
+            True where a schedule needs a condition at a sample, (schedules, conditions, T + 1).
         """
         drawing = _Drawing(self, count, random)
         for i in random.permutation(len(self._formulas)):
@@ -69,15 +73,18 @@ class GoalScheduler:
         return self._steps
 
     def number(self, condition: ir.Formula) -> int:
-        """Index of a condition."""
+        """Index of `condition` in `conditions`."""
         return self._numbers[condition]
 
     def opposite(self, condition: ir.Formula) -> int | None:
-        """Index of the negation of a condition, if that is a condition too."""
+        """Index of the negation of `condition` in `conditions`; None if the negation is not there."""
         return self._opposed.get(self._numbers.get(condition, -1))
 
     def depth(self, formula: ir.Formula) -> int:
-        """Greatest number of nested choices of a sample in a formula."""
+        """Greatest number of nested operators in a formula for which a schedule chooses a sample.
+
+        Example: 2 for `eventually (p and eventually q)`.
+        """
         found = self._depths.get(id(formula))
         if found is None:
             own = isinstance(formula, ir.Windowed) and formula.op in ("eventually", "until", "release")
@@ -85,7 +92,7 @@ class GoalScheduler:
         return found
 
     def decidable(self, formula: ir.Formula) -> bool:
-        """True for a condition on the states of one sample."""
+        """True if a formula only compares the states of one sample, that is, if it is a condition."""
         known = self._decidable.get(id(formula))
         if known is None:
             known = self._decidable[id(formula)] = self._decided(formula)
@@ -99,7 +106,7 @@ class GoalScheduler:
         )
 
     def parts(self, formula: ir.Formula) -> Iterator[ir.Formula]:
-        """The conditions of which a condition is the conjunction."""
+        """Yield the parts of a condition: the operands of its conjunctions, or the condition itself."""
         if isinstance(formula, ir.BoolOp) and formula.op == "and":
             for item in formula.items:
                 yield from self.parts(item)
@@ -107,7 +114,10 @@ class GoalScheduler:
             yield formula
 
     def present(self, formula: ir.Formula) -> Iterator[ir.Formula]:
-        """The conditions that must hold at the sample at which a formula holds."""
+        """Yield the conditions that must hold at a sample if a formula is to hold at the same sample.
+
+        Conditions inside temporal operators, such as `eventually`, are not included.
+        """
         match formula:
             case ir.BoolOp("and", items):
                 for item in items:
@@ -132,11 +142,11 @@ def _opposite(condition: ir.Predicate) -> ir.Predicate:
 
 
 class _Drawing:
-    """Schedules that are being drawn side by side.
+    """Many schedules that are drawn at the same time.
 
     Attributes:
-        needed: whether a condition is needed at a sample, (schedules, conditions, T + 1).
-        possible: schedules without a window that is empty, (schedules,).
+        needed: True where a schedule needs a condition at a sample, (schedules, conditions, T + 1).
+        possible: False for a schedule in which no sample was left for some formula, (schedules,).
     """
 
     def __init__(self, scheduler: GoalScheduler, count: int, random: Generator) -> None:
@@ -147,7 +157,13 @@ class _Drawing:
         self.possible = np.ones(count, np.bool_)
 
     def need(self, formula: ir.Formula, now: Instants, on: Flags) -> None:
-        """Demand a formula at the samples `now`, in the schedules `on`: both (schedules,)."""
+        """Add to the schedules that `formula` must hold at one sample.
+
+        Args:
+            formula: the formula.
+            now: the sample for each schedule, (schedules,).
+            on: True for the schedules to which the formula is added, (schedules,).
+        """
         if not on.any():
             return
         if self._scheduler.decidable(formula):
@@ -195,9 +211,19 @@ class _Drawing:
                 self._always(right, first, np.where(released, chosen, last), on)
 
     def _chosen(self, formula: ir.Formula, allowed: Flags, on: Flags) -> tuple[Instants, Flags]:
-        """Random allowed samples, (schedules,), and the schedules that have one.
+        """Choose for each schedule `on` one of its allowed samples at random.
 
-        If `n` further choices follow within the formula, each is the first of `n + 1` random samples.
+        If further choices are nested in the formula, early samples are more likely, so that time is left for
+        these choices: with n nested choices, the earliest of n + 1 random samples is taken.
+
+        Args:
+            formula: formula for which the sample is chosen.
+            allowed: True at the allowed samples, (schedules, T + 1).
+            on: schedules in which a sample is to be chosen, (schedules,).
+
+        Returns:
+            The samples, (schedules,); and True for the schedules `on` that have an allowed sample,
+            (schedules,).
         """
         count = allowed.sum(1)
         share = 1.0 - self._random.random(len(on)) ** (1.0 / self._scheduler.depth(formula))
@@ -207,9 +233,9 @@ class _Drawing:
         return chosen, on & (count > 0)
 
     def _free(self, formula: ir.Formula) -> Flags:
-        """Samples at which a formula may hold: no opposite of its present conditions is needed there.
+        """Mask of the samples at which a formula may hold, (schedules, T + 1).
 
-        Shape (schedules, T + 1).
+        At these samples a schedule needs no condition whose negation the formula needs.
         """
         free = np.ones((len(self.needed), self._last + 1), np.bool_)
         for part in self._scheduler.present(formula):
@@ -228,7 +254,7 @@ class _Drawing:
                 self.need(formula, first + k, on & (first + k <= last))
 
     def _hold(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
-        """Demand a condition from the sample `first` to `last`."""
+        """Add to the schedules `on` that a condition must hold from sample `first` to sample `last`."""
         within = (self._samples >= first[:, None]) & (self._samples <= last[:, None]) & on[:, None]
         for part in self._scheduler.parts(formula):
             if isinstance(part, ir.Truth):
@@ -238,14 +264,17 @@ class _Drawing:
 
 
 def tempo(needed: Flags, apart: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Greatest speed that schedules demand between one goal and the next, per sample.
+    """Greatest speed that each schedule demands on the way from one goal to the next.
+
+    A speed is a distance divided by the number of samples in which it must be covered.
 
     Args:
-        needed: samples at which each goal is needed, (schedules, goals, T + 1).
-        apart: distances between the initial state and the goals, (1 + goals, 1 + goals).
+        needed: True where a schedule needs a goal at a sample, (schedules, goals, T + 1).
+        apart: distances between places, (1 + goals, 1 + goals). Place 0 is the initial state; the others are
+            the goals.
 
     Returns:
-        Speeds, (schedules,); 0 without goals.
+        Speeds, (schedules,); 0 for a schedule without goals.
     """
     count, goals, samples = needed.shape
     visited = np.logical_or.reduce(needed, axis=2)

@@ -33,8 +33,8 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
     Args:
         task: specification and system.
-        text: `random`; or assignments such as `x=1, v=2 m/s`, where states that are not assigned are random;
-            or the path of a trace file, in which the first sample of each trace is an initial state.
+        text: `random`; or assignments such as `x=1, v=2 m/s`, where all other states are random; or the path
+            of a trace file. In the last case the first sample of each trace is an initial state.
         count: number of initial states; for a trace file, the maximum number.
         seed: seed of random states.
 
@@ -57,7 +57,8 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     """Name of a state and its value in SI units, from a text such as `v = 2 m/s`.
 
     Raises:
-        UsageError: U101, the system has no such state, or the value is not a number with a unit.
+        UsageError: U101, the system has no such state; or the value is neither a number, with or without a
+            unit, nor a label of the state.
     """
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
@@ -103,11 +104,11 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
 @torch.no_grad()
 def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
-    """Trace file's content for plans: the predicted trajectory from each initial state is one trace.
+    """Convert plans to the content of a trace file: one trace, the predicted states, per initial state.
 
-    Further arrays: `action.NAME`, the actuator commands of every control, (traces, steps); `plan_rho`, the
-    robustness of the plan, (traces,); `infeasible`, 1 if the planner proved that no plan satisfies the
-    specification, (traces,).
+    Besides the states there are the arrays `action.NAME`, (traces, steps), the actuator commands of the
+    control NAME; `plan_rho`, (traces,), the robustness of each plan; and `infeasible`, (traces,), 1 if the
+    planner proved that no plan satisfies the specification.
     """
     states = task.rollout(result.states, result.plans).numpy()
     commanded = task.system.commanded(

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class Policy(ABC):
     """Interface of planners and trained policies: candidate plans, and the selection among them.
 
-    Of the candidates that satisfy the specification, the one with the least performance cost is selected; if
-    there is none, the one with the largest exact robustness.
+    Of the candidate plans that satisfy the specification, the one with the least performance cost is
+    selected. If no candidate satisfies it, the one with the largest exact robustness is selected.
 
     Attributes:
         task: task whose verdicts select the plan; `for_task` returns the policy for another task.
@@ -47,22 +47,25 @@ class Policy(ABC):
         """All candidate plans in physical units: (B, n) -> (B, plans, T, m)."""
 
     def for_task(self, task: Task) -> Self:
-        """This policy for another task of the same system, for example one with robustness margins."""
+        """Copy of this policy that selects plans by the verdicts of `task`, another task of the same system.
+
+        Example: a task whose requirements must be satisfied with robustness margins.
+        """
         other = copy(self)
         other.task = task
         return other
 
     @torch.no_grad()
     def plan(self, x0: Tensor) -> Tensor:
-        """The selected plan, physical units: (B, n) -> (B, T, m) in the dtype of `x0`."""
+        """The selected plan from each state, in physical units: (B, n) -> (B, T, m) in the dtype of `x0`."""
         plans = self.candidates(x0).to(x0.dtype)
         return plans[:, 0] if plans.shape[1] == 1 else self._best(x0, plans)[0]
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans from the states to which many prefixes (first actions of plans) lead: (B, n) -> (B, T, m).
+        """Plans that continue prefixes (first actions of plans): (B, n) -> (B, T, m).
 
-        By default these are the plans of `plan`. A policy whose `plan` is slow returns plans that are cheaper
-        to compute.
+        `x0`: the states that the prefixes reach. Since these may be many, a policy whose method `plan` is
+        slow returns plans here that are faster to compute. By default the plans are those of `plan`.
         """
         return self.plan(x0)
 
@@ -72,11 +75,17 @@ class Policy(ABC):
 
     @torch.no_grad()
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan, as `plan` returns it, and its verdicts, one row per state."""
+        """The selected plan from each state, as `plan` returns it, and the verdicts on these plans."""
         return self._best(x0, self.candidates(x0).to(x0.dtype))
 
     def _best(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The best of the plans (B, plans, T, m) from each state, and its verdicts."""
+        """Select the best of the plans from each state.
+
+        `plans`: candidate plans, (B, plans, T, m).
+
+        Returns:
+            The selected plans, (B, T, m), and the verdicts on them.
+        """
         batch, count = plans.shape[:2]
         if count == 1:
             return plans[:, 0], self.task.judge(x0, plans[:, 0])
@@ -87,10 +96,12 @@ class Policy(ABC):
 
 
 class ModelRollout(Policy):
-    """Policy from a one-step actor: the plan is its closed-loop action sequence on the model.
+    """Policy made from an actor, a function that chooses one action per step.
+
+    The plan consists of the actions that the actor chooses in closed loop on the model of the system.
 
     Args:
-        actor: states (B, n), timers included, -> actions (B, m) in physical units.
+        actor: the actor: states (B, n), timers included, -> actions (B, m) in physical units.
         task: specification and system.
     """
 
@@ -115,7 +126,7 @@ class PlanNetwork(nn.Module):
 
     Attributes:
         plans: number of plans.
-        mirror: the system's symmetry; None if it has none or the method does not use it.
+        mirror: the system's mirror symmetry; None if the system has none or the network does not use it.
         centre: mean of the observations, (k,), by which the network's inputs are centred.
         spread: standard deviation of the observations, (k,), by which the network's inputs are divided.
     """
@@ -164,9 +175,11 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Mirror states (B, n) on one side of the symmetry; return all, and the mask of the mirrored ones.
+        """Mirror those of the states (B, n) that lie on one side of the symmetry.
 
-        The mask is (B,). Without a symmetry the states are unchanged, and the mask is None.
+        Returns:
+            All states, (B, n); and the mask of the mirrored states, (B,). Without a symmetry no state is
+            mirrored, and the mask is None.
         """
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 

@@ -1,8 +1,9 @@
 """Episodes of a task on its model, in one batch: environment for learners that choose one action per step.
 
-An episode begins at a random initial state and has as many steps as a plan. There are the three rewards that
-Meng and Fan (2023) compare: the one that the system declares for every step (RL_R), the robustness of the
-episode at its end (RL_S), and at its end whether it satisfies the specification (RL_A).
+An episode begins at a random initial state and has as many steps as a plan. There are three rewards, compared
+by Meng and Fan (2023). `task` (RL_R) is the reward that the system file declares for every step. The others
+are given once, at the end of an episode: `robustness` (RL_S) is its robustness; `accuracy` (RL_A) is positive
+if it satisfies the specification, else 0.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ MOST = 10.0
 
 
 def require_reward(task: Task, reward: str) -> None:
-    """Raise UsageError (U101) if no reward has the name `reward`.
+    """Check that a task has the reward `reward`.
 
-    The error is also raised if the name is `task`, but the system declares no reward.
+    Raises:
+        UsageError: U101, no reward has this name; or the name is `task`, and the system declares no reward.
     """
     if reward not in REWARDS:
         raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(REWARDS)}")
@@ -57,10 +59,10 @@ class Transition:
     """Result of one step of all environments.
 
     Attributes:
-        observation: observation after the step, (N, k); if an episode ended, the observation of the next
-            initial state.
+        observation: observation after the step, (N, k); if the episodes ended, that of their new initial
+            states.
         reward: reward of the step, (N,).
-        done: whether the episode ended, (N,) bool.
+        done: True for episodes that ended with the step, (N,) bool.
         final: observation after the step, before any reset, (N, k).
         rho: robustness of the episodes that ended, (N,); NaN for others.
         verdicts: exact verdicts on the episodes; None before their end.
@@ -100,7 +102,7 @@ class Environments:
         ahead: number of initial states that are drawn at a time, since drawing few is slow; 0: `count`.
 
     Raises:
-        UsageError: U101, no reward is named `reward`, or this name is `task` and the system declares no
+        UsageError: U101, no reward has the name `reward`; or the name is `task`, and the system declares no
             reward.
 
     Attributes:
@@ -197,7 +199,7 @@ class Environments:
         self._actions = self._blank()
 
     def _blank(self) -> Tensor:
-        """Array of zeros in which the actions of an episode are stored, (N, T, m)."""
+        """Make an array of zeros, (N, T, m), to which the actions of the episodes are written."""
         return torch.zeros((self.count, self.steps, len(self._low)), dtype=torch.float64)
 
     def _starts(self) -> Tensor:

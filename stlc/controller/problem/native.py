@@ -1,8 +1,8 @@
 """Native code of a task, from its dynamics and requirements: verdicts, local search, gradients, steps.
 
-Verdicts equal those of the torch graph and are tens of times faster: a training step in torch is about a
-thousand small array operations, in native code two calls. Without a compiler, on a GPU, or for formulas that
-cannot be written in C, torch is used, and `torch_reasons` gives the reason.
+Verdicts equal those computed in torch, and are tens of times faster: a training step needs about a thousand
+small array operations in torch, but only two calls of native code. torch is used if there is no compiler, on
+a GPU, and for formulas that cannot be written in C; `Task.torch_reasons` then gives the reason.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Options of a native local search; a row is one initial state.
+    """Options of a native local search for plans from several initial states.
 
     Attributes:
-        generations: number of generations of changed plans per row.
-        enough: robustness at which the search for a row ends.
+        generations: number of generations of changed plans per initial state.
+        enough: robustness at which the search for an initial state ends.
         seed: seed of the random changes.
         threads: number of threads; the result does not depend on it.
-        stop: condition that ends the search before all rows are done.
+        stop: condition that ends the whole search early.
     """
 
     generations: int
@@ -95,8 +95,8 @@ class NativeJudge:
             columns: whether to return the states.
 
         Returns:
-            Robustness (B, R), and states name -> (T+1, B), empty without `columns`. The kernel computes in
-            float64; the results have the dtype of `x0`.
+            Robustness, (B, R); and states, name -> (T+1, B), an empty mapping if `columns` is False. The
+            kernel computes in float64; the results have the dtype of `x0`.
         """
         rho, seen = self.kernel.judge(
             x0.detach().double().numpy(),
@@ -178,8 +178,8 @@ class NativeGradient:
         Args:
             x0: initial states, (B, n), not differentiated.
             u: plans in physical units, (B, T, m).
-            slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions at
-                distance x.
+            slope: k in the smooth step (1 + tanh(k x)) / 2. Jumps and conditions are true steps, with
+                derivative 0 almost everywhere. Gradients use the derivative of the smooth step instead.
         """
         each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
         return each, dict(zip(self.judge.names, columns.unbind(0), strict=True))
@@ -232,7 +232,7 @@ class NativeStep:
         """Build the functions for a system; None if there is no C code or compiler for it.
 
         Raises:
-            UsageError: U101, a reward is wanted (`rewarded`), but the system file declares none.
+            UsageError: U101, `rewarded` is True, but the system file declares no reward.
         """
         reward = system.require_reward() if rewarded else None
         given = commands(system.decl)
@@ -254,7 +254,8 @@ class NativeStep:
             share: elapsed share of the episode after the step, the last entry of each observation.
 
         Returns:
-            States (B, n), observations (B, k + 1) float32, and rewards (B,), None if built without a reward.
+            States, (B, n); observations, (B, k + 1) float32; and rewards, (B,), or None if this object was
+            built with `rewarded=False`.
         """
         after, seen, reward = self.compiled.advance(x.contiguous().numpy(), u.contiguous().numpy(), share)
         earned = None if reward is None else torch.from_numpy(reward)

@@ -1,12 +1,13 @@
 """Robustness margins of pending goals of a mission.
 
 A goal is a requirement `eventually@[a, b]`, whose times count from the start of the mission. It is pending
-while it is neither satisfied nor violated.
+until it is satisfied or violated.
 
-Example: the goal `eventually@[0 s, 18 s] [x, y] in b`. The first sample that satisfies it has almost no
-margin. From then on, the guidance cost (distance to the next goal) would draw plans away from the goal.
-Therefore plans that reach a pending goal are compared by their margin, up to gamma. A previous plan that
-reaches the goal is retained while its margin increases.
+Example: the goal `eventually@[0 s, 18 s] [x, y] in b` (be in the region b once). At the first sample in b
+the margin is almost 0. From then on, the guidance cost (distance to the next goal) would draw plans out of b.
+Therefore plans that reach a pending goal are compared by the margin with which they reach it, up to gamma,
+the margin that plans should have. While the margin still increases along the previous plan, this plan is
+retained.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class PendingGoals:
     """
 
     def __init__(self, compiled: Compiled, gamma: float) -> None:
-        """Collect the goals of a compiled specification; `gamma` is the margin that plans are to reach."""
+        """Collect the goals of a compiled specification; `gamma` is the margin that plans should have."""
         self._gamma = gamma
         self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
         statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
@@ -72,11 +73,10 @@ class PendingGoals:
         self.items = tuple(goal for goal in found if goal is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Shortfall of plans below the margin gamma, over the goals pending at the first sample: (batch,).
+        """Margin that plans lack, summed over the goals that are pending at the first sample: (batch,).
 
-        gamma is the margin that plans are to reach. At one goal the shortfall is gamma minus the largest
-        margin that the plan reaches there, clipped to the range from 0 to gamma. The shortfalls at all
-        pending goals are added.
+        At one goal a plan lacks gamma, the margin that plans should have, minus the largest margin that the
+        plan reaches at this goal, clipped to the range from 0 to gamma.
 
         Args:
             columns: predicted states, name -> (time, batch); the result is differentiable with respect to
@@ -94,8 +94,8 @@ class PendingGoals:
     def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
         """Mask of the plans whose first step increases the margin of a goal that the first sample satisfies.
 
-        A goal counts only if its margin at the first sample is below gamma, the margin that plans are to
-        reach. The mask is (batch,).
+        Goals whose margin at the first sample is at least gamma, the margin that plans should have, are
+        ignored. The mask is (batch,).
 
         Args:
             columns: predicted states, name -> (time, batch).

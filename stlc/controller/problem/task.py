@@ -165,14 +165,14 @@ class Task:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Random initial states, (n, dim), as `System.sample` draws them."""
+        """Draw `n` random initial states, (n, dim), with the method `System.sample`."""
         return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """States under plans: (B, n), (B, T, m) -> (B, T+1, n).
 
-        `switch` gives the form of jumps and conditions, exact by default. Without gradient, plans of at most
-        one horizon are rolled out by the native kernel.
+        `switch` gives the form of jumps and conditions, exact by default. The native kernel is used if no
+        gradient is needed and the plans have at most `horizon` steps.
         """
         differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
         apart = differentiated or not switch.exact or u.shape[1] > self.horizon
@@ -186,7 +186,8 @@ class Task:
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
         """Robustness of trajectories at time 0: (B, T+1, n) -> (B,).
 
-        It is exact, or smooth with parameter k = `smoothing` (Meng and Fan 2023, Eq. 4 and 7).
+        The robustness is exact if `smoothing` is None. Otherwise it is smooth, with the parameter k =
+        `smoothing` (Meng and Fan 2023, Eq. 4 and 7).
         """
         rho: Tensor = self.graph.robustness(x, smoothing)
         return rho
@@ -198,26 +199,27 @@ class Task:
 
     @cached_property
     def native(self) -> NativeJudge | None:
-        """Native kernel for verdicts and local search, without gradient; None: torch is used."""
+        """Native kernel for verdicts and local search, without gradient; None if torch has to be used."""
         return NativeJudge.of(self.system, self.rules, self.compiled.end)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
         """Native kernel for robustness and states, differentiable with respect to the plans.
 
-        None: torch is used.
+        None if torch has to be used.
         """
         return NativeGradient.of(self.system, self.rules, self.native, self.compiled.end)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Reasons why parts of a training run in torch: name of the part -> reason; "" if it runs in C.
+        """Parts of a training run, and for each the reason why it uses torch; "" if it runs in C.
 
         The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
 
         Args:
             device: type of the torch device.
             searches: whether the training searches for plans.
-            smooth: whether its objective uses smooth robustness, for which there is no native gradient.
+            smooth: whether the objective of the training uses smooth robustness, which has no native
+                gradient.
         """
         if device != "cpu":
             return dict.fromkeys(("verdicts", "search", "gradient"), f"the device is {device}")
@@ -285,10 +287,10 @@ class Task:
     def cost(self, judged: PlanVerdicts) -> Tensor:
         """Cost by which satisfying plans are compared, without gradient: (batch,).
 
-        It is the sum of the performance terms. In a mission (a specification that adds timers to the state),
-        a term is added: the amount by which the robustness is below gamma, times a weight. Without it, the
-        guidance cost (distance to the next goal), one of the performance terms, would draw plans to the
-        boundary of the constraints.
+        It is the value of the method `performance`. In a mission (a specification that adds timers to the
+        state), the guidance cost (distance to the next goal) would draw plans to the boundary of the
+        constraints. Therefore the cost of a plan increases if its robustness is below gamma, the margin that
+        plans should have: the missing robustness, times a weight, is added.
         """
         with torch.no_grad():
             cost = self.performance(judged.columns, judged.rho, judged.plans)
@@ -298,11 +300,11 @@ class Task:
             return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Sum of the performance terms, whether or not a plan satisfies the specification: (batch,).
+        """Sum of the performance terms of plans, also for plans that violate the specification: (batch,).
 
-        In a mission (a specification that adds timers to the state), two further terms are added: the amounts
-        by which the margins of pending goals are below gamma, and the guidance cost (distance to the next
-        goal).
+        In a mission (a specification that adds timers to the state), two terms are added to those of the
+        system file: the margin that the plan lacks at pending goals (see `PendingGoals.short`), and the
+        guidance cost (distance to the next goal), each times a weight.
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -319,7 +321,7 @@ class Task:
 
     @cached_property
     def pending_goals(self) -> PendingGoals:
-        """Goals `eventually@[a, b]` of the mission, with gamma as the margin that plans are to reach."""
+        """Goals `eventually@[a, b]` of the mission, and gamma, the margin that plans should have at them."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
@@ -335,7 +337,7 @@ class Task:
         )
 
     def alive(self, x: Tensor) -> Tensor:
-        """Mask of the states from which the mission can still satisfy every requirement: (B, n) -> (B,)."""
+        """Mask of the states in which no requirement of the mission is violated for good: (B, n) -> (B,)."""
         env = {name: column[None] for name, column in zip(self.system.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
@@ -350,9 +352,10 @@ def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
         safe: robustness of phi_safe, the same shape; if None, safety is not considered.
 
     Returns:
-        Values of the same shape; larger is better. A plan that satisfies the specification gets more than 1,
-        decreasing with its cost. Any other gets less than 1, increasing with its robustness (at equal
-        robustness, decreasing with its cost), and 2 less if it violates phi_safe.
+        Values of the same shape; larger is better. A plan that satisfies the specification gets a value above
+        1, which decreases with its cost. Any other plan gets a value below 1, which increases with its
+        robustness; of two equally robust plans, the cheaper one gets more. If `safe` is given, 2 is
+        subtracted from the value of a plan that violates phi_safe.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))

@@ -26,16 +26,19 @@ SAME = 1e-5
 
 
 class _Space(Protocol):
-    """Space of the vectors (d,) that the cross-entropy method samples; each represents one plan."""
+    """Space of vectors, (d,), from which the cross-entropy method samples; each vector represents a plan."""
 
     def centre(self, start: Tensor) -> Tensor:
-        """Mean of the first population for initial guesses of plans: (k, T, m) -> (k, d)."""
+        """Centres of the first populations, as vectors, (k, d), for guesses of k plans, (k, T, m)."""
 
     def deviation(self, x0: Tensor) -> Tensor:
-        """Standard deviation of the first population: (d,), or (1,) if all components have the same."""
+        """Standard deviation of each component of the first population: (d,), or (1,) if all are equal."""
 
     def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
-        """Plans that the vectors represent: states (k, n), p vectors per state (k, p, d) -> (k, p, T, m)."""
+        """Plans that vectors represent, (k, p, T, m).
+
+        `x0`: initial states, (k, n). `vectors`: p vectors per state, (k, p, d).
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +48,12 @@ class Cem:
     Attributes:
         population: number of samples per round.
         elites: number of samples, the most robust ones, to which the Gaussian is fitted.
-        deviation: standard deviation of the first population, in half-widths of the control ranges; with
-            `over=policy`, of the weights themselves.
-        physical: whether `deviation` is in the physical units of the controls instead of half-widths.
+        deviation: standard deviation of the first population. Its unit is half the width of each control's
+            range. With `over=policy` the weights are sampled, and it has no unit.
+        physical: whether `deviation` is in the physical units of the controls instead.
         floor: least standard deviation, in the units of `deviation`.
         rounds: maximum number of rounds, after which the search from an initial state begins anew.
-        over: `plan` samples plans, `policy` the weights of a network with `hidden` ReLU units.
+        over: `plan`: plans are sampled; `policy`: weights of a network with `hidden` ReLU units are sampled.
         hidden: number of hidden units of the network.
     """
 
@@ -85,7 +88,8 @@ class Cem:
     def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
         """Make up to `rounds` rounds for each of the initial states with indices `rows`, (k,).
 
-        The rounds of a state end once it has converged, reached the target robustness, or spent its budget.
+        The rounds for a state end when the Gaussian has converged, a plan has reached the target robustness,
+        or the budget of the state is spent.
         """
         mean = space.centre(search.start[rows])
         wide = space.deviation(search.states[rows]).expand_as(mean).clone()

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GradientPlanner:
-    """Adam on latent plans: unbounded numbers, mapped to the control ranges like outputs of a policy network.
+    """Gradient steps (Adam) on latent plans.
+
+    The entries of a latent plan are unbounded numbers; they are mapped to the control ranges like the outputs
+    of a policy network.
 
     Attributes:
         objective: `exact`: exact robustness, with gradients by generated C code; `paper`: smooth robustness
@@ -27,8 +30,9 @@ class GradientPlanner:
         steps: number of gradient steps, after which the search begins anew from random latent plans.
         starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
         rate: learning rate of Adam.
-        slope: k in (1 + tanh(k x)) / 2, whose derivative replaces that of jumps and conditions of the system
-            if the objective is `exact`.
+        slope: k in the smooth step (1 + tanh(k x)) / 2. Jumps and conditions of the system are true
+            steps, with derivative 0 almost everywhere. If the objective is `exact`, gradients use the
+            derivative of the smooth step instead.
     """
 
     objective: str = "exact"

@@ -24,13 +24,14 @@ class Halving:
     """Local searches from random piecewise constant plans, by successive halving (Karnin et al. 2013).
 
     A local search from a plan that visits goals in the wrong order ends at a robustness just below 0, which
-    no small change improves. Hence each round begins many searches from different plans and continues the
-    best.
+    no small change improves. Therefore each round begins many searches from different plans and continues
+    only the best ones.
 
     Attributes:
         starts: number of searches per initial state that a round begins.
         tries: number of plans that each search tries before the first selection.
-        keep: factor by which each selection divides the number of searches, and multiplies the plans tried.
+        keep: number by which each selection divides the number of searches. Each remaining search then tries
+            `keep` times as many plans as before.
         pieces: maximum number of constant pieces of a random plan.
     """
 
@@ -62,7 +63,7 @@ class Halving:
     def _rung(
         self, search: PlanSearch, rows: Tensor, plans: Tensor, searcher: Searcher, tries: int
     ) -> Tensor:
-        """Continue the searches from the initial states `rows`, with up to `tries` plans each.
+        """Continue all searches from the initial states `rows`; each tries up to `tries` more plans.
 
         Args:
             search: the search for plans.
@@ -72,7 +73,7 @@ class Halving:
             tries: maximum number of plans that each search tries.
 
         Returns:
-            The improved plans, (k, p, T, m), the best of each state first.
+            The improved plans, (k, p, T, m), for each state in descending order of robustness.
         """
         count = plans.shape[1]
         tries = max(1, search.affordable(rows, tries * count) // count)

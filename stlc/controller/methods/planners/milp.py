@@ -49,7 +49,7 @@ class Milp:
         gap: relative optimality gap at which the maximisation of robustness ends.
         prove: whether to solve the second program.
         tries: number of plans that a local search tries first, for each initial state. A program is solved
-            only where these miss the target. 0: no local search.
+            only for the states where these plans miss the target robustness. 0: no local search.
     """
 
     gap: float = 1e-3
@@ -124,14 +124,15 @@ class Milp:
     def _solved(
         self, task: Task, state: Tensor, goal: _Goal, limit: _Limit, highs: Any, *, tight: bool
     ) -> tuple[str, Tensor | None]:
-        """Solve the program for a plan from the state `state`, (n,), with the robustness that `goal` demands.
+        """Search for a plan from the state `state`, (n,), that reaches the robustness in `goal`.
 
-        `limit`: condition that ends the solve early. `highs`: the module of HiGHS. `tight`: if True, every
-        solution is a plan of the system; if False, every satisfying plan is a solution.
+        `limit`: condition that ends the solve early. `highs`: the module of HiGHS. `tight`: choice between
+        two programs. True: every solution is a plan with this robustness. False: all plans with this
+        robustness are solutions, but not only these; such a program can only prove that there is no plan.
 
         Returns:
-            `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), if it was found,
-            else None.
+            A result: `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), or None
+            if the result is not `FOUND`.
         """
         encoding, cost = _encoded(task, state, goal.target, known=goal.known, tight=tight)
         if not encoding.model.feasible:
@@ -160,9 +161,9 @@ class _Goal:
     """Robustness that a plan must reach.
 
     Attributes:
-        target: the robustness; inf: as large as possible.
-        known: robustness of a plan that is already known. If the robustness is maximised, only plans that
-            reach at least this value are of interest.
+        target: the robustness to be reached; inf: the robustness is to be as large as possible.
+        known: robustness of a plan that is already known, or 0. If `target` is inf, plans below this value
+            are excluded.
     """
 
     target: float
@@ -173,8 +174,9 @@ class _Goal:
 class _Limit:
     """Condition that ends a solve: the budget of processor time is spent, or the whole search ends.
 
-    The time limit of HiGHS itself is not used: it is elapsed time, which depends on other programs. HiGHS
-    does not check the condition within its sub-programs, so a solve may end some tenths of a second late.
+    The time limit of HiGHS is not used, since elapsed time depends on the other processes on the machine.
+    HiGHS does not check the condition within its sub-programs, so a solve may end some tenths of a second
+    late.
 
     Attributes:
         until: end of the budget on the clock of processor time.
@@ -217,11 +219,12 @@ def _at(form: Affine, values: Any) -> float:
 def _encoded(
     task: Task, state: Tensor, target: float, *, known: float = 0.0, tight: bool
 ) -> tuple[Encoding, Affine]:
-    """Program whose solutions are plans from the state `state`, and the cost to be minimised.
+    """Encode the search for a plan from the state `state`; return the program and the cost to be minimised.
 
-    If `target` is finite, the robustness of the plans is at least `target`, and the cost is 0. If `target` is
-    inf, the robustness is to be maximised: it is at least `known`, and the cost is its negative. `tight`: if
-    True, every solution is a plan of the system; if False, every satisfying plan is a solution.
+    If `target` is finite, the robustness of the plan must be at least `target`, and the cost is 0. If
+    `target` is inf, the robustness must be at least `known`, and the cost is the negative robustness.
+    `tight`: if True, every solution is a plan with this robustness. If False, all plans with this robustness
+    are solutions, but not only these.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.

@@ -37,18 +37,20 @@ NEARLY = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Mpc:
-    """Nonlinear program for each initial state, solved from several guesses until the target is reached.
+    """Nonlinear program for each initial state, solved from one guess after the other.
+
+    The search for a state ends when a plan reaches the target robustness.
 
     Attributes:
         guesses: number of guesses; the first is the initial guess of the search, the others are random
             controls that are constant over five pieces.
         drawn: number of random plans that are judged for one guess; the most robust of them is taken.
         iterations: maximum number of iterations of the interior-point method from each guess.
-        smoothing: scale of log-sum-exp for minima and maxima within conditions.
-        sharpness: greatest slope of the smooth indicators of conditions.
-        margin: robustness added to the target in the program, since the program approximates by smooth
-            functions.
-        repair: number of plans that a local search tries where a plan nearly reaches the target.
+        smoothing: k of log-sum-exp, which replaces minima and maxima inside conditions; larger is sharper.
+        sharpness: greatest slope of the smooth functions, from 0 to 1, that replace conditions.
+        margin: robustness by which the program demands more than the target, since its smooth functions are
+            approximations.
+        repair: number of plans that a local search tries if the best plan nearly reaches the target.
     """
 
     guesses: int = 12
@@ -121,11 +123,11 @@ class Mpc:
     def _improve(
         self, search: PlanSearch, rows: Tensor, guess: Tensor, shooting: Shooting, solve: Callable[..., Any]
     ) -> None:
-        """Solve the program for one initial state from the plan `guess`, (T, m); offer the result.
+        """Solve the program for one initial state, starting from the plan `guess`, (T, m).
 
-        `search` keeps the result if it is better. `rows`: index of the state, (1,). The solution may violate
-        the program only slightly, but miss the target of the exact robustness. Then the program is solved
-        once more, with a margin increased by the missing robustness.
+        `rows`: index of the state, (1,). The result is offered to `search`, which keeps it if it is the best.
+        Its exact robustness may be below the target, although it nearly solves the program. Then the program
+        is solved once more, with a margin that is increased by the missing robustness.
         """
         target = search.budget.target
         maximise = math.isinf(target)
@@ -143,10 +145,9 @@ class Mpc:
             margin += self.margin + target - rho
 
     def _mend(self, search: PlanSearch, rows: Tensor, searcher: Searcher) -> None:
-        """Improve the best plan of one initial state by a short local search.
+        """Improve the best plan from one initial state by local search, if it nearly reaches the target.
 
-        This is done only if the plan misses the target robustness by little. `rows`: index of the state,
-        (1,).
+        `rows`: index of the state, (1,).
         """
         missed = search.budget.target - float(search.rho[rows])
         if self.repair and TOLERANCE < missed <= NEARLY:

@@ -1,8 +1,9 @@
-"""`schedule`: random schedules of the goals, met by Gauss-Newton steps.
+"""`schedule`: random schedules of the goals, and Gauss-Newton steps that change plans to meet them.
 
-A local search fails where goals are reached in the wrong order. Here each attempt first draws when, and by
-which alternative, every part of the specification shall hold; then it changes a plan until the states meet
-these conditions. The attempts that come nearest go on, and a local search on exact robustness ends them.
+A local search fails where goals are reached in the wrong order. Here each attempt first draws a schedule: for
+every part of the specification, the time at which it shall hold and the alternative of an `or` that shall
+hold. Then the attempt changes a plan until the states meet these conditions. Only the attempts that come
+nearest are continued. At the end, a local search improves the exact robustness of the best plans.
 """
 
 from __future__ import annotations
@@ -40,21 +41,25 @@ MODERATE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class SchedulePlanner:
-    """Gauss-Newton steps towards random schedules of the goals.
+    """Planner that draws random schedules of the goals and changes plans by Gauss-Newton steps to meet them.
+
+    A round begins with one attempt per schedule.
 
     Attributes:
-        schedules: number of schedules per round, those of `draws` with the least speed between goals.
-        draws: number of schedules drawn.
-        steps: number of Gauss-Newton steps.
-        halvings: number of selections of the better half of the attempts, at equal distances.
-        library: number of random plans; each schedule begins with the best of them.
-        rows: maximum number of conditions that a step considers.
-        margin: distance by which conditions shall hold, as a share of the typical range of the states.
-        greed: preference for schedules with a low speed between goals; 0 draws them at random.
+        draws: number of schedules that are drawn per round.
+        schedules: number of these schedules that are attempted. Schedules that demand a low speed between
+            goals are preferred.
+        greed: strength of this preference; 0: the schedules are selected at random.
+        steps: number of Gauss-Newton steps of an attempt.
+        halvings: number of times that the worse half of the attempts is dropped, in equal intervals.
+        library: number of random plans. An attempt begins with one of them that nearly meets its schedule.
+        rows: maximum number of conditions, the worst ones, that a Gauss-Newton step considers.
+        margin: distance from their boundaries at which conditions shall hold, as a share of the typical range
+            of the states.
         best: number of plans that a local search improves at the end of a round.
-        tries: number of plans that it tries for each of these.
-        starts: number of random plans, the best ones, that a local search improves at the beginning.
-        first: number of plans that it tries for each of these.
+        tries: number of changed plans that this local search tries per plan.
+        starts: number of plans, the best of the library, that a local search improves before the first round.
+        first: number of changed plans that this local search tries per plan.
     """
 
     schedules: int = 48
@@ -71,10 +76,10 @@ class SchedulePlanner:
     first: int = 1_000
 
     def prepare(self, task: Task) -> Solver:
-        """Return the solver, with the conditions of the specification.
+        """Return a function that searches for plans by schedules.
 
         Raises:
-            UsageError: U101, the specification has no condition on states.
+            UsageError: U101, the specification has no condition on the states of one sample.
         """
         scheduler = GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
         if not scheduler.conditions:
@@ -113,8 +118,9 @@ class _Attempts:
         search: the search for plans.
         row: index of the initial state, (1,).
         library: plans with which attempts begin, (k, T, m).
-        prepared: the conditions of the specification, and the derivative of the states.
-        random: random numbers.
+        prepared: scheduler with the conditions of the specification; and the function that `state_gradient`
+            returns, for derivatives of the states.
+        random: source of the random schedules.
     """
 
     def __init__(
@@ -142,7 +148,7 @@ class _Attempts:
         self._apart = torch.cdist(places, places).nan_to_num(0.0).numpy()
 
     def round(self, searcher: Searcher) -> None:
-        """Draw schedules, and improve plans for them."""
+        """Draw schedules, and change one plan per schedule until the plan meets the schedule."""
         search, row, options = self._search, self._row, self._options
         with search.charged(row):
             needed = self._drawn()
@@ -163,7 +169,10 @@ class _Attempts:
             _polish(search, row, best, searcher, options.tries)
 
     def _drawn(self) -> Tensor:
-        """Schedules, those with a low speed between goals more likely, (k, conditions, T + 1)."""
+        """Draw k schedules: True where a condition is needed at a sample, (k, conditions, T + 1).
+
+        Schedules that demand a low speed between goals are preferred.
+        """
         options, random = self._options, self._random
         needed: NDArray[np.bool_] = self._scheduler.draw(options.draws, random)
         speed = tempo(needed[:, self._goals], self._apart)
@@ -171,14 +180,17 @@ class _Attempts:
         return torch.from_numpy(needed[order[: options.schedules]])
 
     def _nearest(self, needed: Tensor) -> Tensor:
-        """For each schedule the plan that misses it least, among random ones of the library, (k, T, m)."""
+        """Select a plan for each of the k schedules `needed`: (k, T, m).
+
+        Of a random part of the library, the plan that comes nearest to meeting the schedule is taken.
+        """
         missed = needed.flatten(1).double() @ self._missed
         seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
         return self._library[torch.where(seen, missed, torch.inf).argmin(1)]
 
 
 def _polish(search: PlanSearch, row: Tensor, plans: Tensor, searcher: Searcher, tries: int) -> None:
-    """Improve plans, (k, T, m), of the initial state `row` by local search, with `tries` plans each."""
+    """Improve plans, (k, T, m), from the initial state `row` by local search, each with `tries` tries."""
     count = len(plans)
     tries = max(1, search.affordable(row, tries * count) // count)
     bank = plans.new_zeros(0, *plans.shape[1:])

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 class SearchPlanner:
     """Local search: in every generation the best of a batch of changed plans is kept.
 
-    A change is noise over an interval of time, a shift of an interval, an interval held at one level, or a
-    part of a plan that solved another initial state. The first round starts from the initial guess; later
-    rounds start alternately from plans of a library and from the best plan found. The library begins with
-    piecewise constant plans, and plans that solve an initial state are added.
+    A change adds noise in an interval of time, shifts an interval, holds one value in an interval, or inserts
+    a part of a plan that solved another initial state. The first round starts from the initial guess. Later
+    rounds start alternately from a plan of a library and from the best plan found. The library contains
+    piecewise constant plans; plans that solve an initial state are added.
 
     Attributes:
         tries: number of plans tried per initial state in the first round; each later round tries twice as
