@@ -1,9 +1,8 @@
-"""Unknown samples: bounds of a formula's robustness over all values that the unknown samples may have.
+"""Bounds on the robustness of a formula on a trace with unknown samples.
 
-In arrays an unknown value is NaN. The bounds are computed as for a trace that is still growing
-(`stlc.monitor.prefix_bounds`): a predicate that reads an unknown value is -inf in the lower bound and +inf in
-the upper one. All operators are monotone in their predicates, so a verdict that follows from the bounds holds
-for every value that the samples may have.
+An unknown sample is NaN in the arrays. A predicate that reads it counts as -inf in the lower bound, and as
++inf in the upper bound. The robustness of a formula never falls if the value of a predicate rises. Therefore
+a verdict that follows from the bounds is true for all values that the samples may have.
 """
 
 from __future__ import annotations
@@ -31,9 +30,10 @@ def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """Return the signals (samples, batch) with NaN replaced by numbers, and indicators of known samples.
+    """Return the signals without NaN, and one additional signal per name in `holes`.
 
-    One indicator (samples, batch) is added for each signal in `holes`: 1 at known, -1 at unknown samples.
+    Every NaN is replaced by some number. The additional signal marks where this was done: it is 1 at known
+    samples and -1 at unknown samples. All arrays are (samples, batch).
     """
     filled = dict(env)
     for name in holes:
@@ -46,13 +46,13 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 @lru_cache(maxsize=512)
 def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """Return a formula whose value bounds that of `formula`, whatever values the unknown samples have.
+    """Return a formula whose value is a bound on `formula` for all values of the unknown samples.
 
     Args:
         formula: in negation normal form (negations occur only in predicates).
-        holes: names of the signals with unknown values. A name that a `freeze` binds to such a signal is
-            treated in the same way.
-        least: True for the lower bound (least value), False for the upper bound (greatest value).
+        holes: names of the signals with unknown values. A `freeze` may store such a signal under a name; this
+            name then also counts as a signal with unknown values.
+        least: True for the lower bound, False for the upper bound.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -68,7 +68,10 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
 
 
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
-    """An expression that is 1 where all signals in `num` are known, else -1; None if always known."""
+    """Return an expression that is 1 where all signals in `num` are known, else -1.
+
+    None is returned if `num` reads no signal in `holes`: it is then known everywhere.
+    """
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)

@@ -1,9 +1,9 @@
 """Instants at which a requirement is evaluated, and its values there.
 
-A requirement that mentions the horizon `T` holds for every planning window: it is evaluated at each sample
-that has a full window of length `T` after it, and `end` is the end of that window. Other requirements, and
-those with absolute operators (`always@[a, b]`, whose interval counts from the start of the mission), are
-evaluated once, at the start of the trace.
+A requirement that mentions the horizon `T` holds for every planning window. It is evaluated at each sample
+that has a full window of length `T` after it. In its formula, `end` is the end of this window. Other
+requirements are evaluated once, at the start of the trace. So are requirements with absolute operators
+(`always@[a, b]`), whose interval counts from the start of the mission.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ def rule_bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest robustness at the instants `starts`, each `(count, batch)`.
 
-    Both are one and the same array if nothing is unknown. `horizon` is the length of a planning window in
-    steps. `ends` is the treatment of windows that extend beyond the trace: "open" computes bounds over the
-    missing samples, "truncate" clips the windows.
+    If nothing is unknown, the same array is returned twice. `horizon` is the length of a planning window in
+    steps. `ends` is the treatment of windows that extend beyond the trace: "open" leaves the missing samples
+    unknown, "truncate" clips the windows.
     """
     window = window_of(rule, horizon)
     if window is None:
@@ -80,7 +80,11 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """True for instants in `starts` whose value depends on the first `samples` samples only, (count,)."""
+    """Return for each instant in `starts` whether its value is exact: booleans, (count,).
+
+    A value is exact if it depends only on the first `samples` samples. `horizon` is the length of a planning
+    window in steps.
+    """
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
@@ -92,9 +96,9 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
     """Return the robustness at every sample, `(samples, batch)`.
 
     `end` is the treatment of windows that extend beyond the trace: "strict" gives NaN, "truncate" clips them,
-    "lower" and "upper" give a bound. A value that depends on unknown samples is NaN, or the bound if `end` is
-    "lower" or "upper". A requirement with absolute operators (`always@[a, b]`) has the same value at all
-    samples.
+    "lower" and "upper" give a bound. Unknown samples inside the trace have the same effect: NaN, or the bound
+    if `end` is "lower" or "upper". A requirement with absolute operators (`always@[a, b]`) has the same value
+    at all samples.
     """
     if record.holes:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
@@ -111,8 +115,8 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
 def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
     """Compute `rule_signal` for a requirement that mentions `end`, the last sample of a planning window.
 
-    The planning window ends `window` samples after each instant. With argument `end` "strict", values are NaN
-    where the planning window extends beyond the trace.
+    The planning window of an instant ends `window` samples after it. If the argument `end` is "strict",
+    values are NaN where the planning window extends beyond the trace.
     """
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
@@ -130,7 +134,11 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
 def rules_at(
     rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
 ) -> list[Array]:
-    """Robustness of several requirements at sample `at`, `(1, batch)` each; for `end` see `rule_signal`."""
+    """Robustness of several requirements at sample `at`, `(1, batch)` each.
+
+    `end` is the treatment of windows that extend beyond the trace, as in `rule_signal`. `horizon` is the
+    length of a planning window in steps.
+    """
     if record.holes:
         sides = [_sides(rule, record) for rule in rules]
         least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
@@ -152,7 +160,10 @@ def rules_at(
 
 
 def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
-    """Two copies of a requirement: its formula bounded from below, and from above, over unknown samples."""
+    """Return two copies of a requirement, for a lower and an upper bound on its robustness.
+
+    The bounds hold for all values of the unknown samples.
+    """
     formula = rule.under(record.semantics)
     least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)

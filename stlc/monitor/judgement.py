@@ -82,7 +82,7 @@ class Judgement:
         scope: True for traces that satisfy the assumptions, (traces,); None: all do. Traces that violate the
             assumptions do not affect verdicts over all traces.
         reported: `low` and `high` in the semantics (definition of min and max) that the caller requested;
-            None if that is the exact one.
+            None if the caller requested the exact semantics.
     """
 
     rule: CompiledRequirement
@@ -133,18 +133,21 @@ class Judgement:
 
     @property
     def overall(self) -> Status:
-        """Status over the traces in scope: violated if one is, satisfied if all are, else inconclusive."""
+        """Status over the traces in scope: violated if any is, satisfied if all are, else inconclusive."""
         holds = self.counted(self.holds)
         return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
     @property
     def satisfied(self) -> bool | None:
-        """True if all traces satisfy the requirement, False if one violates it, None if that is unknown."""
+        """True if all traces satisfy the requirement, False if any violates it, None if that is unknown."""
         return _known(self.overall)
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """Bounds on the least robustness of the evaluated instants, over all continuations of the trace."""
+        """Lower and upper bound on the robustness, which is the least one over the evaluated instants.
+
+        The bounds hold for all continuations of the trace. They are floats, or arrays for a batch of traces.
+        """
         low, high = self.margins
         return _shaped(low.min(axis=0), self.shape), _shaped(high.min(axis=0), self.shape)
 
@@ -178,10 +181,10 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Pair (trace, sample) with the least robustness.
+        """Index of the trace and sample at which the robustness is least.
 
-        If the requirement is violated, the upper bounds `high` on the robustness are compared, otherwise the
-        lower bounds `low`.
+        If the requirement is violated, the upper bounds on the robustness (`high`) are compared. Otherwise
+        the lower bounds (`low`) are compared.
         """
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
@@ -239,9 +242,9 @@ class Verdict:
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return a copy in which only the traces that satisfy the assumptions count.
+        """Return a copy of the verdict that counts only the traces that satisfy the assumptions.
 
-        These traces are True in `scope`, (traces,).
+        The array `scope`, (traces,), is True for these traces.
         """
         if scope.all():
             return self
@@ -255,13 +258,16 @@ class Verdict:
 
     @property
     def overall(self) -> Status:
-        """Status over all requirements and all traces in scope: the worst of the requirements' statuses."""
+        """Status over all requirements and all traces in scope.
+
+        It is violated if any requirement is violated, satisfied if all are satisfied, else inconclusive.
+        """
         found = {judgement.overall for judgement in self.requirements}
         return _status("violated" in found, found <= {"satisfied"})
 
     @property
     def satisfied(self) -> bool | None:
-        """True if all traces satisfy all requirements, False if one violates one, None if that is unknown."""
+        """True if all traces satisfy all requirements, False if any requirement is violated, else None."""
         return _known(self.overall)
 
     @property
@@ -295,11 +301,12 @@ class Verdict:
         return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Return truth values of a judgement at `most` instants, (most, traces).
+        """Return the truth values of a judgement at `most` instants, (most, traces).
 
-        `truth` is `judgement.holds` or `judgement.fails`. It is returned unchanged if the judgement has
-        `most` instants. Otherwise the values of a trace are all equal: for `holds` they tell whether the
-        requirement holds at all of its instants, for `fails` whether it fails at any.
+        `truth` is `judgement.holds` or `judgement.fails`. If the judgement has `most` instants, `truth` is
+        returned unchanged. Otherwise one truth value per trace is repeated at all instants. For `holds`, it
+        tells whether the requirement holds at all of its own instants. For `fails`, it tells whether the
+        requirement fails at any of them.
         """
         if judgement.instants == most:
             return truth

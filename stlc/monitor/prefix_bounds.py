@@ -1,10 +1,12 @@
-"""Formulas whose values bound the robustness on a stream that may end with any sample.
+"""Formulas whose values are bounds on the robustness of a stream that may end with any sample.
 
-The length of a window to the end of the trace is unknown while the trace grows. `eventually` has its least
-value if the trace ends now, `always` if the trace continues; for the greatest values it is the other way
-round. `prefix_bound` adds to the formula a predicate that is true at every existing sample and unknown
-afterwards, so that values beyond the last sample do not count. The least and the greatest value therefore
-need two formulas.
+A window that extends to the end of the trace has an unknown length while the trace grows. An `eventually` is
+least if the trace ends now, since later samples can only increase it. An `always` is least if the trace
+continues. For the greatest values it is the other way round. The least and the greatest value therefore need
+two formulas.
+
+`prefix_bound` adds a predicate to the formula. It is true at every existing sample and unknown after the last
+one. Values after the last sample then do not count.
 """
 
 from __future__ import annotations
@@ -33,9 +35,9 @@ _UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
-    """Return a formula whose value bounds that of `formula` on a trace that is still growing.
+    """Return a formula whose value is a bound on `formula` while the trace is still growing.
 
-    The bound holds for every sample, now or later, with which the trace may end.
+    The bound is valid wherever the trace may end: with the latest sample or with any later sample.
 
     Args:
         formula: the formula to bound.
@@ -51,10 +53,10 @@ class _PrefixBound:
     cut: bool
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return a formula that bounds `formula` on all traces that end with the last sample or later.
+        """Return a formula whose value is a bound on `formula`, wherever the trace ends.
 
-        Instants that would not exist if the trace ended early are excluded from windows where that is the
-        worst case.
+        The trace may end with the latest sample, or later. Some instants of a window do not exist if the
+        trace ends early. They do not count in a window where this is the worst case for the bound.
         """
         match formula:
             case ir.Temporal(op, window, body):
@@ -74,13 +76,13 @@ class _PrefixBound:
         return self.cut or window.hi is None
 
     def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """Bound the body of a window on a trace that may end with any sample, now or later.
+        """Return a bound on the body of a window, wherever the trace ends.
 
         If an early end of the trace is the worst case for the bound, only existing samples count.
 
         Args:
             body: the body.
-            some: True if the body must hold at one instant of the window, False if at every one.
+            some: True if the body must hold at some instant of the window, False if at every instant.
             cut: whether the end of the trace clips the window.
         """
         inner = self.of(body)
@@ -89,18 +91,19 @@ class _PrefixBound:
     def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
         """Make the bound on an unbounded operator infinite if its window starts after the last sample.
 
-        `some` is True if the body must hold at one instant of the window, False if at every one. The formula
-        is returned unchanged if an empty window gives the infinite bound anyway, or if the end of the trace
-        clips all windows (`cut`).
+        Nothing is known in this case. `some` is True if the body must hold at some instant of the window,
+        False if at every instant. The formula is returned unchanged if an empty window has an infinite bound
+        anyway, or if the end of the trace clips all windows (`cut`).
         """
         if window.hi is not None or self.cut or some is self.least:
             return formula
         return self._seen(formula, window.lo)
 
     def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """Make a bound infinite (no information) at instants k for which sample k + `later` may not exist.
+        """Make the value of `formula` infinite at each instant k for which sample k + `later` is missing.
 
-        `formula` is the formula whose value is the bound.
+        The value of `formula` is a bound. An infinite bound contains no information. The sample is missing if
+        it has not been received yet.
         """
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
@@ -108,7 +111,7 @@ class _PrefixBound:
 
 
 def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
-    """Return the signals (samples, traces) and, added, the signal `SEEN`, which is 1 at every sample."""
+    """Return the signals (samples, traces), and the additional signal `SEEN`, which is 1 at every sample."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
 
 
@@ -116,9 +119,9 @@ def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
 
 
 def own_span(node: ir.Formula) -> Reach:
-    """Return how far an operator or predicate itself reads back and ahead, in samples.
+    """Return how many samples `node`, an operator or predicate, reads back and ahead.
 
-    What its operands read is not included. Of an unbounded window only the lower bound counts.
+    What its operands read is not included. An unbounded window `[a, inf)` counts as `a` samples.
     """
     reads = [Reach(0, 0), *(farthest(num) for num in children(node) if not isinstance(num, ir.Formula))]
     past, future = (max(ends) for ends in zip(*reads, strict=True))

@@ -1,4 +1,4 @@
-"""Signals that requirements read: options for reading them from a file, and their arrays for evaluation.
+"""Signals that requirements read: how to read them from a file, and how to evaluate them.
 
 The evaluator reads each signal as a column, an array `(time, batch)`.
 """
@@ -96,19 +96,22 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
 
 
 def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
-    """Add the kinds and words of the signals that a specification declares to `requested`.
+    """Return the options `requested`, completed by the kinds and words of the declared signals.
 
     Args:
-        spec: the specification. It gives the kinds of the signals (such as bool or enum), and the numbers
-            that words (members of an enum) stand for.
-        requested: options of the user: the time grid, and names of signals in the file. A name is given for a
-            signal, or for the text behind `from` in its declaration.
+        spec: the specification, which declares the signals. It gives their kinds (such as bool or enum), and
+            the numbers that words (members of an enum) stand for.
+        requested: options of the user: the time grid, and the names that signals have in the file. They are
+            keyed by the signal, or by the text after `from` in its declaration.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}
 
     def column(name: str) -> str:
-        """Name in the file of a signal or of a vector's component: with `p from "q"`, `p[0]` is `q[0]`."""
+        """Return the name that a signal has in the file.
+
+        Example: after the declaration `p from "q"`, the vector component `p[0]` is called `q[0]` in the file.
+        """
         base, bracket, index = name.partition("[")
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
@@ -164,11 +167,11 @@ class Signals:
         return {name: gap for name, gap in found.items() if gap.samples}
 
     def like_given(self, values: Array) -> Array:
-        """Reshape values (time, batch) to the shape of the given signals, (…, time)."""
+        """Reshape values (time, batch) to (…, time), the shape in which the signals were given."""
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
-        """Reshape values (1, batch) at one sample to the leading shape of the given signals, (…)."""
+        """Reshape values (1, batch) of one sample to the shape of the given signals without time axis."""
         flat = values.reshape(self.shape)
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
@@ -215,7 +218,10 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
 
 
 def _find(data: Given, name: str) -> Any:
-    """The array called `name`, or for `q[0]` component 0 of the vector `q`; None if there is none."""
+    """Return the array called `name`; None if there is none.
+
+    A component such as `q[0]` is also found in the vector `q`.
+    """
     index = None
     if name not in data:
         match = _COMPONENT.fullmatch(name)
@@ -249,7 +255,10 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
 
 
 def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...], int]:
-    """Leading shape and number of samples of several arrays; a single number is a constant signal."""
+    """Return the shape of the arrays without their time axis, and their number of samples.
+
+    An array that is a single number is a constant signal.
+    """
     lengths = {key: int(values.shape[-1]) for key, values in arrays.items() if values.ndim}
     if not lengths:
         raise TraceError(Diagnostic("E605", f"{name}: no signal has a time axis"))
@@ -292,7 +301,9 @@ def _torch_columns(
 
 
 def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Convert signals from recorded to declared units; a signal with an unknown unit is unchanged.
+    """Convert signals from the units in the trace to those that the specification declares.
+
+    A signal with an unknown unit is unchanged.
 
     Raises TraceError (E605) if two units measure different quantities.
     """
@@ -322,13 +333,15 @@ class Conversion:
     shift: float
 
     def __call__(self, values: Any) -> Any:
-        """Return `values` converted."""
+        """Convert `values` to the new unit."""
         scaled = values if self.factor == 1.0 else values * self.factor
         return scaled + self.shift if self.shift else scaled
 
 
 def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
-    """Return the conversion from the recorded to the declared unit; None if they are equal or one is unknown.
+    """Return the conversion from the unit in the trace, `recorded`, to the declared unit of `column`.
+
+    None is returned if the units are equal, or if one is unknown.
 
     Raises:
         TraceError: E605, the units measure different quantities.
@@ -388,9 +401,10 @@ class Gap:
     last: int = 0
 
     def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
-        """Return the gap with the True samples of `unknown`, (samples,) or (samples, traces), added.
+        """Return a gap that also includes the unknown samples of further data.
 
-        `offset` is the index in the trace of the first row of `unknown`.
+        The array `unknown`, (samples,) or (samples, traces), is True at these samples. `offset` is the index
+        in the trace of its first row.
         """
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):

@@ -44,13 +44,16 @@ class Record:
 
     @staticmethod
     def of(env: Mapping[str, Array], ops: Ops) -> Record:
-        """Return a record of signals in which NaN is an unknown value; for NumPy arrays only."""
+        """Return a record of the signals `env`; in NumPy arrays, NaN is an unknown value."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
         return Record(without_holes(env, holes) if holes else env, ops, holes=holes)
 
     @property
     def sure(self) -> Record:
-        """The record with `holes` empty, for formulas that account for unknown values themselves."""
+        """This record with an empty `holes`.
+
+        Formulas that account for unknown values themselves are evaluated on it.
+        """
         return replace(self, holes=frozenset()) if self.holes else self
 
     @property
@@ -59,7 +62,7 @@ class Record:
         return len(next(iter(self.env.values())))
 
     def cut(self, stop: int) -> Record:
-        """Return the record cut off after the first `stop` samples."""
+        """Return a record of the first `stop` samples."""
         return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
 
     def values(
@@ -69,7 +72,7 @@ class Record:
 
         `end` is the treatment of windows that extend beyond the last sample: "strict" gives NaN, "truncate"
         clips them, "lower" and "upper" give a bound. If the trace continues, `stop` is the number of samples
-        that it will have in the end; unbounded windows then end with the last of these.
+        in the complete trace. Unbounded windows then extend to the end of the complete trace.
         """
         return evaluate(
             formulas,
@@ -88,9 +91,9 @@ def bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values at consecutive instants, each `(count, batch)`.
 
-    If nothing is unknown, both are one and the same array. `ends` is the treatment of windows that extend
-    beyond the trace: "open" computes bounds, "truncate" clips the windows. `stop` is the number of samples
-    that the trace will have in the end, if that is more than the known ones.
+    If nothing is unknown, the same array is returned twice. `ends` is the treatment of windows that extend
+    beyond the trace: "open" computes bounds, "truncate" clips the windows. `stop` is the number of samples in
+    the complete trace, if the record contains fewer.
     """
     if record.holes:
         least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
@@ -114,12 +117,12 @@ def bounds(
 def window_bounds(
     formula: ir.Formula, record: Record, starts: range, window: int, ends: Ends
 ) -> tuple[Array, Array]:
-    """Least and greatest values if `end` is `window` samples after each instant, each `(count, batch)`.
+    """Least and greatest values of a formula whose `end` moves with the instant, each `(count, batch)`.
 
-    Each instant is evaluated on its own excerpt of the trace. The excerpt begins before the instant, by the
-    lookback of the past operators, and stops at the `end` of the instant. Many excerpts form one batch. If
-    the trace is too short for an excerpt, the missing samples are unknown; with `ends` "truncate" the excerpt
-    stops at the last sample.
+    `end` is `window` samples after each instant. Each instant is evaluated on its own excerpt of the trace.
+    The excerpt begins before the instant, so that past operators find their samples, and stops at `end`. Many
+    excerpts form one batch. If the trace is too short for an excerpt, the missing samples are unknown. If
+    `ends` is "truncate", the excerpt stops at the last sample instead.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
@@ -139,8 +142,8 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
     """Cut the trace into overlapping excerpts, one per instant in `starts`, and yield them in groups.
 
     The excerpt of instant k contains the samples from k - `back` to k + `window`; it is shorter at the end of
-    the trace. A group is yielded as (record, number of instants). The batch of the record contains the
-    excerpts of that many instants.
+    the trace. A group is yielded as (record, number of instants). The record contains the excerpts of these
+    instants as one batch.
     """
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
@@ -159,9 +162,10 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
 
 
 def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
-    """Return an upper bound of the formula: predicates that read signals not in `names` are assumed true.
+    """Return the formula with every predicate that reads a missing signal assumed true.
 
-    Such signals are missing. A name that `freeze` binds to a missing signal is treated in the same way.
+    Signals not in `names` are missing. The value of the result is an upper bound on the formula. A `freeze`
+    may store a missing signal under a name; this name then also counts as missing.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -175,7 +179,7 @@ def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formu
 
 
 def _read(num: ir.Num) -> set[str]:
-    """Names of the signals, and of the names bound by `freeze`, that an expression reads."""
+    """Names of the signals that an expression reads, and of the values stored by `freeze` that it reads."""
     return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
@@ -183,9 +187,9 @@ def _read(num: ir.Num) -> set[str]:
 
 
 def by_truth(formula: ir.Formula) -> ir.Formula:
-    """The formula with each predicate's margin replaced by its truth value: +inf (true) or -inf (false).
+    """Return the formula with truth values, +inf (true) or -inf (false), in place of predicate margins.
 
-    `a > b` is true if its margin a - b is above 0, `a >= b` if it is at least 0, without any tolerance.
+    `a > b` is true if its margin a - b is above 0, `a >= b` if it is at least 0. There is no tolerance.
     """
     if isinstance(formula, ir.Predicate):
         return replace(formula, guard=True)

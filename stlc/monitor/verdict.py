@@ -49,19 +49,19 @@ _SUFFIXES = (".stl", ".stlc")
 
 
 class Monitor:
-    """Exact monitor of recorded signals; evaluates each requirement. Torch is used only for torch tensors.
+    """Exact monitor of recorded signals, which evaluates each requirement of a specification.
 
     Args:
         spec: a specification, its text, or the path of its file.
         dt: time step of the signals in seconds; default: that of the trace, or of the system.
-        horizon: horizon `T` of the planning window in seconds; default: that of the trace, or of the system.
+        horizon: horizon `T` of the planning window in seconds; default: that of the system, or of the trace.
         system: path or name of a system file; the specification is then checked against it. Without it, the
             system that the specification names supplies a missing `dt` or `T`.
         overrides: name of a constant -> its value, as text.
 
-    Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is one array (…, time,
-    k) or one signal per component, `q[0]`. Results for NumPy are float64; for torch, dtype, device and
-    gradients are kept.
+    Signals are NumPy arrays or torch tensors by name, (time,) or (…, time). A vector is one array (…, time,
+    k), or one signal per component, such as `q[0]`. Results for NumPy arrays are float64. Results for torch
+    tensors keep dtype, device and gradients. Torch is not used otherwise.
 
     Raises:
         SpecError: the specification is invalid; E311, `dt` or `T` is needed and unknown.
@@ -123,8 +123,8 @@ class Monitor:
                 own instants.
             end: treatment of a trace that is too short: "open" computes bounds over all its continuations and
                 may be inconclusive, "strict" raises an error, "truncate" clips the windows.
-            tolerance: a requirement is satisfied if its robustness is at least minus this value. With 0,
-                truth values of the predicates decide, which distinguish `<` from `<=`.
+            tolerance: a requirement is satisfied if its robustness is at least minus this value. If the
+                tolerance is 0, the truth values of the predicates decide: then `<` and `<=` differ.
             require: names of the requirements to evaluate; empty: all.
             semantics: semantics of the reported robustness, or its name; verdicts and causes are always
                 exact.
@@ -168,7 +168,7 @@ class Monitor:
                 time).
             end: "strict" gives NaN where a window is incomplete, "truncate" clips windows.
             at: sample at which to evaluate; None: at every sample.
-            smoothing: scale k of log-sum-exp; giving it selects the log-sum-exp semantics.
+            smoothing: scale k of the log-sum-exp semantics. If given, this semantics is used.
             semantics: definition of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
         Returns:
@@ -186,7 +186,7 @@ class Monitor:
     ) -> dict[str, Array]:
         """Robustness of each requirement by name, without weight and scale.
 
-        The arguments are those of the method `robustness`, which explains them.
+        The method `robustness` explains the arguments.
         """
         ready = self._prepare(signals, ()).under(semantics_of(semantics))
         shaped = ready.signals.like_given if at is None else ready.signals.at_one
@@ -196,8 +196,8 @@ class Monitor:
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest robustness of the specification over all continuations of the signals.
 
-        A predicate that reads a missing sample is unknown. The arrays have the shape of the signals; with
-        `at`, which is the sample at which to evaluate, they have no time axis.
+        A predicate that reads a missing sample is unknown. The arrays have the shape of the signals. If `at`
+        is given, the specification is evaluated at this sample only, and the arrays have no time axis.
         """
         ready = self._prepare(signals, ())
         return _least(ready, "lower", at), _least(ready, "upper", at)
@@ -248,9 +248,9 @@ class Monitor:
     def _ready(self, recorded: Times) -> Compiled:
         """Return the specification compiled for the time step and horizon that are known.
 
-        The time step is that of the trace, else argument `dt` of the monitor, else that of the system. The
-        horizon is argument `horizon`, else that of the system, else that of the trace. A time step or horizon
-        that is still unknown is taken from the system that the specification names.
+        The time step is that of the trace (`recorded`), else the argument `dt` of the monitor, else that of
+        the system. The horizon is the argument `horizon` of the monitor, else that of the system, else that
+        of the trace. If either is still unknown, it is taken from the system that the specification names.
         """
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)
@@ -271,9 +271,10 @@ class Monitor:
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """Add to an E311 (`dt` or `T` is unknown) the note that the system file does not exist.
+        """Add to a finding E311 the note that the system file does not exist.
 
-        The note is added if the specification names a system; other findings are returned unchanged.
+        E311 means that `dt` or `T` is unknown. The note is added only if the specification names a system.
+        All other findings are returned unchanged.
         """
         if finding.code != "E311" or self.spec.system is None:
             return finding
@@ -287,7 +288,7 @@ class Monitor:
 
 
 def _source(spec: str | Path) -> Source:
-    """The source file at a path, or the text itself if `spec` does not look like a path."""
+    """Return the source file at a path, or the text itself if `spec` does not look like a path."""
     if isinstance(spec, Path) or (spec.endswith(_SUFFIXES) and "\n" not in spec):
         return read_source(spec)
     return Source("<text>", spec)
@@ -319,7 +320,7 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
 
 
 def _scope(ready: Prepared, tolerance: float) -> Bools:
-    """False for traces that certainly violate an assumption, else True; (traces,)."""
+    """Return for each trace whether it counts: False if it certainly violates an assumption, (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
         scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
@@ -341,9 +342,9 @@ def _judge(
 
 
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """A copy of the judgement whose `reported` bounds are in the semantics of `ready`.
+    """Return a copy of the judgement whose `reported` bounds are in the semantics that `ready` selects.
 
-    In a semantics whose minimum and maximum are means, bounds over unknown samples are not valid. In this
+    In some semantics, minimum and maximum are means, and bounds over unknown samples are not valid. In this
     case only the sign of the exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or
     +inf.
     """

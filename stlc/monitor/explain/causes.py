@@ -1,10 +1,14 @@
-"""Cause of a violation at an instant: the smallest tree of sub-formulas, instants and signals behind it.
+"""Causes of a violation at an instant, as a tree of sub-formulas.
 
-A violated conjunction is explained by one operand, a violated disjunction by all operands; a violated
-`always` by one instant, a violated `eventually` by all instants, of which the one closest to satisfaction is
-shown. The main path of the tree follows the operands that attain each minimum and maximum, down to one
-predicate at one instant, whose value is the robustness. If several predicate values equal the robustness, the
-path leads to one whose change alone changes the robustness, if there is one.
+A node of the tree is a sub-formula at an instant, at which it has the wrong truth value. The children of a
+node explain this value. A violated conjunction has one child: the operand with the least robustness. A
+violated disjunction has all operands as children. A violated `always` has one child: its body at the worst
+instant. The body of a violated `eventually` fails at all instants of the window. The only child is the body
+at the instant at which it is closest to being true.
+
+The main path leads from the root to one predicate at one instant, the deciding predicate. Its value is the
+robustness of the whole formula. Several predicate values may be equal to the robustness. The path then leads,
+if possible, to one that decides alone: a change of this value changes the robustness.
 """
 
 from __future__ import annotations
@@ -51,23 +55,22 @@ _MOST_LATER = 64
 
 @dataclass(frozen=True, slots=True)
 class CauseNode:
-    """Node of a tree of causes: a sub-formula that does not have the truth value that is needed.
+    """Node of a tree of causes: a sub-formula that has the wrong truth value at an instant.
 
     Attributes:
         formula: the sub-formula, type-checked.
         holds: truth value that the sub-formula has; the opposite value is needed.
         sample: the instant, as a sample number.
         rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
-        until: last instant of the window, if the body of a temporal operator fails at every instant of it;
-            else None.
-        reads: for a predicate, the signals that it reads, each with the offset in samples at which it reads
-            it.
-        parts: causes among the operands; empty for a predicate.
-        main: index in `parts` of the operand whose value equals the robustness of the sub-formula.
+        until: for a temporal operator whose body has the wrong truth value in the whole window: the last
+            instant of the window; `sample` is the first one. Otherwise None.
+        reads: for a predicate, pairs (signal, offset): it reads the signal `offset` samples after `sample`.
+        parts: the children, which explain this node; empty for a predicate.
+        main: index in `parts` of the child on the main path. Its value is the robustness of the sub-formula.
         premise: whether the sub-formula is the left side of an implication.
-        moves: whether the value of the deciding predicate (`leaf`) can change alone, and then changes the
-            robustness of the sub-formula. False, for example, if a `freeze` binds a sample of a signal, and
-            the predicate inside the `freeze` reads the same sample.
+        moves: whether the robustness of the sub-formula changes if only the value of the deciding predicate
+            (`leaf`) changes. Example of False: a `freeze` stores the value of a signal at a sample, and the
+            predicate inside it reads the signal at the same sample.
     """
 
     formula: typed.Formula
@@ -103,7 +106,7 @@ class CauseNode:
 
     @property
     def path_moves(self) -> bool:
-        """True if `moves` is True for this node and all nodes on the path to the deciding predicate."""
+        """True if the attribute `moves` is True for this node and for all nodes below it on the main path."""
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
@@ -118,15 +121,15 @@ Spot: TypeAlias = tuple[ir.Formula, int]
 
 @dataclass(frozen=True, slots=True)
 class _Tied:
-    """Table of predicate values on a trace; one value may be replaced by the next larger float.
+    """Table of the predicate values on a trace, in which one value may be increased slightly.
 
-    The replacement shows whether this single value determines the robustness of a formula.
+    The increase, to the next larger float, shows whether this value alone determines the robustness.
 
     Attributes:
         record: the trace.
         names: predicate -> name of the column (time series) with its values.
-        env: name of a column -> predicate values (samples, 1); `coded` adds the columns that are missing.
-        raised: (predicate, sample) of the value to replace; None replaces no value.
+        env: name of a column -> predicate values (samples, 1). The method `coded` adds missing columns.
+        raised: (predicate, sample) of the value to increase; None increases no value.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
     """
 
@@ -138,7 +141,7 @@ class _Tied:
 
     @property
     def columns(self) -> dict[str, Floats]:
-        """Predicate values by column name; the value at `raised` is replaced by the next larger float."""
+        """Predicate values by column name; the value at `raised` is increased to the next larger float."""
         return self.env if self.raised is None else self._with(self.raised)
 
     def _with(self, spot: Spot) -> dict[str, Floats]:
@@ -147,7 +150,10 @@ class _Tied:
         return {**self.env, name: column}
 
     def coded(self, formula: ir.Formula) -> ir.Formula:
-        """Replace the predicates of a formula by columns of their values; missing columns are added."""
+        """Return the formula with each predicate replaced by the column (time series) of its values.
+
+        The values of a predicate without a column are computed and added to `env`.
+        """
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
@@ -158,8 +164,8 @@ class _Tied:
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
         """Return the robustness of `formula` at `sample`, with one predicate value slightly increased.
 
-        `raised[0]` is the (predicate, sample) pair whose value is increased, to the next larger float.
-        Further pairs are ignored. If `raised` is empty, no value is changed.
+        The sequence `raised` contains the pair (predicate, sample) of this value. The value is increased to
+        the next larger float. If `raised` is empty, no value is changed. Only the first pair in it is used.
         """
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
@@ -168,7 +174,10 @@ class _Tied:
 
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
-    """Predicates of a formula; a `freeze` counts as one predicate."""
+    """Return the predicates of a formula, each once, as the keys of a dictionary.
+
+    A `freeze` counts as one predicate.
+    """
     if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return {formula: None}
     return {leaf: None for part in operands(formula) for leaf in _leaves_of(part)}
@@ -187,12 +196,11 @@ class CauseFinder:
     Attributes:
         record: signals of the trace, (samples, 1), up to the end of the evaluated window.
         grid: time step and horizon of the signals.
-        cache: (formula, wanted) -> the lowered formula (intervals in samples, only basic operators), negated
-            if `wanted` is False.
-        known: lowered formula -> list of pairs: a range of instants, and the upper bounds on the robustness
-            at these instants.
-        tied: table of predicate values, one of them slightly raised. If given, it is evaluated instead of the
-            trace.
+        cache: (formula, wanted) -> the lowered formula (intervals in samples, only basic operators). It is
+            negated if `wanted`, the truth value that the formula should have, is False.
+        known: lowered formula -> list of pairs (range of instants, upper bounds on the robustness at them).
+        tied: table of predicate values, one of them slightly increased. If given, formulas are evaluated on
+            the table instead of the trace.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
     """
 
@@ -209,10 +217,10 @@ class CauseFinder:
         """Explain why `formula` does not have the truth value `wanted` at `sample`.
 
         Returns:
-            The tree of causes, and a flag. The flag is True if one predicate value decides: a change of this
-            value alone changes the robustness. If several predicate values are equal to the robustness, the
-            first `MOST_TIED` of them are tested. The main path of the tree then leads to one that decides, if
-            there is one.
+            The tree of causes, and a flag. The flag is True if the value of the deciding predicate decides
+            alone: a change of only this value changes the robustness. If several predicate values are equal
+            to the robustness, the first `MOST_TIED` of them are tried. The main path then leads to a value
+            that decides alone, if one is found.
         """
         tree = self.blame(formula, sample, wanted=wanted)
         lowered = self._lowered(formula, wanted)
@@ -235,9 +243,10 @@ class CauseFinder:
         return tree, False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
-        """Pairs (predicate, instant), in order of time, whose predicate value is the robustness `worth`.
+        """Pairs (predicate, instant), in order of time, at which the predicate has the value `worth`.
 
-        Only the predicates in the formula `lowered` are searched.
+        The argument `worth` is the robustness of the formula `lowered`. Only predicates in `lowered` are
+        searched.
         """
         wanted = _leaves_of(lowered)
         found = {
@@ -265,7 +274,7 @@ class CauseFinder:
         return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
-        """Return the causes for which `formula` does not have the truth value `wanted` at `sample`."""
+        """Return the tree that explains why `formula` does not have the truth value `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
@@ -298,7 +307,10 @@ class CauseFinder:
     # ------------------------------------------------------------------- values
 
     def _frozen(self, formula: typed.Freeze, sample: int) -> set[tuple[str, int]]:
-        """Pairs (signal, sample) that a `freeze` formula reads to bind its names."""
+        """Pairs (signal, sample) of the values that a `freeze` formula stores at instant `sample`.
+
+        A `freeze` stores the values of signals at one instant under names, for use inside the formula.
+        """
         return {
             (leaf.name, sample + self._later(leaf, sample))
             for _, num in formula.bindings
@@ -307,7 +319,7 @@ class CauseFinder:
         }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
-        """Return the values that a `freeze` formula binds at a sample: name -> value.
+        """Return the values that a `freeze` formula stores at instant `sample`: name -> constant.
 
         An unknown value is represented by an expression that reads a signal after the end of the trace.
         Predicates that use this value are then unknown.
@@ -324,7 +336,7 @@ class CauseFinder:
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
-        """The formula in terms of basic operators with intervals in samples, negated if `wanted` is False.
+        """Return the formula with basic operators and intervals in samples, negated if `wanted` is False.
 
         Predicates on signals that the trace does not contain are assumed true. If samples are unknown, the
         upper bound of the formula is returned.
@@ -388,14 +400,17 @@ class CauseFinder:
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
     def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
-        """Offset from `sample`, at which a predicate is evaluated, to the sample of `leaf` that it reads."""
+        """Number of samples from `sample` to the sample of the signal `leaf` that a predicate reads.
+
+        The predicate is evaluated at `sample`.
+        """
         if isinstance(leaf, ir.Signal):
             return 0
         there = sample + leaf.steps
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
-        """Triple (formula, sample, wanted) in `parts` with the least `_margin`."""
+        """Triple (formula, sample, wanted) in `parts` with the least upper bound (`_margin`)."""
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
 
     def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
@@ -432,12 +447,12 @@ class CauseFinder:
     def _least_of_both(
         self, formula: typed.Logic, sample: int, wanted: bool
     ) -> list[tuple[typed.Formula, int, bool]]:
-        """Return two (operand, sample, wanted) triples that explain a violated equivalence.
+        """Return the two operands that explain a violated `a <-> b` or `a xor b`.
 
-        `formula` is `a <-> b` or `a xor b`. If both sides should be equal, there are two ways to achieve it:
-        both are true, or both are false. If they should differ, the two ways are: only the left side is true,
-        or only the right side. For each way, the operand that is farthest from its truth value in this way is
-        returned.
+        `a <-> b` can become true in two ways: both operands are true, or both are false. `a xor b` can become
+        true in two other ways: only `a` is true, or only `b`. If `wanted` is False, the ways of the other
+        operator count. For each way, the operand that is farthest from the truth value it needs is returned,
+        as a triple (operand, sample, needed truth value).
         """
         left, right = formula.items
         same = (formula.op == "<->") is wanted
@@ -460,7 +475,7 @@ class CauseFinder:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """Instants in the window of `formula` at `sample` at which something is known about its operands."""
+        """Instants in the window of `formula` at `sample` at which its operands can be known."""
         lowered = self._lowered(formula, wanted)
         match lowered:
             case ir.Windowed(window=window, back=False):
@@ -478,11 +493,11 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """First instant from which on nothing is known about the operands of the operator `lowered`.
+        """Return the first instant from which on the operands of the operator `lowered` are unknown.
 
-        Without past operators, it is the instant after the last sample. Past operators in an operand still
-        read recorded samples at later instants. The instant is then later by their lookback, at most by
-        `_MOST_LATER` samples.
+        Usually this is the first instant after the last sample. An operand with past operators still reads
+        recorded samples at later instants. In this case its lookback is added, but at most `_MOST_LATER`
+        samples.
         """
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
@@ -542,10 +557,10 @@ class CauseFinder:
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
-        """True if a bounded window extends beyond the instants at which its operands are known.
+        """True if the window of `formula` at `sample` extends to instants at which operands are unknown.
 
-        It is the window of `formula` at `sample`. The argument `wanted` is the truth value that `formula`
-        should have.
+        Always False for an unbounded window. The argument `wanted` is the truth value that `formula` should
+        have.
         """
         lowered = self._lowered(formula, wanted)
         if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
@@ -554,7 +569,7 @@ class CauseFinder:
         return not instants or instants[-1] < sample + lowered.window.hi
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
-        """Causes for which the formula `left unless right` does not have the truth value `wanted`.
+        """Return the tree that explains why `left unless right` does not have the truth value `wanted`.
 
         The interval of `unless` is [a, b]. The formula is rewritten as `always[0, b] left or left until[a, b]
         right`.
@@ -566,12 +581,16 @@ class CauseFinder:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """Find the value that decides a violated `until`: its offset, and True if it is one of the left side.
+    """Find the value that decides a violated `until`.
 
-    `left` and `right` are robustness values of the two sides, one per instant. `left` begins at the instant
-    at which `until` is evaluated, and `right` at the beginning of its window. The offset counts samples from
-    the beginning of `left`. The robustness of `until` is the maximum, over the instants k of its window, of
-    the minimum of the right side at k and of the left side at all instants up to k.
+    `left` and `right` are robustness values of the two operands, one per instant. `left` begins at the
+    instant at which `until` is evaluated. `right` begins later, with the window of `until`. For each instant
+    k of the window, take the least of two numbers: the right value at k, and the least left value up to k.
+    The greatest result over all k is the robustness of `until`.
+
+    Returns:
+        The number of samples from the start of `left` to the deciding value. Then True if it is a value of
+        `left`, False if it is a value of `right`.
     """
     skipped = len(left) - len(right)
     held = np.minimum.accumulate(left)[skipped:]
@@ -584,13 +603,13 @@ def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
 def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
     """Find the two values that decide a violated `release`.
 
-    `left` and `right` are robustness values of the two sides, one per instant. `left` begins at the instant
-    at which `release` is evaluated, and `right` at the beginning of its window. Offsets count samples from
-    the beginning of `left`.
+    `left` and `right` are robustness values of the two operands, one per instant. `left` begins at the
+    instant at which `release` is evaluated. `right` begins later, with the window of `release`.
 
     Returns:
-        The offset at which the right side fails, the offset of the greatest left value up to there, and the
-        side whose value is the robustness: 0 left, 1 right.
+        Three numbers. The first is the offset at which the right side fails. The second is the offset of the
+        greatest left value up to this instant. The third is the side whose value is the robustness: 0 left, 1
+        right. Offsets are samples from the start of `left`.
     """
     skipped = len(left) - len(right)
     freed = np.maximum.accumulate(left)[skipped:]

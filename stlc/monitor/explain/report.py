@@ -55,8 +55,8 @@ class Cause:
         labels: the other parts to underline, and their texts.
         because: the cause in words, on one line.
         tree: tree of the sub-formulas that explain the violation, down to predicates.
-        alone: whether a larger margin of `predicate` at `sample` suffices to raise the robustness of the
-            requirement.
+        alone: whether the robustness of the requirement rises if only the value of `predicate` at `sample`
+            rises.
     """
 
     judgement: Judgement
@@ -152,12 +152,12 @@ def _cause(
 
 @dataclass(frozen=True, slots=True)
 class _Words:
-    """Generator of the texts that describe causes of the violation of one requirement.
+    """Writer of the texts that explain the violation of one requirement.
 
     Attributes:
         subject: the evaluated signals and requirements.
         record: the trace, up to the end of the evaluated window.
-        written: source expression of the requirement.
+        written: expression of the requirement, as it is written in the specification.
         definitions: name of a definition in the specification -> its expression.
     """
 
@@ -182,7 +182,10 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """Source locations to underline, each with its text; that of the deciding predicate comes first."""
+        """Source locations to underline, each with its text.
+
+        The location of the deciding predicate comes first.
+        """
         found: dict[Span, str] = {}
         for node in _labelled(tree):
             found.setdefault(self.site(node.span), self.label(node))
@@ -193,7 +196,7 @@ class _Words:
     def label(self, node: CauseNode) -> str:
         """Text beside the underlined source of `node`: its truth value, and the instant.
 
-        For the left side of an implication, the values of the signals that it reads are added.
+        If `node` is the left side of an implication, the values of its signals are added.
         """
         moment = self.subject.moment(node.sample)
         if node.until is not None:
@@ -205,7 +208,8 @@ class _Words:
     def because(self, tree: CauseNode) -> str:
         """The cause in words, as one line of text.
 
-        If the left side of an implication decides, the right side of the implication is described after it.
+        If the deciding predicate is on the left side of an implication, the text continues with the right
+        side.
         """
         text = self.reason(tree)
         while tree.parts:
@@ -230,19 +234,21 @@ class _Words:
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
-        """Source location to underline for the location `span`.
+        """Return the part of the requirement to underline for the source location `span`.
 
-        If `span` lies inside a definition, it is the name in the requirement that leads to this definition.
-        Otherwise it is `span` itself.
+        If `span` lies in the requirement itself, it is returned. Otherwise it lies in the text of a
+        definition. The requirement then contains a name that refers to this definition, directly or through
+        other definitions. The location of the name is returned.
         """
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
-        """Names of the definitions through which the source expression `expr` refers to location `span`.
+        """Return the names that lead from the expression `expr` to the source location `span`.
 
-        Example: `expr` names the definition `a`, and `a` names `b`, whose text contains `span`: the names are
-        `a` and `b`. Empty if `span` lies in `expr` itself; None if no name leads to it.
+        Example: `expr` contains the name of the definition `a`, the text of `a` contains `b`, and the text of
+        `b` contains `span`. The result is (`a`, `b`). It is empty if `span` lies in `expr` itself, and None
+        if no name leads to `span`.
         """
         if _within(span, expr.span):
             return ()
@@ -255,9 +261,9 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """Pairs (signal, offset in samples) that a predicate reads, in the order of the signals in its text.
+    """Pairs (signal, offset in samples) that a predicate reads, in the order in which its text names them.
 
-    Signals that the predicate reads only through a named definition come last.
+    If the text contains the name of a definition, the signals in this definition come last.
     """
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
@@ -269,8 +275,9 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
     """Yield the nodes of a tree of causes whose source is underlined.
 
-    These are left sides of implications, bodies of temporal operators that hold nowhere in the window, and
-    predicates. Nothing inside an underlined part is underlined again.
+    Three kinds of nodes are underlined: left sides of implications, predicates, and the body of a temporal
+    operator if the body has the wrong truth value in the whole window. Nothing inside an underlined part is
+    underlined again.
     """
     if tree.premise or tree.until is not None or not tree.parts:
         yield _body(tree)
@@ -282,8 +289,8 @@ def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
 def _deciding(tree: CauseNode) -> CauseNode:
     """Node whose source is underlined first: it contains the predicate that decides the violation.
 
-    It is the body of a temporal operator if this body holds nowhere in the window. Otherwise it is the
-    predicate itself.
+    It is the body of a temporal operator if this body has the wrong truth value in the whole window.
+    Otherwise it is the predicate itself.
     """
     return _body(tree) if tree.until is not None or not tree.parts else _deciding(tree.parts[tree.main])
 
@@ -300,9 +307,10 @@ def _closest(tree: CauseNode) -> bool:
 
 
 def _body(node: CauseNode) -> CauseNode:
-    """Return a copy of the node with the body of its temporal operator in place of its formula.
+    """Return a copy of `node` whose formula is the body of its temporal operator.
 
-    This is done only if the body holds nowhere in the window. Any other node is returned unchanged.
+    This is done only if the body has the wrong truth value in the whole window. Any other node is returned
+    unchanged.
     """
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
         return replace(node, formula=operands(node.formula)[-1])

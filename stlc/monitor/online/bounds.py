@@ -1,4 +1,4 @@
-"""Bounds on the robustness of a requirement while a trace grows, and the interface of their evaluators."""
+"""Interface of the evaluators of one requirement on a growing trace, and the bounds that they return."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TrackingOptions:
     Attributes:
         ending: treatment of windows that extend beyond the end of the trace: "open" leaves missing samples
             unknown, "truncate" clips the windows.
-        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
+        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
         begin: the first sample at which the requirement is evaluated.
     """
 
@@ -65,7 +65,7 @@ class Tracker(Protocol):
     def ended(self, starts: range) -> Bounds:
         """Bounds at the instants `starts` after the trace has ended.
 
-        Windows to the end of the trace end with the last sample.
+        A window that extends to the end of the trace now ends with the last sample.
         """
 
     def drop(self, start: int) -> int:

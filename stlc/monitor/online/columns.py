@@ -1,7 +1,8 @@
-"""Time series of robustness values that grow sample by sample, in memory bounded by the windows of a formula.
+"""Time series of robustness values that grow sample by sample.
 
-Each such time series (column) is stored twice: with the least and with the greatest values over all
-continuations of the trace. The two are equal at samples where nothing is unknown.
+Only rows that the windows of a formula still need are stored. Such a time series is called a column. There is
+a least and a greatest value of each row, over all continuations of the trace. The two are equal where nothing
+is unknown.
 """
 
 from __future__ import annotations
@@ -54,12 +55,12 @@ class ColumnReader:
     The order of computation is cached for every range of rows.
 
     Args:
-        formulas: formulas; each predicate is the value of a column.
-        end: value of columns after their last row: "lower" -inf, "upper" +inf, "both" these two side by side.
-            With "truncate", windows are clipped at the last row.
+        formulas: formulas to evaluate; each of their predicates is the value of a column.
+        end: value of a column after its last row: -inf if "lower", +inf if "upper". If "both", a column has
+            two parts, one for each of these cases. If "truncate", windows are clipped at the last row.
         going_on: whether the trace continues after the last row.
-        back: number of rows before the first requested row that the formulas read. Unknown values (NaN) in
-            earlier rows have no effect.
+        back: lookback of the formulas: number of rows that they read before the first requested row. Unknown
+            values (NaN) in rows before these have no effect.
     """
 
     def __init__(
@@ -94,10 +95,11 @@ class ColumnReader:
     def of_signals(
         self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
     ) -> list[Floats]:
-        """Bounds of each formula at `count` rows from `start` on, over all values that NaN may stand for.
+        """Return bounds on each formula at `count` rows, the first of which is `start`.
 
-        `least` selects the lower (True) or the upper (False) bound, (count, traces). If `least` is None, the
-        columns have one trace, and both bounds are returned side by side, (count, 2).
+        The bounds hold for all values that the unknown entries (NaN) of the columns may have. `least` selects
+        the lower (True) or the upper (False) bound, (count, traces). If `least` is None, the columns have one
+        trace, and both bounds are returned side by side, (count, 2).
         """
         rows = {name: env[name] for name in self.names}
         near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
@@ -111,9 +113,9 @@ class ColumnReader:
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
     def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
-        """Evaluator of the lower (`least`) or upper bounds on all formulas.
+        """Return an evaluator of bounds on all formulas: of lower bounds if `least`, else of upper bounds.
 
-        It takes the values of the columns `holes` as partly unknown.
+        The columns named in `holes` contain unknown values.
         """
         key = (holes, least)
         if key not in self._unsure:
@@ -124,16 +126,17 @@ class ColumnReader:
 
 @dataclass(slots=True)
 class Side:
-    """Columns of a formula (time series of its predicates and past operators), for bounds on its robustness.
+    """Columns of one formula, from which bounds on its robustness are computed.
+
+    The columns are the time series of the predicates and past operators of the formula.
 
     Attributes:
         plan: the columns to compute.
-        end: value of predicates after the last sample: "lower" -inf, "upper" +inf, "both" the two side by
-            side as (rows, 2); "truncate" clips windows at the last sample.
+        end: value of a predicate after the last sample: -inf if "lower", +inf if "upper". If "both", the two
+            values are stored side by side, (rows, 2). If "truncate", windows are clipped at the last sample.
         beyond: number of instants after the last sample at which the formula reads its columns.
-        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
-        least: bound that replaces a predicate if it reads unknown samples (NaN): True lower, False upper,
-            None both.
+        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
+        least: bound on a predicate that reads unknown samples (NaN): True lower, False upper, None both.
         rows: column name -> view of its stored rows, the first of which is sample `base`.
         history: storage of the rows.
     """
@@ -170,9 +173,10 @@ class Side:
         self.history = ColumnHistory(self._farthest(), _UNKNOWN[self.end])
 
     def _farthest(self) -> int:
-        """Number of instants after the last sample for which the columns must have a value.
+        """Number of instants after the last sample at which the columns must have a value.
 
-        It is the farthest that the formula or another column reads ahead; 0 if windows are clipped.
+        This is how far the formula, or a column computed from other columns, reads ahead. The number is 0 if
+        windows are clipped.
         """
         if self.end == "truncate":
             return 0
@@ -224,7 +228,7 @@ class Side:
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
     def over(self) -> Side:
-        """Return a copy that treats the last sample as the end of the trace, at which windows are clipped.
+        """Return a copy for a trace that ends with the last sample, so that windows are clipped there.
 
         If no column reads later samples, the end makes no difference, and `self` is returned.
         """
@@ -236,11 +240,14 @@ class Side:
         return last
 
     def values(self, reader: ColumnReader, start: int, count: int) -> list[Floats]:
-        """Return the values (count, traces) of the formulas in `reader` at `count` samples, from `start`."""
+        """Return the values (count, traces) of the formulas in `reader` at `count` samples.
+
+        The first of these samples is `start`.
+        """
         return reader(self.rows, start - self.base, count)
 
     def drop(self, first: int) -> None:
-        """Free the rows before sample `first`; keep rows that an unbounded past operator still needs."""
+        """Free the rows before sample `first`, except rows that an unbounded past operator still needs."""
         needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._recursive]
         if (base := min([first, *needs])) > self.base:
             self.history.forget(base)
@@ -257,7 +264,7 @@ _UNKNOWN: Mapping[Beyond, float | tuple[float, float]] = {
 
 
 def _of_the_present(stream: DerivedColumn) -> bool:
-    """True for a predicate that reads the signals at its own sample only, not before or after it."""
+    """True for a predicate that reads signals only at the sample at which it is evaluated."""
     return isinstance(stream, PredicateColumn) and not (
         stream.back or stream.ahead or isinstance(stream.formula, ir.Freeze)
     )
@@ -266,8 +273,9 @@ def _of_the_present(stream: DerivedColumn) -> bool:
 def shareable(plans: ColumnPlans) -> bool:
     """True if one formula gives the lower and the upper bound, so that both are computed together.
 
-    `plans` contains a formula for each bound. The result is True if these formulas are equal, every predicate
-    reads the signals at its own sample only, and unbounded past operators have no operand that looks ahead.
+    `plans` contains a formula for each bound. The result is True if three conditions hold. The formulas are
+    equal. Every predicate reads the signals only at the sample at which it is evaluated. No operand of an
+    unbounded past operator reads later samples.
     """
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(
@@ -277,12 +285,12 @@ def shareable(plans: ColumnPlans) -> bool:
 
 
 def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:
-    """Values (rows, traces) of an unbounded past operator, computed recursively.
+    """Return the values (rows, traces) of an unbounded past operator, computed recursively.
 
     Args:
         op: the operator.
         parts: values of its operands at the rows to compute, (rows, traces) each.
-        last: value of the operator in the row before, (traces,); None if there is no such row.
+        last: value of the operator in the row before these rows, (traces,); None if there is no such row.
     """
     match op:
         case "once":

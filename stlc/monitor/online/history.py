@@ -35,7 +35,10 @@ class ColumnHistory:
         self._origin = self._room = 0
 
     def grow(self, names: Iterable[str], count: int, width: int = 1) -> None:
-        """Append `count` rows with value `fill` to the columns `names`, which are the same in every call."""
+        """Append `count` rows with the value `fill` to the columns `names`.
+
+        All calls must have the same `names`.
+        """
         stop = self.samples + count + self._beyond
         if stop - self._origin > self._room:
             known = slice(self.first - self._origin, self.samples - self._origin)
@@ -47,11 +50,11 @@ class ColumnHistory:
         self.samples += count
 
     def put(self, name: str, start: int, values: Floats) -> None:
-        """Write rows (rows, width) of the series `name` from sample `start` on."""
+        """Write `values`, (rows, width), to the series `name`; the first row belongs to sample `start`."""
         self._rows[name][start - self._origin : start - self._origin + len(values)] = values
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Append `count` samples to all series: name -> (count, width)."""
+        """Append `count` samples to all series; `columns` maps their names to arrays (count, width)."""
         start = self.samples
         self.grow(columns, count, next(iter(columns.values())).shape[1])
         for name in self._rows:

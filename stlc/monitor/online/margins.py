@@ -27,13 +27,14 @@ Counts: TypeAlias = NDArray[np.int64]
 class Margin:
     """Bounds on the robustness margin of a requirement at the latest sample, (traces,) each.
 
+    A window start is a sample at which the requirement is evaluated.
+
     Attributes:
         low: least robustness over all continuations of the trace. If the requirement is evaluated at every
             sample, this is the minimum over the windows that contain the latest sample.
-        high: greatest robustness over all continuations; the same minimum over windows is taken.
-        violated: number of window starts (samples at which the requirement is evaluated) at which it is
-            violated, whatever samples follow.
-        open: whether the requirement is still undecided at some window start.
+        high: greatest robustness over all continuations, with the same minimum over windows.
+        violated: number of window starts at which the requirement is certainly violated.
+        open: whether the requirement is undecided at any window start.
     """
 
     low: Floats
@@ -44,8 +45,8 @@ class Margin:
     def status(self, trace: int) -> Status:
         """Status of one trace: `violated`, `satisfied` or `inconclusive`.
 
-        It is violated if the requirement is violated at any window start, and satisfied if it is satisfied at
-        every one.
+        The status is violated if the requirement is violated at any window start, and satisfied if the
+        requirement is satisfied at every window start.
         """
         if self.violated[trace]:
             return "violated"
@@ -56,13 +57,13 @@ class Margin:
 class _Watched:
     """A requirement, and its counts over window starts (the samples at which it is evaluated).
 
-    A window start is settled if its value can no longer change with later samples.
+    A window start is settled if later samples can no longer change the robustness there.
 
     Attributes:
         rule: the requirement.
         horizon: horizon `T` of the planning window in steps; None if unknown.
         whole: evaluator of the bounds over all continuations of the traces.
-        next: the first window start that is not settled; all earlier ones are.
+        next: the first window start that is not settled; all earlier window starts are settled.
         violated: number of settled window starts that are violated, (traces,).
         last: margins at the latest sample; None before the first evaluation.
     """
@@ -100,9 +101,10 @@ class _Watched:
         return max(self.next - history(self.rule.formula), 0)
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """Margin of the requirement at the latest sample, which has index `samples` - 1; updates the counts.
+        """Return the margin of the requirement at the latest sample, and update the counts.
 
-        `env` contains the stored samples of each signal, (stored, traces), beginning with sample `first`.
+        The latest sample has the index `samples` - 1. `env` contains the stored samples of each signal,
+        (stored, traces), beginning with sample `first`.
         """
         if not self.everywhere and self.next:
             assert self.last is not None
@@ -137,9 +139,10 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Number of window starts, from `next` on, to leave out of the margin at the latest sample.
+        """Number of window starts to leave out of the margin, because their windows are over.
 
-        Their windows end before that sample; `samples` is the number of samples received.
+        These are the first window starts from `next` on. Their windows end before the latest sample.
+        `samples` is the number of samples received.
         """
         if not self.everywhere or self.ahead is None:
             return 0

@@ -65,8 +65,8 @@ class How:
             the instants that each requirement prescribes (`stlc.monitor.instants`).
         end: treatment of windows that extend beyond the end of the stream: "open" computes bounds, "strict"
             raises an error, "truncate" clips the windows.
-        tolerance: a requirement is satisfied if its robustness is at least minus this value. With 0, truth
-            values of the predicates decide, which distinguish `<` from `<=`.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value. If the tolerance
+            is 0, the truth values of the predicates decide: then `<` and `<=` differ.
         t0: time of the first sample in seconds.
         reasons: whether to store the samples that `Online.cause` needs.
     """
@@ -88,10 +88,11 @@ class Watched:
         everywhere: whether the requirement is evaluated at every sample or only at one.
         values: evaluator of the robustness.
         truths: evaluator of truth values, +inf or -inf; None if the tolerance is not 0.
-        tolerance: the requirement is satisfied if its robustness is at least minus this value; with 0, the
-            truth values of the predicates decide.
+        tolerance: the requirement is satisfied if its robustness is at least minus this value. If it is 0,
+            the truth values of the predicates decide.
         tally: summary of the instants whose verdict is final; these instants are called counted.
-        decided: True for instants after the counted ones that already have a verdict, (instants,).
+        decided: whether an instant already has a verdict, (instants,). It begins with the first instant that
+            is not counted.
     """
 
     rule: CompiledRequirement
@@ -121,7 +122,7 @@ class Watched:
 
     @property
     def over(self) -> bool:
-        """True if the requirement is evaluated only once and that verdict is final."""
+        """True if the requirement is evaluated only once, and its verdict is final."""
         return not self.everywhere and self.tally.instants > 0
 
     def judged(self, start: int, stop: int) -> JudgedInstants:
@@ -150,8 +151,8 @@ class Online:
     """Monitor of a stream of samples; made by `Monitor.online`.
 
     Memory is bounded by the windows of the requirements, not by the length of the stream. An unbounded future
-    window takes constant memory if it is outermost, or if all windows around it are unbounded. If it is
-    inside a bounded window, all samples are stored and the requirement is evaluated on them.
+    window takes constant memory, unless it is inside a bounded window. In that case all samples are stored,
+    and the requirement is evaluated on all of them.
     """
 
     def __init__(
@@ -230,9 +231,10 @@ class Online:
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
-        """Count the unknown samples (NaN) among the next `values` (samples,) of the signal `need` in `gaps`.
+        """Count the unknown samples (NaN) of the signal `need`, and add them to `gaps`.
 
-        Raises TraceError (E604) if a value is infinite.
+        `values`, (samples,), are the next samples of the signal. Raises TraceError (E604) if a value is
+        infinite.
         """
         if np.isinf(values).any():
             first = int(np.argmax(np.isinf(values)))
@@ -308,7 +310,7 @@ class Online:
     def _count_settled(self, requirements: Sequence[Watched]) -> None:
         """Pass the latest samples to the evaluators of `requirements`.
 
-        Instants whose value can no longer change are then added to the summary of each requirement.
+        Then add the instants whose value can no longer change to the summary of each requirement.
         """
         for watched in requirements:
             if watched.due(self.samples):
@@ -347,10 +349,9 @@ class Online:
         return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Triples (sample, least robustness, greatest robustness) of the requirement `name`.
+        """Return bounds on the robustness of the requirement `name`, where it may still change.
 
-        There is one triple for each sample at which the requirement has been evaluated and its value may
-        still change.
+        There is one triple (sample, least robustness, greatest robustness) for each of these samples.
         """
         watched = self._find(name)
         if watched.over or not self.samples:
@@ -363,8 +364,7 @@ class Online:
     def standing(self, name: str) -> Tally:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
 
-        At a sample where the robustness may still change, the summary uses the lower and the upper bound on
-        it.
+        Where the robustness may still change, the summary uses its lower and its upper bound.
         """
         return self._standing(self._find(name))
 
@@ -441,7 +441,10 @@ class Online:
 
 
 def _number(sample: Sample, need: Need) -> float:
-    """Value of the signal `need` in a sample; `q[0]` may also be given as a component of the vector `q`."""
+    """Return the value of the signal `need` in a sample.
+
+    If the sample contains a vector `q`, the signal `q[0]` is its first component.
+    """
     value = sample.get(need.column.name)
     if isinstance(value, float):
         return value

@@ -1,9 +1,9 @@
 """Evaluation of requirements with wide windows in a stream, at a bounded cost per sample.
 
-Instants whose value may still change are recomputed at every evaluation. Requirements with narrow windows are
-evaluated after every sample; those with wide windows only after every n-th sample, so that the cost per
-sample is bounded. A window longer than the stream is shortened to a few times the number of samples and
-lengthened as the stream grows, so that memory grows with the number of samples, not with the width of the
+Every evaluation recomputes the instants whose value may still change. Requirements with narrow windows are
+evaluated after every sample. Those with wide windows are evaluated only after every n-th sample, so that the
+cost per sample is bounded. A window longer than the stream is shortened to a few times the number of samples.
+It is lengthened as the stream grows. Memory thus grows with the number of samples, not with the width of the
 windows.
 """
 
@@ -45,10 +45,10 @@ _FROZEN = 500
 
 
 def span(formula: ir.Formula) -> Reach:
-    """Return the lookback and lookahead of a formula in samples, each summed over nested operators.
+    """Return the lookback and the lookahead of a formula in samples.
 
-    If an operator has several operands, the greatest value counts. Of an unbounded window only the lower
-    bound counts.
+    Those of nested operators are added. If an operator has several operands, the greatest value counts. An
+    unbounded window `[a, inf)` counts as `a` samples.
     """
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
@@ -57,12 +57,14 @@ def span(formula: ir.Formula) -> Reach:
 
 @dataclass(frozen=True, slots=True)
 class PacedWork:
-    """Work of one evaluation of a formula, counted in rows (values of a subformula at one instant).
+    """Work of one evaluation of a formula, counted in rows.
+
+    A row is the value of one subformula at one instant.
 
     Attributes:
         rows: number of all rows.
-        own: number of rows that are of use at one evaluated instant only, such as those inside a `freeze`.
-            Other rows are shared by several instants.
+        own: number of rows that only one evaluated instant uses, such as those inside a `freeze`. Several
+            instants share the other rows.
         heaviest: the subformula to which most of the rows in `own` belong.
     """
 
@@ -105,13 +107,14 @@ def _unbounded(formula: ir.Formula) -> bool:
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
-    """Shorten a formula's windows so that its value on streams of at most `samples` samples stays the same.
+    """Return a copy of the formula with shorter windows, which has the same value on short streams.
 
-    Returns the new formula. At instants far after the last sample nothing is known, and each sub-formula has
-    the same value at all of them. A future window therefore need not contain more than one of these instants.
-    A past window need not reach back beyond the first sample. Future windows are shortened only if past
-    windows are narrow, and past windows only if future windows are narrow. If both are wide, the formula is
-    unchanged.
+    A short stream has at most `samples` samples. Nothing is known far after its last sample: there, each
+    sub-formula has the same value at all instants. A future window needs only one of these instants. A past
+    window need not reach back beyond the first sample.
+
+    If past windows are narrow, future windows are shortened. Otherwise, if future windows are narrow, past
+    windows are shortened. If both are wide, the formula is returned unchanged.
     """
     past, future = span(formula)
     slack = sum(1 for _ in nodes(formula))
@@ -144,12 +147,12 @@ class PacedTracker:
 
     Attributes:
         rule: the requirement.
-        make: function that returns an evaluator of a requirement; it is called with `rule`, whose windows may
-            have been shortened.
+        make: function that returns an evaluator of a requirement. Its argument is `rule`, or a copy of `rule`
+            with shorter windows.
         everywhere: whether the requirement is evaluated at every instant or only at the first one.
         stores_all: whether the evaluator stores and reads all samples.
-        window: number of samples from each instant to the end of its planning window; None if this number is
-            not fixed.
+        window: number of samples from each instant to the end of its planning window; None if no planning
+            window moves with the instant.
         samples: number of samples received at the last evaluation.
     """
 
@@ -164,9 +167,10 @@ class PacedTracker:
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of one evaluation of `formula` on `spanned` consecutive samples of the trace.
+        """Return the work of one evaluation of `formula` on a part of the trace.
 
-        `formula` is the formula of the requirement, or this formula with shorter windows.
+        The part consists of `spanned` consecutive samples. `formula` is the formula of the requirement, or a
+        copy with shorter windows.
         """
         many = self.everywhere or _unbounded(formula)
         found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)

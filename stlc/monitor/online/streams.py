@@ -72,7 +72,7 @@ class ColumnPlan:
     Attributes:
         formula: the formula, in which columns replace the predicates and unbounded past operators.
         streams: the columns; each one depends only on signals and on columns before it.
-        lag: number of rows at the end of the columns whose values may change with later samples.
+        lag: number of the latest rows of the columns that later samples may still change.
     """
 
     formula: ir.Formula
@@ -152,9 +152,10 @@ class _Planner:
         return self._leaf(formula)
 
     def _past(self, formula: ir.PastTemporal | ir.Since) -> ir.Formula:
-        """Rewrite a past operator over columns.
+        """Rewrite a past operator whose operands are formulas over columns.
 
-        An unbounded operator `op[a, inf)` becomes the column of `op[0, inf)`, read `a` samples earlier.
+        An unbounded operator `op[a, inf)` is replaced by the column of `op[0, inf)`, read `a` samples
+        earlier.
         """
         if formula.window.hi is not None:
             return formula
@@ -179,5 +180,8 @@ class _Planner:
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """Return the greatest number of samples by which a predicate reads signals later than its instant."""
+    """Return how many samples ahead of their own instant the predicates of a formula read signals.
+
+    This is the greatest number over all predicates.
+    """
     return max((farthest(num).future for num in numbers(formula)), default=0)

@@ -21,8 +21,8 @@ class JudgedInstants(NamedTuple):
     Attributes:
         low: least robustness over all continuations of the trace.
         high: greatest robustness over all continuations.
-        holds: whether the requirement is satisfied, whatever samples follow.
-        fails: whether the requirement is violated, whatever samples follow.
+        holds: whether the requirement is certainly satisfied, that is, for all samples that may follow.
+        fails: whether the requirement is certainly violated.
     """
 
     low: Floats
@@ -38,7 +38,7 @@ class Tally:
     Attributes:
         instants: number of counted instants.
         holds: number of instants at which the requirement is certainly satisfied.
-        fails: number of instants at which it is certainly violated.
+        fails: number of instants at which the requirement is certainly violated.
         low: minimum over the instants of the least robustness over all continuations; +inf without instants.
         high: minimum over the instants of the greatest robustness over all continuations.
         low_at: instant of `low`.
@@ -87,14 +87,22 @@ class Tally:
 
     @property
     def status(self) -> Status:
-        """Violated if violated at any instant, satisfied if satisfied at every one, else inconclusive."""
+        """Status over all counted instants: `violated`, `satisfied` or `inconclusive`.
+
+        It is violated if the requirement is violated at any instant, and satisfied if it is satisfied at all
+        of them.
+        """
         if self.fails:
             return "violated"
         return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"
 
     @property
     def robustness(self) -> float:
-        """The least robustness; if unknown, `low` if satisfied, `high` if violated, NaN if inconclusive."""
+        """The least robustness over the counted instants.
+
+        If it is not known exactly, `low` is returned for a satisfied requirement, `high` for a violated one,
+        and NaN if the verdict is inconclusive.
+        """
         if self.low == self.high or self.status == "satisfied":
             return self.low
         return self.high if self.status == "violated" else math.nan

@@ -1,4 +1,7 @@
-"""Buffer of the latest samples of a stream, and of causes of violations found before samples were dropped."""
+"""Buffer of the latest samples of a stream, from which causes of violations are found.
+
+A cause that older samples show is found and stored before these samples are dropped.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,9 @@ class Worst:
 
 @dataclass(slots=True)
 class TraceBuffer:
-    """Buffer of the latest samples, and of causes of violations found before older samples were dropped.
+    """Buffer of the latest samples of a stream, and of causes of violations.
+
+    The causes are found before the samples that show them are dropped.
 
     Attributes:
         compiled: the specification.
@@ -108,12 +113,12 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """Excerpt of the buffer that suffices to explain the violation `worst` of the requirement `rule`.
+        """Return an excerpt of the buffer that suffices to explain the violation `worst` of `rule`.
 
         Returns:
-            The index in the trace of the first sample of the excerpt; the index in the excerpt of the instant
-            at which to explain the violation; and arrays (samples, 1) by signal name. None if needed samples
-            were dropped.
+            Three values: the index in the trace of the first sample of the excerpt; the index in the excerpt
+            of the instant at which to explain the violation; and the signals, name -> array (samples, 1).
+            None if needed samples were dropped.
         """
         history = self._history
         formula, horizon = rule.lowered, self.compiled.grid.horizon
@@ -139,8 +144,8 @@ class TraceBuffer:
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
     """True if `formula` is an `always` over an unbounded window, and its body has only bounded windows.
 
-    `formula` is that of the requirement `rule`. False if the requirement is evaluated for every planning
-    window.
+    `formula` is the formula of the requirement `rule`. The result is False if the requirement is evaluated
+    for every planning window.
     """
     return (
         isinstance(formula, ir.Temporal)
@@ -152,10 +157,10 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Numbers of samples before and after an instant that determine the value of `formula` at the instant.
+    """Return how many samples before and after an instant determine the value of `formula` there.
 
-    `formula` is that of the requirement `rule`; `horizon` is the length of a planning window in steps. None
-    if a number is unbounded.
+    `formula` is the formula of the requirement `rule`. `horizon` is the length of a planning window in steps.
+    None is returned if either number is unbounded.
     """
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):

@@ -38,28 +38,30 @@ from stlc.monitor.values import Record, by_truth, window_bounds
 def worst(
     formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
 ) -> ir.Formula:
-    """Return a formula whose value bounds that of `formula` on a trace that is still growing.
+    """Return a formula whose value is a bound on `formula` while the trace is still growing.
 
-    The bound holds for every sample, now or later, with which the trace may end.
+    The bound is valid wherever the trace may end: with the latest sample or with any later sample.
 
     Args:
         formula: the formula to bound.
         end: "lower" or "upper" bound.
         ending: "truncate" if windows are clipped at the end of the trace, else "open".
-        window: length in samples of the planning window that the requirement refers to, or None. If there is
-            a planning window and it is not clipped, all its instants exist: `formula` itself is returned.
+        window: length in samples of the planning window that the requirement refers to; None without one.
+            With a planning window and `ending` "open", `formula` itself is returned, since the trace will
+            contain the whole window.
     """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
 
 def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
-    """Return the columns (time series of subformulas) for two bounds: the lower and the upper one.
+    """Return the columns from which the lower and the upper bound on a formula are computed.
 
-    If windows are clipped at the end of the trace, the list has two more entries: the columns of the formula
-    with clipped windows, for its lower and its upper bound. These two bounds differ only where samples are
-    unknown (NaN). `beyond` is the number of instants after the last sample at which the formulas read
-    columns.
+    A column is the time series of a subformula. `plans` contains the decompositions into columns. The first
+    entry of the list is for the lower bound, the second for the upper bound. If windows are clipped at the
+    end of the trace, two more entries follow: the columns for both bounds on the formula with clipped
+    windows. These two bounds differ only where samples are unknown (NaN). `beyond` is the number of instants
+    after the last sample at which the formulas read columns.
     """
     sides = [
         Side(plans["lower"], "lower", beyond, options.truth),
@@ -72,9 +74,10 @@ def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[
 
 
 def first_needed(planned: ColumnPlan, samples: int) -> int:
-    """Return the index of the first sample that is still needed after `samples` samples.
+    """Return the index of the first sample that later evaluations still read.
 
-    Later evaluations of the predicates in `planned` read no sample before it.
+    `samples` is the number of samples received. The predicates in `planned` determine how far evaluations
+    read back.
     """
     predicates = [stream for stream in planned.streams if isinstance(stream, PredicateColumn)]
     return max(min((samples - each.ahead - each.back for each in predicates), default=samples), 0)
@@ -86,9 +89,9 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 class _CutTracker(ABC):
     """Base of evaluators for requirements whose windows may be clipped at the end of the trace.
 
-    An instant is settled if no later sample can change its value. If windows are clipped, the values at
-    settled instants are computed with clipped windows. At the other instants, the bounds are computed with
-    whole windows, and later samples are unknown.
+    An instant is settled if no later sample can change its value. If windows are clipped, this is already
+    done at settled instants. At all other instants, windows keep their full length, and bounds are computed
+    in which later samples are unknown.
     """
 
     __slots__ = ()
@@ -107,12 +110,13 @@ class _CutTracker(ABC):
     def certain(self, starts: range) -> Bounds:
         """Return bounds at the instants `starts`, with windows clipped at the last sample.
 
-        The method is called for instants that no later sample can change, and after the trace has ended.
+        The method is for settled instants, whose value no later sample can change, and for a trace that has
+        ended.
         """
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Return bounds at the instants from `start` to `stop` (exclusive), without clipping windows.
+        """Return bounds at the instants from `start` to `stop` (exclusive), without clipped windows.
 
         Samples outside the trace are unknown.
         """
@@ -138,12 +142,12 @@ class _CutTracker(ABC):
 class _ColumnTracker(_CutTracker):
     """Evaluator of a formula over columns (time series of its predicates and past operators).
 
-    There is one set of columns for the lower and one for the upper bound. If windows are clipped at the end
-    of the trace, two more sets belong to the bounds with clipped windows.
+    There is one set of columns for the lower bound and one for the upper bound. If windows are clipped at the
+    end of the trace, there are two more sets, for the two bounds with clipped windows.
 
     Attributes:
-        plans: decompositions into columns: under "lower" that of the formula for the lower bound, under
-            "upper" that for the upper bound, under "truncate" that of the formula itself.
+        plans: decompositions into columns: "lower" of the formula for the lower bound, "upper" of the formula
+            for the upper bound, "truncate" of the formula itself.
         options: options of the evaluation.
         samples: number of samples received.
     """
@@ -156,7 +160,7 @@ class _ColumnTracker(_CutTracker):
 
     @property
     def planned(self) -> ColumnPlan:
-        """Decomposition into columns (time series) of the formula itself, not of its lower or upper bound."""
+        """Columns (time series of subformulas) of the formula itself, not of its lower or upper bound."""
         return self.plans["truncate"]
 
     @property
@@ -177,9 +181,10 @@ class _ColumnTracker(_CutTracker):
 
     @abstractmethod
     def _values(self, which: int, start: int, stop: int) -> Floats:
-        """Values (instants,) of one bound at the instants from `start` to `stop` (exclusive).
+        """Return one bound at the instants from `start` to `stop` (exclusive), (instants,).
 
-        `which` is 0 for the lower and 1 for the upper bound; with clipped windows it is 2 and 3.
+        `which` selects the bound: 0 is the lower and 1 the upper bound. With clipped windows, 2 is the lower
+        and 3 the upper bound.
         """
 
 
@@ -232,12 +237,12 @@ class IntervalColumns:
 
     The delay is the number of later samples after which the value at an instant is final.
 
-    The formulas share columns (time series of their predicates and past operators), (rows, 2), which hold the
-    least and the greatest value over all continuations of the trace. One evaluation gives both bounds of all
-    formulas.
+    The formulas share columns (time series of their predicates and past operators), (rows, 2). A row contains
+    the least and the greatest value over all continuations of the trace. One evaluation gives both bounds of
+    all formulas.
 
     Attributes:
-        truth: whether predicates count as +inf (true) or -inf (false) instead of their margins.
+        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
         samples: number of samples received.
     """
 
@@ -277,7 +282,7 @@ class IntervalColumns:
         self.samples, self._found = samples, None
 
     def values(self, which: int, start: int, stop: int) -> Floats:
-        """Return the lower and the upper bound of formula number `which`, (instants, 2).
+        """Return the lower and the upper bound on formula number `which`, (instants, 2).
 
         The instants are those from `start` to `stop` (exclusive).
         """
@@ -286,9 +291,9 @@ class IntervalColumns:
         return self._found[1][which]
 
     def drop(self, which: int, start: int) -> None:
-        """Drop the rows that no formula needs any more.
+        """Free the rows that no formula needs any more.
 
-        Formula number `which` needs no instant before `start` from now on.
+        From now on, formula number `which` does not need the instants before `start`.
         """
         self._starts[which] = start
         self.side.drop(min(self._starts) - self._back)
@@ -342,10 +347,12 @@ class IntervalTracker:
 class PlanningWindowTracker(_ColumnTracker):
     """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
 
-    The planning window of instant k ends with sample k + `window`. The value at k depends on the samples up
-    to there. An interval of the formula may extend beyond this end. A past operator that is evaluated beyond
-    the end still reads samples before it, while predicates beyond the end are unknown. In this case samples
-    are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
+    The planning window of instant k ends with sample k + `window`. The value at k depends only on samples up
+    to this one.
+
+    An interval in the formula may extend beyond the planning window. Predicates are then unknown beyond the
+    window, but past operators evaluated there still read samples inside it. In this case samples are
+    processed one by one: the value at k is stored as soon as sample k + `window` arrives.
 
     Attributes:
         window: samples from an instant to the end of its planning window.
@@ -405,9 +412,10 @@ class PlanningWindowTracker(_ColumnTracker):
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
     def _continued(self, side: Side, record: Record, starts: range) -> Floats:
-        """Values (instants,) at `starts`, for a formula with past operators after its planning window.
+        """Values (instants,) of a formula that evaluates past operators beyond its planning window.
 
-        `record` contains the columns (time series of subformulas) of `side`.
+        `starts` are the instants, as row numbers. `record` contains the columns (time series of subformulas)
+        of `side`.
         """
         formulas, back = [side.plan.formula], self._back
         early = range(starts.start, max(min(back, starts.stop), starts.start))
@@ -480,9 +488,10 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Free the samples whose effect is already contained in the coefficients of `UnboundedState`.
+        """Free the samples that later evaluations do not need, as the coefficients account for them.
 
-        Returns the index of the first sample that is still needed.
+        `UnboundedState` explains the coefficients. Returns the index of the first sample that is still
+        needed.
         """
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)
@@ -491,7 +500,7 @@ class UnboundedTracker:
 
 @dataclass(slots=True)
 class RecomputeTracker(_CutTracker):
-    """Evaluator of a requirement that needs the whole trace; every call computes from all samples."""
+    """Evaluator of a requirement that needs the whole trace; every evaluation reads all samples."""
 
     rule: CompiledRequirement
     horizon: int | None
@@ -540,9 +549,9 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Return least and greatest robustness at `starts`, each (instants, traces).
+        """Return the least and the greatest robustness at `starts`, each (instants, traces).
 
-        The bounds hold for all continuations of the traces.
+        They are taken over all continuations of the traces.
         """
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
@@ -596,8 +605,8 @@ class Trackers:
             everywhere: whether the requirement is evaluated at every instant or only at the first one.
 
         Raises:
-            UsageError: E313, the requirement takes too much work, since every instant needs many values of
-                its own (in a `freeze`, or because `end` moves with the instant).
+            UsageError: E313, the requirement takes too much work: every instant needs many values that no
+                other instant uses (in a `freeze`, or because `end` moves with the instant).
         """
 
         def make(part: CompiledRequirement) -> Tracker:
@@ -641,11 +650,12 @@ class Trackers:
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with bounded windows in place of windows up to `end`.
+    """Return the formula with bounded windows in place of its windows up to `end`.
 
-    `window` is the number of samples from an instant to `end`, the end of its planning window. None is
-    returned if a bounded formula would have another value: `end` occurs inside another temporal operator or
-    in the function `sweep` (motion between samples), or a bounded window extends beyond `end`.
+    `end` is the end of the planning window, `window` samples after each instant. None is returned in three
+    cases, in which the bounded formula would have another value: `end` occurs inside another temporal
+    operator; `end` occurs in the function `sweep` (motion between samples); or a bounded window extends
+    beyond `end`.
     """
     moved = _ended(formula, window)
     return None if endless(moved) or uses_end(moved) or reach(moved).future > window else moved
@@ -662,7 +672,10 @@ def _ended(formula: ir.Formula, window: int) -> ir.Formula:
 
 
 def _too_much(rule: CompiledRequirement, found: PacedWork) -> Diagnostic:
-    """Finding E313: a requirement takes too much work, as every instant needs many values of its own."""
+    """Finding E313: the requirement `rule` takes too much work on a stream.
+
+    Every instant needs many values that no other instant uses. `found` is the amount of work.
+    """
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
     return Diagnostic(

@@ -1,9 +1,13 @@
 """Formulas with windows to the end of the trace, evaluated at one sample in bounded memory.
 
-The samples are divided at a sample called the frontier. The value of the formula is a monotone function (a
-lattice polynomial of min and max) of the values that its unbounded operators have on the samples from the
-frontier on. The samples before the frontier determine only the coefficients of the polynomial: the value of
-the formula for each choice of -inf or +inf as the later values of the unbounded operators.
+The trace is divided at a sample called the frontier. Example: `always p` is the minimum of two numbers, the
+least `p` before the frontier, and `always p` from the frontier on. The first number is known and takes
+constant memory. The second number may still change.
+
+In general, the value of the formula is a polynomial of minima and maxima. Its variables are the values that
+the unbounded operators have from the frontier on. Its coefficients depend only on the samples before the
+frontier, which can therefore be dropped. There is one coefficient for each subset of the variables. It is the
+value of the formula if these variables are +inf and all others are -inf.
 """
 
 from __future__ import annotations
@@ -47,16 +51,16 @@ class DelayedFormula:
 class UnboundedOperators:
     """Decomposition of a formula into its unbounded future operators and its other subformulas.
 
-    Columns (time series) `$0`, `$1`, … replace the subformulas without unbounded operators. Columns `!0`,
-    `!1`, … stand for the values of the unbounded operators on the samples that are not received yet.
-    Operators are rewritten so that their windows begin at 0.
+    A column is a time series of values. Columns `$0`, `$1`, … replace the subformulas without unbounded
+    operators. Columns `!0`, `!1`, … stand for the values that the unbounded operators have on samples not yet
+    received. Operators are rewritten so that their windows begin at 0.
 
     Attributes:
         root: the formula over columns.
         parts: column `$k` -> the subformula that it replaces.
         origins: column `!k` -> its operator in the formula, with the original window.
-        operators: column `!k` -> formula for the value of its operator, computed from the columns `$k` on the
-            samples received and from `!k`.
+        operators: column `!k` -> formula for the value of its operator. It combines the columns `$0`, `$1`, …
+            on the samples received with the column `!k`.
     """
 
     root: ir.Formula
@@ -73,9 +77,10 @@ class UnboundedOperators:
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
     def unsure(self, plan: ColumnPlan) -> int:
-        """Number of unknown samples to append to the known ones when bounds are computed.
+        """Number of unknown samples to append to the received samples before bounds are computed.
 
-        More of them would not change the bounds. `plan` contains the columns (time series of subformulas).
+        With more unknown samples, the bounds would be the same. `plan` contains the columns (time series of
+        subformulas).
         """
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
@@ -101,9 +106,9 @@ def skeleton(formula: ir.Formula) -> UnboundedOperators:
 
 
 def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Rewrite `formula`, evaluated `steps` samples after an instant, as a formula over columns.
+    """Return `formula`, evaluated `steps` samples after an instant, as a formula over columns.
 
-    A column is the time series of a subformula; missing columns are added to `found`.
+    A column is the time series of a subformula. Columns that are missing in `found` are added to it.
     """
     if not endless(formula):
         return _part(formula, steps, found)
@@ -130,17 +135,20 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Name of the column that stands for the value of an unbounded operator on samples not received yet.
+    """Return the name of the column for the value of `origin` on samples not yet received.
 
-    The column is added to `found` if it is missing. Two operators share a column only if they are written in
-    the same way. `next (always p)` and `always (next p)` read the same signals, but get two columns: their
-    values differ at the end of the trace.
+    `origin` is an unbounded operator. The column is added to `found` if it is missing. Two operators share a
+    column only if they are written in the same way: `next (always p)` and `always (next p)` get two columns.
+    They read the same signals, but their values differ at the end of the trace.
     """
     return _column_of(origin, found.origins, "!")
 
 
 def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
-    """Name of the column in `columns` that belongs to `formula`; a missing column is added."""
+    """Return the name of the column of `formula`; if it is missing in `columns`, it is added.
+
+    The name of a new column begins with `prefix`.
+    """
     for name, known in columns.items():
         if known == formula:
             return name
@@ -149,12 +157,11 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 
 
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Rewrite an unbounded `until` as a formula over samples received and its unknown value on later ones.
+    """Rewrite an unbounded `until` or `release`, so that received and later samples are separated.
 
-    This later value is a column (time series) of its own.
-
-    An `until` holds in two cases: it is satisfied on the samples received, or its left side is true at all of
-    them and it is satisfied later. `release` is the same with `and` and `or` exchanged.
+    An `until` holds in two cases. It may be satisfied on the samples received. Or its left side is true on
+    all of these samples, and the `until` is satisfied on the later ones. The value on later samples is
+    unknown: a column (time series) of its own stands for it. For `release`, exchange `and` and `or`.
     """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
@@ -173,7 +180,7 @@ def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Form
 
 
 def _neutral(origin: DelayedFormula) -> float:
-    """Value of an unbounded operator if no sample lies in its window.
+    """Value of an unbounded operator if its window contains no sample.
 
     It is +inf for `always` and `release`, -inf for `eventually` and `until`.
     """
@@ -185,16 +192,17 @@ def _neutral(origin: DelayedFormula) -> float:
 class UnboundedState:
     """Lower or upper bound on a formula with unbounded windows, computed incrementally.
 
-    The bound is a polynomial of minima and maxima (see the module) in the values that the unbounded operators
-    have from sample `at`, the frontier, on.
+    The bound is a polynomial of minima and maxima, which the docstring of the module explains. Its variables
+    are the values that the unbounded operators have from sample `at`, the frontier, on.
 
     Attributes:
         bones: the formula, decomposed into its unbounded operators and the other subformulas.
         side: columns (time series) of the predicates and past operators, evaluated for the bound.
         begin: the sample at which the formula is evaluated.
-        at: the frontier: the first sample that the coefficients do not account for yet.
-        coefficients: (subsets of the operators, traces): value of the formula if the operators of the subset
-            are +inf from `at` on and the others -inf; None before the first `advance`.
+        at: the frontier. The coefficients account for all samples before it.
+        coefficients: one row per subset of the operators, (subsets, traces). A coefficient is the value of
+            the formula if the operators of the subset are +inf from `at` on, and the others -inf. None before
+            the first `advance`.
     """
 
     bones: UnboundedOperators
@@ -239,7 +247,7 @@ class UnboundedState:
     def value(self, samples: int) -> Floats:
         """The bound (traces,) after `samples` samples, while the trace continues.
 
-        It is computed with unknown samples appended to the known ones.
+        Unknown samples are appended to the received ones, and the formula is evaluated on all of them.
         """
         env = self._columns(samples - self.at + self._unsure)
         for name, origin in self.bones.origins.items():
@@ -256,9 +264,10 @@ class UnboundedState:
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at sample `at` of all unbounded operators, one row each; `env` contains the columns.
+        """Values at sample `at` of all unbounded operators, one row each.
 
-        Before the first `advance`, the only row is the value of the whole formula.
+        `env` contains the columns. Before the first `advance`, there is only one row: the value of the whole
+        formula.
         """
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
@@ -282,9 +291,10 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Evaluate the polynomial at several points; a point is one value for every unbounded operator.
+        """Evaluate the polynomial at several points.
 
-        `rests` contains the points, (operators, points, traces).
+        A point is one value for every variable, that is, for every unbounded operator. `rests` contains the
+        points, (operators, points, traces).
 
         Returns:
             Values of the formula, (points, traces).
@@ -295,7 +305,10 @@ class UnboundedState:
 
 
 def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formula:
-    """Replace all subformulas without unbounded windows by columns, which are added to `parts`."""
+    """Replace all subformulas without unbounded windows by columns (time series of their values).
+
+    The replaced subformulas are added to `parts`.
+    """
     if not endless(formula):
         return _part(formula, 0, UnboundedOperators(formula, parts))
     match formula:
