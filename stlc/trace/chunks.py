@@ -22,7 +22,9 @@ LARGE = 1_500_000_000
 
 
 def size_of(path: Path) -> int:
-    """Return the approximate bytes of memory that a file's numbers need; 0 if it cannot be read in chunks.
+    """Return approximately how many bytes of memory the numbers in a file need.
+
+    The result is 0 if the file cannot be read in chunks.
 
     Raises:
         StlcError: the file cannot be opened, or is damaged.
@@ -37,7 +39,7 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
 
     Raises:
         TraceError: the errors of `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its
-            format cannot be read in pieces.
+            format cannot be read in chunks.
     """
     clock: _Clock | None = None
     for recording in _recordings(path, samples):
@@ -66,7 +68,10 @@ def _single(trace: Trace) -> Trace:
 
 
 def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
-    """The first date of a time column that holds dates; None if it holds numbers or there is none."""
+    """Return the first date in the time column.
+
+    None is returned if the time column contains numbers, or if there is no time column.
+    """
     clock = reading.names.get(CLOCK)
     (group,) = (recording if clock is None else recording.clocked_by(clock)).groups
     if group.clock is None or group.clock.dtype.kind != "U":
@@ -76,7 +81,10 @@ def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
 
 
 class _Clock:
-    """Converter of consecutive chunks of a trace; the first chunk determines the time grid of all."""
+    """Converter of consecutive chunks of a file to traces on one time grid.
+
+    The first chunk determines the grid.
+    """
 
     def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
@@ -102,7 +110,7 @@ class _Clock:
         return replace(trace, t0=start)
 
     def _seconds(self, group: ClockGroup) -> NDArray[np.float64]:
-        """The times of a chunk in seconds; dates are relative to the first one of the file."""
+        """Times of a chunk in seconds; dates are converted to seconds since the first date of the file."""
         assert group.clock is not None
         if group.clock.dtype.kind not in "Uc":
             return group.clock.astype(np.float64)

@@ -1,7 +1,7 @@
-"""Conversion of words in a trace, members of enums and truth values, to numbers.
+"""Conversion of words in a trace to numbers; words are members of enums, or truth values.
 
-Arrays of words or complex numbers that no signal needs are kept as extras, which are never evaluated. In an
-array that a signal needs, a word without a number, or a complex number, is an error.
+An array of words or complex numbers may not be needed as a signal. It is then kept as an extra, which is
+never evaluated. In a needed signal, complex numbers and words without a number are errors.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
     Args:
         recording: content of the trace file; its arrays may be texts.
         words: numbers that stand for words, such as `{"sign": {"stop": 0, "light": 1}}`. The keys are the
-            names, in the file, of all needed signals; a signal of numbers has an empty value. Other arrays of
-            words or complex numbers become extras, which are never evaluated.
+            names that all needed signals have in the file. The value for a signal of numbers is an empty
+            mapping. Other arrays of words or complex numbers become extras, which are never evaluated.
 
     Raises:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that is not a value of
@@ -77,7 +77,10 @@ def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
 
 
 def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
-    """Return the dates and times (ISO 8601) in a time column. Raises TraceError (E603) for other words."""
+    """Return the dates and times (ISO 8601) in the time column of `group`.
+
+    Raises TraceError (E603) if the column contains other words.
+    """
     assert group.clock is not None
     _refuse_complex(trace, group.named, group.clock)
     written = np.char.rstrip(group.clock, "Zz")
@@ -99,7 +102,7 @@ def instant_of_word(word: str) -> np.datetime64 | None:
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
-    """Return the number that a signal's word stands for. Raises TraceError (E603) if unknown."""
+    """Return the number that `word` stands for. Raises TraceError (E603) for an unknown word."""
     worth = _worth(word, words)
     if worth is None:
         raise TraceError(_unknown(trace, name, word, words))
@@ -107,7 +110,10 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
 
 
 def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Convert a time column of dates and times to seconds since the first one. Raises TraceError (E603)."""
+    """Convert a time column of dates and times to seconds since the first one.
+
+    Raises TraceError (E603) if the column contains other words.
+    """
     instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
@@ -126,7 +132,7 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 def _worth(word: str, words: Words) -> float | None:
     """Return the number that a word stands for; NaN for an empty word, None for an unknown one.
 
-    A word that is not found is looked up again regardless of case.
+    If `words` does not contain the word, upper and lower case are ignored.
     """
     if word in words:
         return words[word]

@@ -1,6 +1,7 @@
-"""Reading of samples that arrive line by line, as a table with a header or as JSON, on one time grid.
+"""Reading of samples that arrive line by line, as a table with a header or as JSON.
 
-Names, units, words and times in a line are interpreted as in a file (`stlc.trace.formats.csv`).
+The samples are on one time grid. Names, units, words and times in a line are interpreted as in a file
+(`stlc.trace.formats.csv`).
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class SampleStream:
 
     Attributes:
         name: name of the stream, for messages.
-        reading: options: names of the signals and of the time in the stream, and the numbers that stand for
-            words.
+        reading: options. They give the names of the signals and of the time in the stream, and the numbers
+            that stand for words.
         units: signal -> unit in the header, "" if there is none; known from the first sample on.
     """
 
@@ -107,7 +108,7 @@ class SampleStream:
     # ------------------------------------------------------------------------ names
 
     def _named(self, there: Iterable[str]) -> None:
-        """Store which of the names in the stream is the time, and which signal each other name stands for.
+        """Assign the names in the stream, `there`, to the time and to the signals.
 
         Raises:
             TraceError: E601, a requested name is not in the stream.
@@ -209,7 +210,7 @@ class SampleStream:
 
 
 def _with_point(cell: str) -> str:
-    """A cell with its decimal comma replaced by a point, if that makes it a number."""
+    """Return a cell with a point in place of its decimal comma, if this makes it a number."""
     changed = cell.replace(",", ".")
     return changed if value_of(cell) is None and value_of(changed) is not None else cell
 
@@ -245,8 +246,9 @@ def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Unif
     """Return an iterator over samples on a uniform time grid; each is yielded as soon as it is known.
 
     The grid is the one that `stlc.trace.trace.trace_of` would use for a file with the same samples. Without
-    resampling the times must be uniform. With resampling (`reading.resample` or `reading.max_gap`) a sample
-    is known once every signal has a later value, or had no value for longer than the allowed gap.
+    resampling the times must be uniform. Resampling is requested by `reading.resample` or `reading.max_gap`.
+    A sample is then known once every signal has a later value, or had no value for longer than the allowed
+    gap.
 
     Raises:
         TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;
@@ -312,7 +314,7 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
 
 @dataclass(slots=True)
 class _Track:
-    """Buffer of the samples of one signal that later interpolation may still need."""
+    """Buffer of the samples of one signal that are still needed for interpolation."""
 
     held: bool
     times: list[float] = field(default_factory=list)
@@ -332,16 +334,16 @@ class _Track:
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
         """Return the values of the signal on a time grid, (points,).
 
-        `end` is the time in seconds up to which it is known that no further sample comes.
+        No further sample of the signal comes before the time `end`, in seconds.
         """
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
-        """Time in seconds before which interpolated values can no longer change.
+        """Return the time in seconds up to which interpolated values can no longer change.
 
-        `now` is the time of the latest sample of the stream, `limit` the longest gap between samples within
-        which values are interpolated, in seconds.
+        `now` is the time of the latest sample of the stream. `limit` is the longest gap between two samples,
+        in seconds, that is bridged by interpolation.
         """
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
@@ -349,13 +351,13 @@ class _Track:
 
 @dataclass(slots=True)
 class Gridded:
-    """Resampler of samples at arbitrary times to a uniform grid, as they arrive.
+    """Resampler of a stream: converts samples at arbitrary times to a uniform grid, as they arrive.
 
     Attributes:
         name: name of the stream, for messages.
         reading: the requested grid, and the kinds of the signals.
         t0: time of the first sample in seconds.
-        dt: time step of the grid in seconds; known from the first sample of the grid on.
+        dt: time step of the grid in seconds; known once the first sample of the grid was yielded.
     """
 
     name: str
@@ -385,7 +387,7 @@ class Gridded:
 
     @property
     def _has_to_wait(self) -> bool:
-        """True if the first samples must be collected to estimate the usual time step from them."""
+        """True if the first samples must be collected, since the usual time step is estimated from them."""
         return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
 
     def _take(self, moment: TimedSample) -> float:
@@ -417,7 +419,7 @@ class Gridded:
         self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
 
     def _ready(self, now: float) -> Iterator[Sample]:
-        """Yield the samples of the grid that become known with a sample at time `now`."""
+        """Yield the samples of the grid that are known once a sample at time `now` has arrived."""
         assert self._spacing is not None
         until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
         stop = min(until, default=now)
@@ -440,9 +442,10 @@ class Gridded:
         """Yield the next samples of the grid, as long as they are known.
 
         Args:
-            known: function that tells for which times, in seconds, samples on the grid are known.
+            known: function from times of the grid, in seconds, to booleans: True if the sample at this time
+                is known.
             most: greatest number of samples to yield since the start of the stream.
-            end: time in seconds up to which no further sample of the stream comes.
+            end: no further sample of the stream comes before this time, in seconds.
 
         Raises:
             TraceError: E605, `most` is too large.

@@ -57,9 +57,10 @@ class TraceMeta:
             text.
         spec_set: constants that were overridden, with their values as texts.
         spec_hash: SHA-256 of these texts, hexadecimal.
-        judge_path: path of a second specification, which evaluates closed-loop runs. `judge_text`,
-            `judge_library` and `judge_set` describe it as the fields `spec_…` do the first one. If
-            `judge_text` is "", there is no second one: the specification in `spec_text` evaluates the trace.
+        judge_path: path of a second specification, which evaluates closed-loop runs. The fields `judge_text`,
+            `judge_library` and `judge_set` have the same meaning for it as `spec_text`, `spec_library` and
+            `spec_set` for the first one. If `judge_text` is "", there is no second specification, and the
+            first one evaluates the trace.
         system_name: name of the system.
         system_path: path of the system file as the user gave it.
         system_text: text of the system file.
@@ -97,21 +98,24 @@ class TraceMeta:
 
     @property
     def planned(self) -> Carried:
-        """The specification that the control sequences (plans) were made for."""
+        """The specification for which the control sequences (plans) were made."""
         return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
 
     @property
     def carried(self) -> Carried:
-        """The specification that evaluates the trace: the one in `judge_text` if any, else `planned`."""
+        """The specification that evaluates the trace.
+
+        It is the second one (`judge_text`) if there is one, else `planned`.
+        """
         if not self.judge_text:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
 
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
-    """Return the metadata in the array `meta` of a trace, and the signals (columns) that it describes.
+    """Return the metadata in the array `meta` of a trace, and the descriptions of its signals.
 
-    Both are empty if `array` is None.
+    A description gives the unit, kind and range of a signal. Both results are empty if `array` is None.
 
     Raises:
         TraceError: E603, the array is not a JSON text of the expected form.
@@ -128,7 +132,10 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
 
 
 def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
-    """Return metadata and signal descriptions as a 0-d array of a JSON text, the inverse of `read_meta`."""
+    """Return metadata and signal descriptions as a JSON text in an array without axes.
+
+    This is the inverse of `read_meta`.
+    """
     signals = {column.name: _written(column) for column in signature.columns}
     return np.array(json.dumps(asdict(meta) | {"signals": signals}))
 

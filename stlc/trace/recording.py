@@ -66,7 +66,7 @@ class Recording:
         return tuple(name for group in self.groups for name in group.arrays)
 
     def clocked_by(self, signal: str) -> Recording:
-        """Return the recording with `signal` as the time of the group that contains it.
+        """Return a copy in which `signal` is the time of its group of signals.
 
         Raises:
             TraceError: E601, there is no such signal.
@@ -97,14 +97,17 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
 
 
 def clock_among(names: Iterable[str]) -> str | None:
-    """Name of the time column: `t`, else a usual name for time (`time`, …) if exactly one of them occurs."""
+    """Return the name of the time column: `t`, else a usual name for time such as `time`.
+
+    A usual name is returned only if exactly one of them occurs; otherwise None.
+    """
     known = list(names)
     found = [name for name in known if name.strip().lower() in CLOCKS]
     return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
 
 
 def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """Recording of signals with common times, which are in the time column, if any.
+    """Return a recording of arrays that share one time column, if there is one.
 
     Arrays called `extra.…` are not signals: they become the extras of the recording.
     """

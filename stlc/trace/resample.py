@@ -64,10 +64,10 @@ class Spacing:
     def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
         """Return the spacing with step `dt` that bridges gaps of at most `max_gap` seconds.
 
-        Within a bridged gap, values are held or interpolated. If `max_gap` is None, gaps of up to three steps
-        are bridged. A step is `dt` or, if that is longer, the usual time between the samples at `times`. If
-        `max_gap` is None and `events` is True, all gaps are bridged: each value of a discrete signal holds
-        until the next sample.
+        Within a bridged gap, values are held or interpolated. If `max_gap` is None, there are two cases. If
+        `events` is True, all gaps are bridged: each value of a discrete signal holds until the next sample.
+        Otherwise gaps of up to three steps are bridged. A step is here the longer of `dt` and the usual time
+        between the samples at `times`.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)
@@ -84,8 +84,8 @@ def values_on(
 ) -> Floats:
     """Return a signal on a grid, (points,), NaN where it is unknown.
 
-    A signal is unknown within gaps that are too long, before its first sample, and, if it is interpolated,
-    after its last one. Samples that are NaN are ignored.
+    A signal is unknown before its first sample and within gaps that are too long. If it is interpolated, it
+    is also unknown after its last sample. Samples that are NaN are ignored.
 
     Args:
         grid: increasing times of the grid in seconds, (points,).
@@ -93,7 +93,7 @@ def values_on(
         values: values of the samples, (samples,).
         spacing: time step of the grid and longest allowed gap.
         held: True for zero-order hold, False for linear interpolation.
-        end: time in seconds up to which no further sample comes. A held last value is known until `end`,
+        end: no further sample comes before this time, in seconds. A held last value is known until `end`,
             unless the gap from the last sample to `end` is too long.
     """
     there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
@@ -117,7 +117,7 @@ def values_on(
 
 @dataclass(frozen=True, slots=True)
 class _Timed:
-    """Signals (traces, samples) with their sampling times, which never decrease."""
+    """Signals (traces, samples) that share their sampling times; the times never decrease."""
 
     times: Floats
     signals: Mapping[str, Array]
@@ -129,12 +129,12 @@ class _Timed:
 
     @property
     def events(self) -> bool:
-        """True if all signals are held between samples."""
+        """True if all signals keep their value until the next sample."""
         return len(self.held) == len(self.signals)
 
     @property
     def last(self) -> float:
-        """The last time at which all signals are known; +inf if all are held beyond their last sample."""
+        """The last time at which all signals are known; +inf if all keep their last value."""
         return math.inf if self.events else float(self.times[-1])
 
 
@@ -144,8 +144,8 @@ class ResampleGrid:
 
     Attributes:
         dt: time step in seconds; None: the usual time between samples.
-        max_gap: the longest gap, in seconds, within which values are known. None: three steps; no limit for
-            discrete signals that have a time column of their own.
+        max_gap: the longest gap, in seconds, within which values are known. If None, it is three steps. There
+            is then no limit for discrete signals with a time column of their own.
     """
 
     dt: float | None = None
@@ -171,7 +171,7 @@ def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind
     """Return the signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
-    (zero-order hold), real ones are interpolated; within gaps that are too long, every signal is NaN.
+    (zero-order hold), and real signals are interpolated. Within a gap that is too long, a signal is NaN.
 
     Args:
         recording: content of a trace file, with one or more groups of common times.

@@ -28,8 +28,8 @@ _SNAP = 1e-6
 def resample_advice(step: float) -> str:
     """Help text for samples that are not on one grid: `--resample` with a proposed time step.
 
-    The proposed step is at most half of `step`, the usual time between samples in seconds, since a grid with
-    the usual step would skip samples.
+    `step` is the usual time between samples in seconds. A grid with this step would skip samples. The
+    proposed step is therefore at most half of `step`.
     """
     if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
         return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
@@ -39,7 +39,10 @@ def resample_advice(step: float) -> str:
 
 
 def gap_advice(step: float) -> str:
-    """Help text for a grid with missing samples: `--max-gap` with a proposed longest gap of three steps."""
+    """Help text for a grid with missing samples: `--max-gap` with a proposed longest gap.
+
+    The proposed gap is three times `step`, the usual time between samples in seconds.
+    """
     return (
         f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
         "in longer ones signals are unknown, and what needs them is inconclusive"
@@ -94,7 +97,7 @@ def require_step(name: str, dt: float) -> None:
 
 
 def require_same_step(name: str, found: float, said: float) -> None:
-    """Raise TraceError (E602) if the measured time step `found` differs from the given one, `said`."""
+    """Raise TraceError (E602) if the measured time step `found` differs from the given time step `said`."""
     if abs(found - said) > 1e-3 * said:
         message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
         help_ = ("leave out --dt: the file says what its step is",)
@@ -102,7 +105,7 @@ def require_same_step(name: str, found: float, said: float) -> None:
 
 
 def check_finite(name: str, times: Floats) -> None:
-    """Raise TraceError if there are no times (E605), or if one is not finite (E604)."""
+    """Raise TraceError if there are no times (E605), or if any of them is not finite (E604)."""
     if not len(times):
         raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
     bad = np.flatnonzero(~np.isfinite(times))
@@ -171,7 +174,7 @@ def snapped(step: float) -> float:
 def _snap(mean: float, dt: float | None) -> float:
     """Return `dt` if it agrees with the measured step `mean`.
 
-    Otherwise `mean` is returned, rounded to a simple fraction if there is one nearby.
+    Otherwise return `mean`. If there is a simple fraction nearby, `mean` is rounded to it.
     """
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt

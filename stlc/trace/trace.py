@@ -79,7 +79,7 @@ class Trace:
         return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
 
     def renamed(self, names: Mapping[str, str]) -> Trace:
-        """Return the trace with signals renamed: `names` maps each new name to the current name.
+        """Return a copy with renamed signals: `names` maps each new name to the current name.
 
         Raises:
             TraceError: E601, a signal is not in the trace.
@@ -104,12 +104,12 @@ class Reading:
         names: signal -> its name in the file; the key `t` gives the name of the time column.
         resample: time step in seconds of a new grid; None keeps the grid of the file, which must be uniform.
         dt: time step in seconds, if the file does not give it; must not contradict the file.
-        max_gap: longest gap in seconds within which values are known. If it is given, the file is resampled,
-            with time step `resample` or else with the usual time step of the file.
+        max_gap: longest gap in seconds within which values are known. If it is given, the file is resampled.
+            The time step is then `resample`, or else the usual time step of the file.
         kinds: signal -> kind of its numbers, which determines how it is resampled.
         words: numbers that stand for words, such as `{"sign": {"stop": 0, "light": 1}}`. The keys are the
-            names, in the file, of all needed signals. Other signals of words become extras (arrays that are
-            never evaluated). None: all signals of words become extras.
+            names of all needed signals. Other signals of words become extras (arrays that are never
+            evaluated). If None, all signals of words become extras.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -145,8 +145,8 @@ def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
     """Read a trace; the suffix of the file determines the format.
 
     Suffixes are `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`; a folder is a ROS 2 bag, and
-    any other file is read as `.npz`. Values may be NaN or infinite here; the monitor refuses infinite values
-    that a requirement needs.
+    any other file is read as `.npz`. Values may be NaN or infinite. The monitor, however, refuses infinite
+    values that a requirement needs.
 
     Raises:
         UsageError: U102, there is no such file.
@@ -158,7 +158,7 @@ def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
 
 
 def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
-    """Convert the content of a trace file to a trace: signals renamed, and on one uniform grid.
+    """Convert the content of a trace file to a trace, with renamed signals, on one uniform grid.
 
     Raises:
         TraceError: the errors of `load_trace`.
@@ -201,7 +201,7 @@ def _longest(group: ClockGroup) -> int:
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:
-    """The trace of a recording whose signals share one uniform time column.
+    """Return the trace of a recording whose signals share one uniform time column.
 
     `step` is the time step in seconds that the user gives, or None. It must not contradict the times.
     """
@@ -266,6 +266,6 @@ def check_writable(path: Path | str) -> None:
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:
-    """Return a time step in seconds as the exact fraction that was meant: 0.1 is 1/10, 0.0333… is 1/30."""
+    """Return the exact fraction that is meant by a time step in seconds: 0.1 is 1/10, 0.0333… is 1/30."""
     near = Fraction(dt).limit_denominator(1_000_000)
     return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)

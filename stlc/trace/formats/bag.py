@@ -2,7 +2,7 @@
 
 A ROS 1 bag is a file of records, some of them in compressed chunks (http://wiki.ros.org/Bags/Format/2.0). A
 ROS 2 bag is a folder with an SQLite database or `.mcap` files. Bags from before ROS 2 Iron contain no message
-definitions: for the standard messages the definitions of `rosbags` (extra `bag`) are used.
+definitions. For standard messages, the definitions in the package `rosbags` (extra `bag`) are then used.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A ROS topic and the decoder of its messages, which is None if they cannot be decoded."""
+    """A ROS topic and the decoder of its messages; the decoder is None if they cannot be decoded."""
 
     name: str
     decode: Decode | None
@@ -122,9 +122,10 @@ def _word(field: bytes) -> int:
 
 
 def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, bytes], content: bytes) -> None:
-    """Process one record: add a connection's topic to `topics`, or a message's numbers to `log`.
+    """Process one record of a file.
 
-    `topics` maps the number of a connection to its topic; other kinds of records are ignored.
+    The topic of a connection is added to `topics`, and the numbers in a message are added to `log`. `topics`
+    maps the number of a connection to its topic. Other kinds of records are ignored.
     """
     if kind == _CONNECTION:
         number = _word(fields[b"conn"])
@@ -144,7 +145,7 @@ def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, by
 
 
 def _read_ros2(path: Path) -> Recording:
-    """Read all numbers in the messages of a ROS 2 bag: its folder, or one `.db3` file of it."""
+    """Read all numbers in the messages of a ROS 2 bag: a folder, or a single `.db3` file."""
     log = Log(path)
     if path.is_dir():
         stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
@@ -160,7 +161,7 @@ def _read_ros2(path: Path) -> Recording:
 
 
 def _order(path: Path) -> tuple[object, ...]:
-    """Sort key of a file, by which `bag_10.db3` follows `bag_9.db3`: digits are compared as numbers."""
+    """Sort key of a file: digits are compared as numbers, so that `bag_9.db3` precedes `bag_10.db3`."""
     return tuple(
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", path.name)
     )

@@ -1,8 +1,8 @@
-"""Conversion of the cells of a table to numbers, one at a time or, for large files, all at once.
+"""Conversion of the cells of a table to numbers: one cell at a time or, for large files, all at once.
 
-Large texts are read by `cells.c` if there is a C compiler (`stlc.native`), else by Arrow if it is installed,
-else by NumPy, in blocks; all give the same numbers. Each of the three rejects texts with unusual cells, which
-a slower reader then reads.
+There are three readers of large texts. `cells.c` is used if there is a C compiler (`stlc.native`), else Arrow
+if it is installed, else NumPy in blocks. All give the same numbers. All reject texts with unusual cells,
+which a slower reader then reads.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TOO_MANY = -2
 
 @dataclass(frozen=True, slots=True)
 class TableText:
-    """The text of a table without its header: it begins at byte `start` and has `width` columns."""
+    """The text of a table: it begins at byte `start`, after the header, and has `width` columns."""
 
     data: bytes
     start: int
@@ -62,10 +62,10 @@ def value_of(text: str) -> float | None:
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers in the selected columns, (lines, columns).
+    """Return the numbers in the columns with indices `columns`, (lines, columns).
 
-    Empty cells are NaN, truth values are 0 and 1; quotes around a number are removed. None is returned if
-    there are no lines, or if another cell is not a number.
+    Empty cells are NaN, truth values are 0 and 1. Quotes around a number are removed. None is returned if
+    there are no lines, or if any other cell is not a number.
     """
     if not _ANY.search(body):
         return None
@@ -131,7 +131,8 @@ def _mended(body: str, delimiter: str) -> str:
 def read_lines(lines: TableText) -> list[Array] | None:
     """Return the columns of a table of numbers, (lines,) each; None if a line or cell is unusual.
 
-    Any line ending is allowed. Lines with empty cells only are left out; other empty cells are NaN.
+    Any line ending is allowed. A line is left out if all its cells are empty. In other lines, empty cells are
+    NaN.
     """
     library = _library()
     if library is not None:

@@ -1,8 +1,9 @@
-"""Traces as `.csv` files; a cell is a number, a word or empty, anything else an error.
+"""Traces as `.csv` files.
 
-The first line names the columns, with optional units in brackets: `t, x [m], v (km/h)`. If the file holds
-several traces, a column `trace` or `agent` identifies the trace of each line. A column whose first cell is a
-word holds words; in other columns an empty cell is NaN, an unknown value.
+A cell contains a number or a word, or is empty; any other content is an error. The first line names the
+columns, with optional units in brackets: `t, x [m], v (km/h)`. If the file holds several traces, a column
+`trace` or `agent` identifies the trace of each line. If the first cell of a column is a word, the column
+contains words. In other columns an empty cell is NaN, an unknown value.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def read(path: Path) -> Recording:
 
 
 def size(path: Path) -> int:
-    """Size of the file in bytes, an estimate of the memory for its numbers."""
+    """Size of the file in bytes, as an estimate of the memory that its numbers need."""
     return path.stat().st_size
 
 
@@ -79,9 +80,10 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
 
 
 def read_csv(path: Path) -> Table:
-    """Return the columns of a `.csv` file (comma, semicolon or tab; UTF-8); columns of words are texts.
+    """Return the columns of a `.csv` file as numbers, or as texts for columns of words.
 
-    If semicolons or tabs separate the columns, numbers may have decimal commas.
+    The file is in UTF-8. Commas, semicolons or tabs separate the columns. With semicolons or tabs, numbers
+    may have decimal commas.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -92,7 +94,7 @@ def read_csv(path: Path) -> Table:
 
 
 def table_of_text(path: Path, data: bytes) -> Table:
-    """Return the columns of file content `data`; `path` is for messages.
+    """Return the columns of a `.csv` file whose content is `data`; `path` is used in messages.
 
     Raises TraceError in the same cases as `read_csv`.
     """
@@ -113,7 +115,10 @@ def _read(path: Path) -> bytes:
 
 
 def _read_large(path: Path, data: bytes) -> Table | None:
-    """Read the columns of a large file of numbers in one step; None if only the slower reader can read it."""
+    """Read the columns of a large file of numbers in one step.
+
+    None is returned if the file contains something that only the slower reader can read.
+    """
     try:
         sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
         names, units = _read_header(sheet)
@@ -179,12 +184,15 @@ def delimiter_of(header: str) -> str:
 
 
 def head_cells(header: str, delimiter: str) -> list[str]:
-    """Split a header into its cells, without quotes and without the apostrophe before a formula."""
+    """Split a header into its cells, without quotes.
+
+    `write_csv` puts an apostrophe before a name like `=1+1`, which would be a formula. It is removed here.
+    """
     return [_head(raw) for raw in _raw_heads(header, delimiter)]
 
 
 def _raw_heads(header: str, delimiter: str) -> list[str]:
-    """Split a header into its unprocessed cells; a delimiter within quotes does not separate."""
+    """Split a header into its unprocessed cells; a delimiter within quotes is part of a cell."""
     hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
     edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
     return [header[left + 1 : right] for left, right in pairwise(edges)]
@@ -207,7 +215,10 @@ def split_head(text: str) -> tuple[str, str]:
 
 
 def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[str, Span]]:
-    """The cells of a line with their source locations; `start` is the offset of the line in the file."""
+    """Yield the cells of a line with their source locations.
+
+    `start` is the position in the file at which the line begins.
+    """
     for raw in cells:
         at = start + (len(raw) - len(raw.lstrip()))
         yield raw, source.span(at, max(at + len(raw.strip()), at + 1))
@@ -230,7 +241,10 @@ def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
 
 
 def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
-    """Read the columns in blocks; a block with unusual cells is read cell by cell."""
+    """Read the columns in blocks of lines; a block with unusual cells is read cell by cell.
+
+    `width` is the number of columns, and `texts` are the indices of the columns of words.
+    """
     findings: list[Diagnostic] = []
     parts: list[list[Array]] = [[] for _ in range(width)]
     text, begin = sheet.source.text, sheet.body_at
@@ -317,7 +331,9 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
 
 
 def write(path: Path | str, trace: Trace) -> None:
-    """Write the signals of a trace, one line per sample; if there are several traces, a column numbers them.
+    """Write the signals of a trace, one line per sample.
+
+    If there are several traces, a column `trace` contains the number of the trace.
 
     Raises:
         TraceError: E605, a signal is called `trace` or `agent`, or has a name that would be read back
@@ -335,10 +351,10 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
-    """Write columns of equal length so that reading them back gives the same numbers.
+    """Write columns of equal length so that reading the file gives the same numbers again.
 
-    The first line names the columns. A name that a spreadsheet program would run as a formula, such as
-    `=1+1`, is preceded by an apostrophe, which the reader removes.
+    The first line names the columns. A spreadsheet program would run a name such as `=1+1` as a formula. An
+    apostrophe is therefore put before it, which the reader removes.
 
     Raises:
         TraceError: E605, a name would be read back differently, such as a name with a unit in brackets.
@@ -355,7 +371,7 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
 
 
 def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
-    """Check that the reader finds these names in a header. Raises TraceError (E605)."""
+    """Check that the reader finds the names `names` in `header`. Raises TraceError (E605) if not."""
     if _names_in(path, header) == list(names):
         return
     odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])

@@ -2,7 +2,7 @@
 
 Numeric and logical arrays are signals; `t` is the time. The fields of a structure `s` are called `s.x`, and
 the columns of a matrix (samples, k) are the components of a vector. Texts, cell arrays and objects are left
-out. Complex numbers are not signals: requesting one is an error.
+out. Complex numbers are not signals: it is an error to request one as a signal.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def read(path: Path) -> Recording:
 
 
 def _as_signal(values: Array) -> Array:
-    """The array; a matrix with a single row or column is flattened to (samples,)."""
+    """Return the array; a matrix with a single row or column is flattened to (samples,)."""
     if values.ndim == 2 and 1 in values.shape:
         return values.reshape(-1)
     return values
@@ -76,7 +76,10 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
 
 
 def _real(values: Array) -> Array:
-    """Combine real and imaginary parts to complex numbers, or to real ones if all imaginary parts are 0."""
+    """Convert structured values with a real and an imaginary part to complex numbers.
+
+    If all imaginary parts are 0, the real parts are returned. Other values are returned unchanged.
+    """
     if values.dtype.names is None:
         return values
     real, turned = (values[part] for part in _COMPLEX)
@@ -84,10 +87,9 @@ def _real(values: Array) -> Array:
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """Yield (name, dataset) for every numeric dataset below `group`, without following links.
+    """Yield (name, dataset) for every numeric dataset in `group` and in the groups inside it.
 
-    The group may contain groups. `prefix` is put before every name, and `depth` is the nesting depth of
-    `group`.
+    Links are not followed. `prefix` is put before every name, and `depth` is the nesting depth of `group`.
 
     Raises:
         TraceError: E603, the file is nested too deeply or contains too many arrays.

@@ -1,7 +1,8 @@
 """MATLAB's file format of version 5 ("MAT-File Level 5"), restricted to numbers; no content is executed.
 
-A file consists of elements: a tag (type, number of bytes) and data padded to 8 bytes; a compressed element
-contains one deflated element. Sizes are checked against the available bytes before memory is allocated.
+A file consists of elements. An element is a tag (type, number of bytes), followed by data padded to 8 bytes.
+A compressed element contains one element in compressed form (deflate). Sizes are checked against the
+available bytes before memory is allocated.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def read_mat5(path: Path) -> dict[str, Array]:
 
 
 def _inflated(data: memoryview, room: int) -> bytes:
-    """Decompress an element; at most `room` bytes are allowed."""
+    """Decompress an element, which may expand to at most `room` bytes."""
     engine = zlib.decompressobj()
     out = engine.decompress(data, room)
     if engine.unconsumed_tail:
@@ -112,7 +113,10 @@ class _Matrix:
 
 
 def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
-    """Name and content of an array element; an element without sub-elements is an unnamed empty array."""
+    """Return the name and the content of an array element.
+
+    An element without sub-elements is an empty array without a name.
+    """
     parts = list(islice(_elements(data, order), MAX_ARRAYS + 1))
     if len(parts) > MAX_ARRAYS:
         raise _DamageError("too many parts")
@@ -145,14 +149,14 @@ def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth:
 
 
 def complex_of(real: Array, turned: Array) -> Array:
-    """Return complex numbers with these real and imaginary parts."""
+    """Return complex numbers with the real parts `real` and the imaginary parts `turned`."""
     made = np.empty(real.shape, dtype=np.complex128)
     made.real, made.imag = real, turned
     return made
 
 
 def _part(name: str, matrix: _Matrix, index: int, order: str) -> Array:
-    """The real (`index` 0) or imaginary (1) parts of an array, flattened."""
+    """Return the real parts (`index` 0) or the imaginary parts (`index` 1) of an array, flattened."""
     values = _numbers(matrix.parts[index], order) if index < len(matrix.parts) else np.zeros(0)
     if len(values) != math.prod(matrix.shape):
         shown = " x ".join(map(str, matrix.shape))

@@ -1,7 +1,8 @@
-"""Logs in `.mcap` files (extra `mcap`), read and written: messages of ROS 1 and 2, JSON, Protocol Buffers.
+"""Logs in `.mcap` files (extra `mcap`), read and written.
 
-Files are written as JSON messages with a schema, which Foxglove can plot: one topic per trace, one message
-per sample. A metadata record describes the signals, so that reading the file back gives the same trace.
+Messages of ROS 1 and 2, JSON and Protocol Buffers can be read. Files are written as JSON messages with a
+schema, which Foxglove can plot: one topic per trace, one message per sample. A metadata record describes the
+signals, so that reading the file back gives the same trace.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ _READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
 def read(path: Path) -> Recording:
-    """Read the numbers in all messages; a signal is left out if any message of its topic lacks it.
+    """Read the numbers in all messages.
+
+    A number becomes a signal only if every message of its topic contains it.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -90,7 +93,10 @@ class _File:
             self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
 
     def decoder(self, channel: Any) -> Decode | None:
-        """Return the decoder of a channel's messages; if there is none, store the reason in `log.unread`."""
+        """Return the decoder of a channel's messages; None if they cannot be decoded.
+
+        In this case the reason is stored in `log.unread`.
+        """
         schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
         described = "" if schema is None else schema.encoding
         try:
@@ -109,7 +115,10 @@ class _File:
 
 
 def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
-    """Add a file's messages to a log; returns the metadata if stlc wrote the file, None for other files."""
+    """Add the messages of a file to a log.
+
+    Returns the metadata if stlc wrote the file, None for other files.
+    """
     reader = needed("mcap.stream_reader").StreamReader
     ours: Mapping[str, str] | None = None
     with mapped(path) as data:
@@ -236,7 +245,10 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def _cell(value: float) -> str:
-    """JSON text of a number: null for NaN, and a number beyond the range of floats for infinity."""
+    """JSON text of a number.
+
+    NaN becomes null. Infinity becomes a number beyond the range of floats, such as 1e999.
+    """
     if math.isnan(value):
         return "null"
     return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"

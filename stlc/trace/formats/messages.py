@@ -1,8 +1,9 @@
 """Logged messages converted to signals: every number is a signal, and every topic has its own times.
 
-A number `twist.twist.linear.x` in topic `/odom` is the signal `odom.twist.twist.linear.x`; in a message with
-the single field `data` the signal has the name of the topic. Times are those at which messages were logged,
-in seconds since the first message. Topics have different times, so most logs are read with `--resample`.
+The number `twist.twist.linear.x` in the topic `/odom` is the signal `odom.twist.twist.linear.x`. If `data` is
+the only field of a message, the signal has the name of the topic. A time is the time at which a message was
+logged, in seconds since the first message. Since topics have different times, most logs are read with
+`--resample`.
 """
 
 from __future__ import annotations
@@ -137,7 +138,9 @@ class Log:
             raise unreadable(self.path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
 
     def recording(self) -> Recording:
-        """Convert the messages to signals; a number that is not in every message of its topic is left out.
+        """Convert the messages to signals.
+
+        A number becomes a signal only if every message of its topic contains it.
 
         Raises:
             TraceError: E603, no message contains a number.
@@ -158,7 +161,7 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return increasing times in ns, and the signals of one topic: name -> (messages,).
+        """Return the increasing times of one topic in ns, and its signals: name -> (messages,).
 
         Both are empty if there was no message.
         """
@@ -223,7 +226,9 @@ class Room:
         self.left = min(MAX_BYTES, max(_ROOM, _RATIO * size))
 
     def unpacked(self, how: str, data: bytes, size: int) -> bytes:
-        """Decompress data that declares `size` decompressed bytes; `how` is `bz2`, `lz4`, `zstd`, or none.
+        """Decompress `data`, whose decompressed size should be `size` bytes.
+
+        `how` is the compression method: `bz2`, `lz4`, `zstd`, or none.
 
         Raises:
             TraceError: E603, the data exceeds the remaining limit.
@@ -249,11 +254,17 @@ class Room:
         return out
 
     def whole(self, message: bytes) -> bytes:
-        """Return a message, decompressed if it is a `zstd` frame, as ROS 2 stores compressed messages."""
+        """Return a message, decompressed if necessary.
+
+        ROS 2 can compress single messages as `zstd` frames.
+        """
         return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
 
     def of_unknown_size(self, data: bytes) -> bytes:
-        """Decompress a `zstd` frame, whatever its size. Raises TraceError (E603) beyond the limit."""
+        """Decompress a `zstd` frame whose decompressed size is unknown.
+
+        Raises TraceError (E603) if the size exceeds the remaining limit.
+        """
         with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
             out: bytes = reader.read(self.left + 1)
         if len(out) > self.left:

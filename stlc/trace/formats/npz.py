@@ -108,8 +108,9 @@ class ArchiveMember:
     """An array of an open archive, read as a whole or in consecutive chunks of samples.
 
     Attributes:
-        length: number of samples: the last axis of (samples,) and (1, samples), else the first axis; -1 if
-            the array is stored in Fortran order, so that its samples are not contiguous.
+        length: number of samples. This is the length of the last axis of an array (samples,) or (1, samples),
+            and of the first axis of other arrays. It is -1 if the array is stored in Fortran order, so that
+            its samples are not contiguous.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
@@ -123,7 +124,7 @@ class ArchiveMember:
             self.length = -1
 
     def read(self, count: int) -> Array:
-        """Read the next `count` samples: (count,) or (count, …)."""
+        """Read the next `count` samples, (count,) or (count, …)."""
         values = self._values(count * self._width)
         return values if self._width == 1 else values.reshape(count, *self._shape[1:])
 
@@ -142,7 +143,7 @@ class ArchiveMember:
 
 
 def _infos(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The files in an archive by the names of their arrays."""
+    """Return the files in an archive: name of the array -> description of its file."""
     members = archive.infolist()
     if len(members) > MAX_ARRAYS:
         raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
@@ -182,7 +183,7 @@ def _checked_header(
     """Read the header (shape, Fortran order, dtype) of an array of numbers or texts.
 
     Raises:
-        TraceError: E603, another kind of array, or a size that differs from that in the archive.
+        TraceError: E603, another kind of array, or its size differs from the size in the archive.
     """
     shape, fortran, dtype = _read_header(stream)
     if dtype.hasobject:

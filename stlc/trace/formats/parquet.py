@@ -41,7 +41,10 @@ def read(path: Path) -> Recording:
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
-    """Open a file; with `whole`, raise an error if its numbers do not fit into memory."""
+    """Open a file. If `whole`, check that all its numbers fit into memory.
+
+    Raises an error if they do not.
+    """
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
@@ -151,7 +154,7 @@ def _words(values: Any) -> NDArray[np.str_]:
 
 
 def _floats(values: Any) -> Floats:
-    """Numbers as floats; durations in seconds, time stamps in seconds since the first one."""
+    """Convert values to floats: durations to seconds, time stamps to seconds since the first one."""
     arrow = needed("pyarrow")
     kind = values.type
     if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):

@@ -96,7 +96,7 @@ def needed(module: str) -> Any:
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
     """Return the error E603: the file cannot be read, or is not safe to read.
 
-    `why` is the reason, and `advice` the help text; "" if there is no help.
+    `why` is the reason. `advice` is a help text, or "".
     """
     return TraceError(
         Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
@@ -105,7 +105,7 @@ def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
 
 @contextmanager
 def opened(path: Path) -> Iterator[None]:
-    """Convert system errors in opening a file to UsageError (U102)."""
+    """Context in which system errors in opening a file become UsageError (U102)."""
     try:
         yield
     except OSError as error:
@@ -115,7 +115,7 @@ def opened(path: Path) -> Iterator[None]:
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """Convert errors that a library raises on damaged files to TraceError (E603)."""
+    """Context in which the errors of a library on damaged files become TraceError (E603)."""
     try:
         yield
     except StlcError:
@@ -127,5 +127,5 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def room_for(path: Path) -> int:
-    """Greatest allowed unpacked size of a compressed file, in bytes."""
+    """Number of bytes to which a compressed file may expand at most."""
     return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))

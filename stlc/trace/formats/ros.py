@@ -1,10 +1,10 @@
 """Decoders of ROS 1 and ROS 2 messages, made from the message definitions in the bag.
 
-A definition is the text of a `.msg` file, followed by the definitions of nested messages, each preceded by a
-line of `=` and `MSG: package/Type` (https://wiki.ros.org/msg,
-https://design.ros2.org/articles/interface_definition.html). A ROS 1 message is a sequence of packed values; a
-ROS 2 message is CDR: a header of 4 bytes, then values aligned to multiples of their size. Definitions are
-interpreted, never executed.
+A definition is the text of a `.msg` file. The definitions of nested messages follow it. Each of them begins
+with a line of `=` and a line `MSG: package/Type` (https://wiki.ros.org/msg,
+https://design.ros2.org/articles/interface_definition.html). A ROS 1 message is a sequence of values without
+gaps. A ROS 2 message is in the format CDR: a header of 4 bytes, then values aligned to multiples of their
+size. Definitions are interpreted, never executed.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ class _Layout:
 
 
 def decoder(definition: str, form: Form) -> Decoder:
-    """Return the decoder of messages of a definition.
+    """Return a decoder of the messages that `definition` describes.
+
+    `form` is the encoding of the messages: "ros1" or "cdr" (ROS 2).
 
     Raises:
         DamageError: the text is not a definition, contains itself, or refers to an undefined message.
@@ -81,7 +83,7 @@ def decoder(definition: str, form: Form) -> Decoder:
 
 
 def _short(name: str) -> str:
-    """Message type as `package/Type`, without the folder `msg`, `action` or `srv` that ROS 2 adds."""
+    """Message type as `package/Type`: ROS 2 adds a folder `msg`, `action` or `srv`, which is removed."""
     return name.replace("/msg/", "/").replace("/action/", "/").replace("/srv/", "/")
 
 
@@ -143,7 +145,7 @@ def _declares(line: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """Decoder of ROS messages of one definition."""
+    """Decoder of the ROS messages that one definition describes."""
 
     layout: _Layout
     form: Form
@@ -167,9 +169,9 @@ class Decoder:
 
 
 def _kept(numbers: Iterator[MessageNumber], wanted: bool) -> Iterable[MessageNumber]:
-    """Return the numbers if `wanted`, else none.
+    """Return the numbers if `wanted`, else nothing.
 
-    The iterator is consumed even if they are not wanted, so that the read position moves past them.
+    Unwanted numbers are read all the same, so that the read position moves past them.
     """
     if wanted:
         return numbers
@@ -211,9 +213,9 @@ class _Cursor:
             yield from _kept(self.value(f"{name}[{i}]", each, depth + 1), wanted)
 
     def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
-        """Yield the numbers of an array if `wanted`, and move past the array.
+        """Yield the numbers of an array if `wanted`, and move the read position past the array.
 
-        Large arrays such as images and point clouds are not wanted: they are only skipped.
+        Large arrays such as images and point clouds are only skipped.
         """
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":

@@ -1,4 +1,4 @@
-"""Tables with one line per sample, converted to signals; lines may belong to several traces."""
+"""Tables with one line per sample, converted to signals; a table may contain several traces."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def clock_scale(trace: str, name: str, unit: str) -> float:
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
     """Reshape columns (lines,) to (traces, samples).
 
-    `keys` tells to which trace each line belongs; `group` is the name of this column.
+    The column `group` identifies the trace of each line; `keys` contains its values.
 
     Raises:
         TraceError: E605, traces differ in length.
