@@ -1,7 +1,8 @@
 """Pictures of training and deployment: learning curves, signals, failures, animations, and one report.
 
 Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). They are imported only when a picture is
-drawn, so that training and deployment work without them; `available` tells whether they are installed.
+drawn, so that training and deployment work without them. The function `available` tells whether both are
+installed.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class Animation:
         frames: number of instants.
         dt: seconds between instants.
         size: width and height of the picture in inches.
-        begin: prepares an empty figure; returns the function that draws an instant, by index, on the figure's
-            canvas.
+        begin: function that prepares an empty figure. It returns another function, which draws the instant of
+            a given index on the figure's canvas.
         alt: description in words.
         moment: index of the instant shown in a still picture.
         draws: True if the function that `begin` returns also renders the canvas. False if it only updates the
@@ -72,13 +72,14 @@ Command: TypeAlias = tuple[Any, ...]
 
 @dataclass(frozen=True, slots=True)
 class VectorAnimation:
-    """An animation as drawing commands.
+    """An animation as a list of drawing commands, which a web page replays.
 
     Attributes:
-        width, height: size of the picture in dots.
-        commands: the distinct drawing commands. A path is `["p", path, fill, stroke, width, dash, clip]`, a
-            text `["t", x, y, text, size, color, align, angle, bold]`, an image `["i", x, y, width, height,
-            address]`.
+        width: width of the picture in pixels.
+        height: height of the picture in pixels.
+        commands: the distinct drawing commands. A path is `["p", path, fill, stroke, width, dash, clip]`. A
+            text is `["t", x, y, text, size, color, align, angle, bold]`. An image is `["i", x, y, width,
+            height, address]`, in which `address` is a `data:` URI that contains the image.
         frames: for every frame, indices into `commands` in the order of drawing.
     """
 
@@ -109,10 +110,10 @@ class VectorAnimation:
 
 
 def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Mapping[str, str]:
-    """Return `dark` if all animations can be shown with it, else an empty mapping.
+    """Return `dark` if all animations can be shown in these colours, else an empty mapping.
 
-    `dark` maps each colour to the colour that replaces it in the dark scheme. It cannot be used if an
-    animation contains images, or colours that `dark` does not list.
+    `dark` maps each colour to the colour that replaces it in the dark scheme. An animation cannot be shown if
+    it contains images, or colours that `dark` does not list.
     """
     known = all(each.colors <= dark.keys() and not each.pictured for each in all_)
     return dark if known else {}
@@ -127,7 +128,7 @@ def clear_artists(axes: Axes) -> None:
 
 
 def speed_up(frames: int, dt: float) -> int:
-    """Smallest integer speed-up at which the animation lasts at most `LONGEST` seconds."""
+    """Smallest integer factor of real time at which the animation lasts at most `LONGEST` seconds."""
     return max(1, int(np.ceil(frames * dt / LONGEST)))
 
 
@@ -145,7 +146,7 @@ def save_animation(
         animation: the animation.
         gif: path of the GIF, whose width is reduced if the file would exceed `max_bytes`.
         mp4: path of the video; None for none.
-        max_frames: maximum number of frames; more instants are subsampled evenly.
+        max_frames: maximum number of frames. If there are more instants, some are left out evenly.
         max_bytes: maximum size of the GIF.
 
     Raises:
@@ -255,9 +256,10 @@ def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
 def _palette(sheet: Image) -> Image:
     """Choose the colour palette of a picture.
 
-    Half of it are the most frequent colours of the picture. The others are added one by one: each time the
-    colour with the largest distance to the palette, weighted by its frequency. Small details, such as a dot
-    in a legend or a red line, thus keep their colour. White stays exactly white.
+    Half of the palette consists of the most frequent colours of the picture. The other colours are added one
+    by one. Each time, the colour with the greatest distance to the palette, weighted by its frequency, is
+    added. Small details, such as a dot in a legend or a red line, thus keep their colour. White stays exactly
+    white.
     """
     from PIL import Image
 
@@ -287,7 +289,10 @@ _CODING = ("-c:v", "libx264", "-preset", "veryfast", "-crf", "23", "-pix_fmt", "
 
 
 def encoder() -> str | None:
-    """Path of the program that writes videos: `ffmpeg`, else that of imageio-ffmpeg; None without either."""
+    """Path of the program that writes videos; None if there is none.
+
+    It is `ffmpeg` if installed, else the ffmpeg of the package imageio-ffmpeg.
+    """
     found = shutil.which("ffmpeg")
     if found is not None or find_spec("imageio_ffmpeg") is None:
         return found
@@ -301,10 +306,12 @@ def encoder() -> str | None:
 
 @contextmanager
 def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Callable[[Image], None]]:
-    """Write an H.264 video that every browser plays; yields the function that appends an RGB picture.
+    """Context in which an H.264 video is written that every browser plays.
+
+    It yields a function that appends an RGB picture to the video.
 
     Args:
-        path: path of the file, replaced if the block ends without an exception.
+        path: path of the file. It is replaced only if no exception occurs in the context.
         size: width and height of all pictures; an odd last row or column is cut off.
         milliseconds: duration of each picture.
 

@@ -1,4 +1,4 @@
-"""Drawing of robots as 3D bodies by PyBullet: rendered without a display, or in PyBullet's window."""
+"""Drawing of robots as 3D bodies by PyBullet: as pictures without a display, or in PyBullet's window."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
 
     Args:
         stage: joint angles of the robots, and the balls (goals and obstacles) around each of them.
-        scene: recorded arrays (frames, …), among them the sources of decisions.
+        scene: name -> recorded array (frames, …). One of them gives the source of each decision: the policy,
+            or a stage of the guard.
         dt: seconds between frames.
 
     Raises:
@@ -136,8 +137,8 @@ class Renderer:
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
         """Show frame `index`.
 
-        `who` (robots,) is the source of each robot's decision (0: the policy, else a stage of the guard),
-        which determines its colour.
+        The colour of a robot depends on the source of its decision. `who`, (robots,), contains the sources: 0
+        is the policy, any other number a stage of the guard.
         """
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
@@ -154,8 +155,8 @@ class Renderer:
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Render frame `index` as an RGB image (height, width, 3).
 
-        `who` (robots,) is the source of each robot's decision (0: the policy, else a stage of the guard).
-        Transparent balls are blended here, not by PyBullet.
+        `who`, (robots,), is the source of each robot's decision: 0 is the policy, any other number a stage of
+        the guard. Transparent balls are blended by this method, not by PyBullet.
         """
         self.turn(index, who)
         whole = self._rendered()
@@ -193,9 +194,9 @@ class Renderer:
         return int(self.client.createMultiBody(0, -1, shape))
 
     def _colour(self, robot: int, source: int) -> None:
-        """Colour the disc of a robot by the source of its decision.
+        """Colour the disc under a robot by the source of its decision.
 
-        If the guard decided, the robot itself gets the same colour, otherwise white.
+        If the guard made the decision, the robot itself gets the same colour. Otherwise it is white.
         """
         self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
         body = _WHITE if source == 0 else _rgba(DECIDED[source])
@@ -272,7 +273,9 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 
 
 def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
-    """Return the path of a robot description with visual geometry: `urdf` itself if it has any, else a copy.
+    """Return the path of a robot description with visual geometry.
+
+    If `urdf` has visual geometry, this is `urdf` itself, else a copy to which it is added.
 
     Args:
         urdf: path of the robot description (URDF); it may contain the kinematics only.

@@ -43,7 +43,8 @@ class RunContents:
             them.
         simulation: content of `eval/simulate.json`, the results of the closed-loop runs.
         units: requirement -> unit of its robustness; it contains only requirements that have a unit.
-        usual: default numbers of agents and steps of the system, under the scenario of the closed-loop runs.
+        usual: default numbers of agents and steps that the system has in the scenario of the closed-loop
+            runs.
         trace: trace recorded in the closed-loop runs.
     """
 
@@ -62,7 +63,7 @@ class RunContents:
 
     @property
     def result(self) -> Record:
-        """Result of the training, from `run.json`; empty until the training is finished."""
+        """Result of the training run, from `run.json`; empty until the run is finished."""
         result = self.record.get("result")
         return result if isinstance(result, Mapping) else {}
 
@@ -106,7 +107,7 @@ def read_contents(run: RunDir) -> RunContents:
 
 
 def readable(read: Callable[[], T]) -> T | None:
-    """Return the result of `read()`, or None if the file is missing, damaged or invalid."""
+    """Call `read` and return its result, or None if the file is missing, damaged or invalid."""
     try:
         return read()
     except (OSError, StlcError):

@@ -18,7 +18,10 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def draw_curves(rows: Rows) -> Picture | None:
-    """Draw learning curves from the rows of `train.jsonl`; None before the second measured accuracy."""
+    """Draw learning curves from the rows of `train.jsonl`.
+
+    Returns None if the accuracy was measured less than twice.
+    """
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None
@@ -45,7 +48,10 @@ def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Moving average over 1/30 of the number of values; the window is shorter at the ends."""
+    """Moving average of `values`.
+
+    The averaging window contains 1/30 of the values; it is shorter at both ends.
+    """
     window = np.ones(2 * (len(values) // 60) + 1)
     return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
 

@@ -53,7 +53,7 @@ def deployment_section(contents: RunContents) -> Section | None:
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
-    """Table `rows` with one column per guard and the heading `title`; None if there are no rows."""
+    """Table `rows` with one column per guard, below the heading `title`; None if there are no rows."""
     if not rows:
         return None
     header = ["", *(guard_words(name).title for name in guards)]
@@ -74,9 +74,9 @@ def _setting(simulation: Record) -> str:
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
-    """Paragraph on the share of instants from which the world behaved as the model for a whole plan.
+    """Paragraph that compares the world with the model; None if they agree, or if this is unknown.
 
-    None if it did so from all instants, or if the share is unknown.
+    It gives the share of the instants from which the world behaved as the model predicts, over a whole plan.
     """
     consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if consistent is None or consistent >= 1.0:
@@ -95,10 +95,10 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows with numbers of satisfying closed-loop runs: of all rules together, then of each rule.
+    """Table rows: how many closed-loop runs satisfied all rules, then how many satisfied each single rule.
 
     A run is lost if no satisfying plan is known from its start, or from its state after an exogenous event.
-    If there are lost runs, a further row, after the first, counts only the other runs.
+    If any runs are lost, a second row counts the runs that satisfied all rules among those that are not lost.
     """
     each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
     known = [drives for drives in each if drives is not None]
@@ -122,7 +122,10 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _broken(simulation: Record | None) -> Html | None:
-    """Table of the closed-loop runs under the last guard listed that violated a rule; None without them."""
+    """Table of the closed-loop runs that violated a rule; None if there are none.
+
+    It shows the runs under the guard that is listed last.
+    """
     each = list(drives_of(simulation).values())
     broken = each[-1]["broken"] if each else []
     if not broken:
@@ -156,9 +159,9 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows with the share of instants from which the executed trajectory satisfies a requirement.
+    """Table rows, one per requirement.
 
-    There is one row per requirement.
+    A row contains the share of instants from which the executed trajectory satisfies the requirement.
     """
     names = [name for name in _names(guards) if name.startswith(HOLDS)]
     return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]

@@ -1,7 +1,8 @@
-"""Region of failing held-out starts (initial states): found by subgroup discovery, described and drawn.
+"""Region of failing held-out starts: how it is found, described and drawn.
 
-The region is a conjunction of simple conditions that contains many failing starts and few others; a beam
-search maximises its F-score.
+Held-out starts are initial states that were not used in training. The region is a conjunction of simple
+conditions. It contains many failing starts and few others: a beam search maximises its F-score (subgroup
+discovery).
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ class HeldOut:
         x0: initial states, (starts, columns).
         rho: robustness over all requirements, (starts,).
         each: robustness per requirement, (starts, requirements).
-        known: True for starts from which a satisfying plan is known, (starts,); None if not recorded.
-        searched: False for starts from which the policy's plan fails and no other plan was searched for, else
-            True, (starts,). None means True for all.
+        known: whether a satisfying plan is known from a start, (starts,); None if this was not recorded.
+        searched: False for a start from which the policy's plan fails, and no other plan was searched for;
+            else True. (starts,), or None if all are True.
     """
 
     names: tuple[str, ...]
@@ -72,21 +73,24 @@ class HeldOut:
 
     @property
     def unsolved(self) -> tuple[int, int]:
-        """Number of starts from which the plans fail, and number of these with a known satisfying plan."""
+        """Number of unsolved starts, and for how many of them a satisfying plan is known.
+
+        A start is unsolved if the policy's plan from it fails.
+        """
         failing = ~(self.rho >= -TOLERANCE)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Condition on an initial state: the state in `column` compared with `value`."""
+    """Condition on an initial state: the value in column number `column` is compared with `value`."""
 
     column: int
     op: Literal["<=", ">=", "="]
     value: float
 
     def holds(self, x0: Array) -> Mask:
-        """Evaluate the condition for starts (starts, columns): booleans, (starts,)."""
+        """Evaluate the condition for initial states (starts, columns); returns booleans, (starts,)."""
         return np.asarray(_COMPARE[self.op](x0[:, self.column], self.value))
 
 
@@ -95,15 +99,15 @@ _COMPARE = {"<=": np.less_equal, ">=": np.greater_equal, "=": np.equal}
 
 @dataclass(frozen=True, slots=True)
 class Weakness:
-    """Region of the initial set in which one requirement fails.
+    """Region of the initial states in which one requirement fails.
 
     Attributes:
         requirement: index of the requirement.
         failing: share of all starts from which the requirement fails.
-        conditions: the region is the conjunction of these conditions.
+        conditions: conditions on the initial state; in the region, all of them hold.
         inside: share of failing starts among those in the region.
         covered: share of the failing starts that lie in the region.
-        axes: indices of the two states that separate failing from satisfied starts best.
+        axes: indices of the two states that best separate failing starts from satisfied ones.
     """
 
     requirement: int
@@ -137,7 +141,8 @@ def load_held_out(path: Path) -> HeldOut | None:
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
     """Return the region in which a requirement fails; None if it never fails.
 
-    `requirement` is its index; by default it is the one that is violated from the most starts.
+    `requirement` is the index of the requirement. By default, the requirement that is violated from the most
+    starts is chosen.
     """
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
@@ -156,10 +161,11 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
 
 
 def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
-    """Return the conjunction of conditions that a beam search finds to describe the failing starts best.
+    """Find conditions that together describe the failing starts best.
 
-    The score is the F-score. A condition is added only if the score grows by at least the factor
-    `LEAST_GAIN`.
+    They are found by a beam search that maximises the F-score of the region in which all conditions hold.
+    More conditions are used only if the score grows by at least the factor `LEAST_GAIN`. `failing`,
+    (starts,), is True for failing starts.
     """
     best: tuple[Condition, ...] = ()
     best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
@@ -180,7 +186,7 @@ def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
 
 
 def _region(x0: Array, conditions: Sequence[Condition]) -> Mask:
-    """Evaluate the conjunction of conditions for starts (starts, columns): booleans, (starts,)."""
+    """Return for each start whether all conditions hold: (starts, columns) -> booleans, (starts,)."""
     return np.asarray(np.all([np.ones(len(x0), dtype=bool), *(c.holds(x0) for c in conditions)], axis=0))
 
 
@@ -193,11 +199,11 @@ def _f_score(region: Mask, failing: Mask) -> float:
 class _Values:
     """Values that occur frequently in one column of the initial states.
 
-    A continuous state may also have frequent values: the 0 at which a timer starts, or a value that means
-    "nothing there".
+    A continuous state may also have frequent values. Examples are the 0 at which a timer starts, and a value
+    that means "nothing there".
 
     Attributes:
-        common: the frequent values; of a column that is not continuous, all values.
+        common: the frequent values; if the column is not continuous, all values.
         continuous: whether the column has many distinct values.
         span: difference between the largest and the smallest value of the column.
     """
@@ -215,9 +221,10 @@ class _Values:
 
 
 def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
-    """Conditions that may be added to a conjunction of conditions.
+    """Return conditions that may be added to the conditions found so far.
 
-    `region` is True for the starts, (starts,), that satisfy the conjunction so far.
+    `region`, (starts,), is True for the starts that satisfy the conditions so far. `values` describes each
+    column of `x0`.
     """
     found: list[Condition] = []
     bad = x0[region & failing]
@@ -232,10 +239,10 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
 
 
 def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """Indices of the two states to draw.
+    """Return the indices of the two states to draw.
 
-    States that occur in an inequality of the region come first. The others follow, beginning with the one
-    that separates failing from satisfied starts best.
+    States in an inequality among `conditions` are preferred. The other states are ranked by how well they
+    separate failing from satisfied starts.
     """
     used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
     focus = _region(x0, [each for each in conditions if each.op == "="])
@@ -246,7 +253,10 @@ def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tup
 
 
 def _separation(values: Array, failing: Mask) -> float:
-    """Kolmogorov-Smirnov distance between failing and satisfied starts in one state."""
+    """Return how well the values of one state separate failing from satisfied starts.
+
+    This is the Kolmogorov-Smirnov distance of the two sets of values, between 0 and 1.
+    """
     if failing.all() or not failing.any():
         return 0.0
     order = np.sort(values)
@@ -261,7 +271,7 @@ def _separation(values: Array, failing: Mask) -> float:
 def region_text(
     conditions: tuple[Condition, ...], names: tuple[str, ...], signature: Signature | None = None
 ) -> str:
-    """The region in the syntax of specifications: `sign = stop, -2.1 <= x <= -1 [m]`."""
+    """Text of the conditions of a region, as in a specification: `sign = stop, -2.1 <= x <= -1 [m]`."""
     return ", ".join(
         _column_text([c for c in conditions if c.column == column], names[column], signature)
         for column in dict.fromkeys(condition.column for condition in conditions)
@@ -285,7 +295,11 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """Clause on a failure region: share of its starts that fail, and its share of all failing starts."""
+    """Clause on a failure region: `fails in 80 % of the starts with x <= -1 m (70 % of its failures)`.
+
+    The first number is the share of starts in the region that fail. The second is the share of all failing
+    starts that lie in the region.
+    """
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -297,7 +311,10 @@ def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None
 
 
 def unsolved_text(held: HeldOut) -> str:
-    """Sentence on unsolved starts: how many there are, and from how many a satisfying plan is known."""
+    """Sentence on the starts from which the policy's plan fails.
+
+    It gives their number, and for how many of them a satisfying plan is known.
+    """
     failing, known = held.unsolved
     text = f"{failing:,} of {len(held.x0):,} starts"
     if held.known is None or not failing:
@@ -318,9 +335,9 @@ def unsolved_text(held: HeldOut) -> str:
 def draw_failures(
     held: HeldOut, signature: Signature | None = None, units: Mapping[str, str] | None = None
 ) -> Picture | None:
-    """Draw the robustness of the requirement that fails most over the two states that separate failures best.
+    """Draw the robustness of the requirement that fails most, over two states.
 
-    Returns None if nothing fails.
+    These are the states that best separate failing starts from satisfied ones. Returns None if nothing fails.
 
     Args:
         held: starts and robustness of their plans.
@@ -379,7 +396,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
 
 
 def _draw_region(axes: Axes, weakness: Weakness, x0: NDArray[np.float64]) -> None:
-    """Outline the failure region in the two states that are drawn."""
+    """Draw the outline of the failure region over the two states on the axes."""
     from matplotlib.patches import Rectangle
 
     if len(x0) == 0 or not any(c.column in weakness.axes and c.op != "=" for c in weakness.conditions):

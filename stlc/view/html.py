@@ -27,7 +27,10 @@ Child: TypeAlias = "Html | str | Iterable[Html | str] | None"
 
 
 def el(name: str, *children: Child, attrs: Mapping[str, str] | None = None) -> Html:
-    """HTML element `name` with attributes `attrs` and `children`; a child None is left out."""
+    """Return the HTML element `name` with the attributes `attrs` and the children `children`.
+
+    A child that is None is left out.
+    """
     written = "".join(f' {key}="{text_of(value)}"' for key, value in (attrs or {}).items())
     if name in _VOID:
         return Html(f"<{name}{written}>")
@@ -55,7 +58,7 @@ def classed(name: str, kind: str, *children: Child) -> Html:
 
 
 def with_code(text: str) -> Html:
-    """Text with its parts in backticks marked as code."""
+    """Return the text as HTML; parts in backticks are marked as code."""
     return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
 
 

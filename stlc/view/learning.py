@@ -1,7 +1,7 @@
-"""Verdict on a training: the share of feasible starts that the policy solves, and advice.
+"""Verdict on a training run: how many feasible starts the policy solves, and advice.
 
 A start (initial state) counts as feasible if a satisfying plan from it is known. The module makes numbers and
-sentences only, no pictures; terminal, JSON output, report and `stlc report` share the verdict.
+sentences only, no pictures. The terminal, the JSON output and the report all show this verdict.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class Curve:
         state: `short`: there were too few search rounds for an extrapolation; `flat`: twice as many steps
             would change little; `rising`: more steps would help.
         times: factor by which the number of steps must grow so that the policy solves the share `TRAINED` of
-            the feasible starts. It assumes the present slope of the curve. Curves flatten: the upper end of
-            the forecast is therefore the square of the factor. None if the factor exceeds `MOST_TIMES`, or
-            if the curve is not rising.
+            the feasible starts. The factor assumes that the slope of the curve stays the same. Since curves
+            flatten, the forecast is a range from this factor to its square. None if the factor exceeds
+            `MOST_TIMES`, or if the curve is not rising.
     """
 
     state: Literal["short", "flat", "rising"]
@@ -57,12 +57,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """Verdict on a training: how well the policy has learned, and what to do next.
+    """Verdict on a training run: how well the policy has learned, and what to do next.
 
     Attributes:
         level: `trained`, `partly trained`, `undertrained`, `no plan known` or `infeasible`.
-        share: of the starts from which a satisfying plan is known, the share that the policy solves; None if
-            there is no such start.
+        share: share of the feasible starts that the policy solves. A start is feasible if a satisfying plan
+            from it is known. None if no start is feasible.
         sentence: level and share as a sentence.
         advice: sentences of advice.
         command: the command to run next.
@@ -77,7 +77,7 @@ class Learning:
     worst: str = ""
 
     def summary(self) -> dict[str, object]:
-        """The verdict on the training as a dictionary for JSON."""
+        """The verdict on the training run as a dictionary for JSON."""
         return {
             "level": self.level,
             "share_of_feasible": self.share,
@@ -90,10 +90,10 @@ class Learning:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """Commands for one run that a verdict may recommend.
+    """Command lines for one run that a verdict may recommend.
 
     Attributes:
-        train_on: resumes the training; the caller appends the budget option.
+        train_on: resumes the training run. The option `--budget` is still missing; the caller appends it.
         simulate: simulates the policy under the recommended guard.
         report: writes the report.
     """
@@ -108,8 +108,8 @@ class Commands:
 
         Args:
             run: name of the run.
-            newest: whether it is the newest run, whose name `simulate` omits.
-            start: program that the training command calls.
+            newest: whether it is the newest run. The command `simulate` then omits its name.
+            start: program that the training command begins with.
             guard: the recommended guard: `none`, `paper` or `full`.
         """
         run = shell((operand(run),))
@@ -126,10 +126,10 @@ def recommended(record: Mapping[str, Any]) -> str:
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
-    """Lines on the closed-loop results of a run: one per guard, best first, and the recommendation.
+    """Lines on the closed-loop results of a run: one line per guard, then the recommended guard.
 
-    Empty if `result` contains no closed-loop results. If no simulation was possible, the only line states the
-    reason.
+    The best guard comes first. The list is empty if `result` contains no closed-loop results. If no
+    simulation was possible, the only line states the reason.
     """
     found = result.get("closed_loop")
     if not isinstance(found, Mapping):
@@ -154,7 +154,7 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def _driven_line(each: Mapping[str, Any]) -> str:
-    """Line on the closed-loop runs (drives) under one guard; `each` is their result.
+    """Line on the closed-loop runs (drives) under one guard; `each` contains their results.
 
     Example: `51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) with the full guard`.
     """
@@ -166,9 +166,10 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """Line on the closed-loop runs that a guard gains and loses, compared with no guard.
+    """Line that compares the closed-loop runs with a guard to the same runs without a guard.
 
-    "" if no run was compared.
+    It tells how many runs are satisfied only with the guard, and how many only without it. It is "" if no run
+    was compared.
     """
     if not each.get("compared"):
         return ""
@@ -180,7 +181,7 @@ def _changed_line(each: Mapping[str, Any]) -> str:
 
 
 def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
-    """The verdict on the training of a run; None if the training is not finished.
+    """The verdict on a training run; None if the run is not finished.
 
     Raises:
         RunError: R101, `run.json` is damaged.
@@ -196,10 +197,10 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
 def learning_on_record(
     record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
 ) -> Learning | None:
-    """The verdict on a training from the contents of `run.json` and `train.jsonl`.
+    """The verdict on a training run, from the contents of `run.json` and `train.jsonl`.
 
-    None if the training is not finished. `where` is a clause on the region in which the worst requirement
-    fails, or "".
+    None if the run is not finished. `where` is a clause on the region in which the worst requirement fails,
+    or "".
     """
     result = record.get("result")
     if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
@@ -216,7 +217,7 @@ def clause(held: HeldOut | None, signature: Signature | None) -> str:
 def learning_of(
     result: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str = ""
 ) -> Learning:
-    """The verdict on a finished training.
+    """The verdict on a finished training run.
 
     Args:
         result: the result in `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
@@ -261,11 +262,12 @@ def learning_of(
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
-    """Extrapolate the learning curve of plan accuracy beyond a training.
+    """Extrapolate the learning curve of plan accuracy beyond the end of a training run.
 
-    A line is fitted to the log-odds of success over the logarithm of the step, without the first quarter of
-    the steps, and continued from the final accuracy. The forecast is rough, as the learning rate decays at
-    the end of every training.
+    The success rate p is the accuracy divided by `feasible`. A line is fitted to the log-odds of p, log(p /
+    (1 - p)), over the logarithm of the step. The first quarter of the steps is left out. The line is then
+    continued from the final accuracy. The forecast is rough, as the learning rate decays at the end of every
+    training run.
 
     Args:
         rows: lines of `train.jsonl`.
@@ -294,9 +296,9 @@ def _log_odds(value: float) -> float:
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
-    """Return advice on a longer training, and the command for it.
+    """Return advice on training for longer, and the command that does so.
 
-    The command is "" if a longer training would not help.
+    The command is "" if longer training would not help.
     """
     twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
     match curve.state, curve.times:
@@ -337,14 +339,14 @@ def _hard_starts(feasible: float, *, sampled: bool) -> tuple[str, ...]:
 
 
 def _rough(seconds: float) -> float:
-    """A duration rounded to one significant digit, or to two if the first is 1."""
+    """Round a duration to one significant digit, or to two digits if the first digit is 1."""
     digits = math.floor(math.log10(max(seconds, 1.0)))
     step = 10.0**digits if seconds >= 2.0 * 10.0**digits else 10.0 ** (digits - 1)
     return float(round(max(seconds, 1.0) / step)) * step
 
 
 def budget_text(seconds: float) -> str:
-    """The smallest of the usual budgets that is at least `seconds`: `60s`, `5min`, `2h`."""
+    """Return the smallest of the usual budgets that is at least about `seconds`: `60s`, `5min`, `2h`."""
     fitting = [time for time in ROUND_TIMES if time >= 0.95 * seconds]
     time = fitting[0] if fitting else 3600.0 * math.ceil(0.95 * seconds / 3600.0)
     if time < 120.0:

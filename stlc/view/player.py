@@ -98,9 +98,9 @@ def _stage(panels: Sequence[RunPanel], animations: Sequence[VectorAnimation], co
 
 
 def _still(contents: RunContents) -> Html | None:
-    """The still picture of the animation, drawn anew if its file is missing or out of date.
+    """The still picture of the animation; None if no run was recorded.
 
-    None if no run was recorded.
+    The picture is drawn anew if its file is missing or out of date.
     """
     path = contents.run.path / STILL
     if current(contents.run) and path.is_file():
@@ -138,7 +138,7 @@ def _keys(panels: Sequence[RunPanel]) -> Html:
 
 
 def _inks(color: str) -> str:
-    """CSS that sets a colour for the light and for the dark scheme."""
+    """CSS that sets one colour in the light scheme, and its replacement in the dark scheme."""
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
 
 
@@ -225,14 +225,14 @@ def _svg(parts: Iterable[Html]) -> Html:
 def _up(values: Floats, limits: tuple[float, float]) -> Floats:
     """Vertical coordinates of values in a strip chart, measured from its upper edge.
 
-    `limits` are the values at the lower and upper edge; values beyond them are moved to the edge.
+    `limits` are the values at the lower and upper edge. A value beyond the limits is drawn at the edge.
     """
     low, high = limits
     return np.asarray(_HIGH - _HIGH * (np.clip(values, low, high) - low) / ((high - low) or 1.0))
 
 
 def _across(times: Floats) -> Floats:
-    """Horizontal coordinates in a strip chart: one per sample, then one for its right edge."""
+    """Horizontal coordinates in a strip chart: one per sample, and finally that of the right edge."""
     span = float(times[-1] - times[0]) or 1.0
     return np.append(_WIDE * (times - times[0]) / span, _WIDE)
 

@@ -58,9 +58,10 @@ def recorded_section(contents: RunContents) -> Section | None:
 
 
 def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
-    """Verdicts on the trace by the specification for closed-loop runs that is stored in it.
+    """Verdicts on the trace by the specification for closed-loop runs; None if the trace has none.
 
-    None if the trace stores only the specification that controls were planned for.
+    A trace always stores the specification for which the controls were planned. It may also store a separate
+    one, which evaluates closed-loop runs.
     """
     if not trace.meta.judge_text:
         return None
@@ -135,9 +136,10 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
 
 
 def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
-    """Text: the instant of the worst violation of a requirement.
+    """Return the time of the worst violation of a requirement as text.
 
-    If the requirement is not violated, the text names the instant from which it has the least robustness.
+    If the requirement is not violated, this is the time at which its robustness is least, or "" if it is
+    evaluated only once.
     """
     moment, cause = verdict.subject.moment, causes.get(judgement.name)
     if cause is None:
@@ -180,7 +182,7 @@ def _caption(trace: Trace, once: list[str]) -> Html:
 
 
 def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
-    """List of the worst violation of each violated requirement: part of the formula, instant and values."""
+    """List with the worst violation of each violated requirement: part of the formula, instant and values."""
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}

@@ -1,4 +1,7 @@
-"""Map of a trace: regions of the specification, paths through them, and share of traces in them over time."""
+"""Map of a trace: the regions that the specification names, and the paths of the traces.
+
+Beside the map, the share of traces in each region is shown over time.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,7 @@ class RegionMap:
     Attributes:
         trace: the recorded trace.
         plane: the two signals on the axes, and their regions.
-        violated: whether a trace violates a requirement, (traces,).
+        violated: whether a trace violates any requirement, (traces,).
     """
 
     trace: Trace
@@ -84,11 +87,11 @@ class RegionMap:
         return _TINTS[others.index(region) % len(_TINTS)]
 
     def inside(self, region: MapRegion) -> Mask:
-        """True where a trace is inside a region, (traces, samples)."""
+        """Return for every trace and sample whether it is inside a region, (traces, samples)."""
         return region.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
-        """Indices of at most `most` traces; traces with violations come first."""
+        """Indices of the first `most` traces to draw; traces with violations come first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
@@ -114,9 +117,9 @@ def draw_map(region_map: RegionMap) -> Picture:
 
 
 def map_animation(region_map: RegionMap, *, title: str = "") -> Animation:
-    """Animation of the map: a region is filled while it is active, and agents leave fading trails.
+    """Animation of the map: agents leave fading trails, and a region is filled while it is active.
 
-    A region is active while a requirement refers to it.
+    A region is active during the time windows of the requirements that refer to it.
     """
 
     def begin(figure: Figure) -> Callable[[int], None]:
@@ -162,7 +165,7 @@ def _summary(region_map: RegionMap) -> str:
 
 
 def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
-    """Return the axes of the map, and a list of the axes beside it.
+    """Return the axes of the map, and the list of axes beside the map.
 
     The list contains one entry per region, from top to bottom.
     """
@@ -182,7 +185,10 @@ def _layout(figure: Figure, region_map: RegionMap) -> tuple[Axes, list[Axes]]:
 
 
 def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
-    """Draw every region; return its filled patch, which is empty for a region outside of the picture."""
+    """Draw every region; return one filled patch per region.
+
+    The patch is empty if the region is outside of the picture.
+    """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -212,10 +218,11 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Grid position (row, column) for the label of a region.
+    """Return the grid position (row, column) for the label of a region.
 
-    `depth` is the distance to the border on the grid, positive inside; `others` are those of the other
-    regions. The label is placed deep inside the region and, if possible, outside the other regions.
+    `depth` is the distance of each grid point to the border of the region, positive inside. `others` are the
+    distances to the borders of the other regions. The label is placed deep inside the region and, if
+    possible, outside the other regions.
     """
     free = np.minimum.reduce([depth, *(-other for other in others)])
     row, column = np.unravel_index(np.argmax(free if (free >= 0).any() else depth), depth.shape)
@@ -242,15 +249,18 @@ def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
 
 
 def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Concatenate rows, separated by NaN, so that they are drawn as one line, which is faster."""
+    """Concatenate rows with NaN between them.
+
+    They can then be drawn as one line with gaps, which is faster.
+    """
     return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
 
 
 def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None:
     """Draw the share of traces in a region over time, and shade the times at which the region is active.
 
-    A region is active while a requirement refers to it. If one visit is enough, a dashed line shows the share
-    of traces that have visited it.
+    A region is active during the time windows of the requirements that refer to it. If one visit to the
+    region is enough, a dashed line shows the share of traces that have visited it while it was active.
     """
     color, times = region_map.color(region), region_map.trace.times
     for low, high in region.windows:
@@ -317,8 +327,8 @@ class Use:
         requirement: name of the requirement.
         negative: whether the region is to be avoided: it occurs under an odd number of negations.
         visit: whether one visit is enough: the region occurs under an `eventually`, `once` or `until`.
-        window: (first, last) time at which the occurrence counts, in seconds since the start of the trace;
-            None: always.
+        window: (first, last) time at which the requirement refers to the region, in seconds since the start
+            of the trace; None: at all times.
     """
 
     requirement: str
@@ -334,7 +344,8 @@ class MapRegion:
     Attributes:
         name: name as declared, or the expression of the region.
         uses: occurrences of the region in the specification.
-        monitor: evaluates whether points are in the region, and their distance to its border.
+        monitor: computes the distance of points to the border of the region, and thus whether they are
+            inside.
     """
 
     name: str
@@ -354,20 +365,21 @@ class MapRegion:
 
     @property
     def visited(self) -> bool:
-        """True if it is enough that the region is visited once."""
+        """True if a single visit to the region is enough."""
         return self.role == "reach" and all(use.visit for use in self.uses)
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Time intervals in which a requirement refers to the region, which is then called active.
+        """Time intervals in which a requirement refers to the region; the region is then called active.
 
-        In seconds since the start of the trace; empty if the region is always active.
+        The intervals are in seconds since the start of the trace. They are empty if the region is always
+        active.
         """
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
     def active(self, seconds: Any) -> Mask:
-        """True for those times, in seconds since the start of the trace, at which the region is active."""
+        """Return for each time in `seconds`, since the start of the trace, whether the region is active."""
         windows = self.windows or ((-np.inf, np.inf),)
         return np.asarray(np.any([(low <= seconds) & (seconds <= high) for low, high in windows], axis=0))
 
@@ -390,7 +402,10 @@ class Plane:
     regions: tuple[MapRegion, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
-        """Limits of the map along both axes: they contain nearly all of the paths, and the regions nearby."""
+        """Limits of the map along both axes, (low, high) each.
+
+        The map shows nearly all of the paths, and the regions near them.
+        """
         ends = []
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
@@ -470,9 +485,9 @@ def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace)
 
 
 def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
-    """A monitor of one predicate `point in region`; None if it cannot be compiled by itself.
+    """Return a monitor of the single predicate `point in region`; None if it cannot be compiled by itself.
 
-    This is the case, for example, if the predicate uses an argument of a definition.
+    For example, the predicate may use an argument of a definition.
     """
     declared = tuple(item for item in spec.items if not isinstance(item, (ast.Require, ast.Assume)))
     formula = replace(node, item=_point(node), negated=False)
@@ -490,7 +505,8 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
     """Yield every predicate of a requirement with its `Use`.
 
-    The `Use` tells whether the predicate is under a negation, and in which time interval it counts.
+    The `Use` tells whether the predicate is under a negation, and to which times the requirement refers
+    there.
     """
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
@@ -517,10 +533,10 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """Return the occurrence inside a temporal operator, restricted to the window of the operator.
+    """Return a copy of `use` for the inside of a temporal operator with the interval `interval`.
 
-    If the operator is evaluated at many instants, its window has no fixed place in time, and the occurrence
-    is returned unchanged.
+    Its time window is restricted to that of the operator. If the operator is evaluated at many instants, its
+    window has no fixed place in time, and `use` is returned unchanged.
     """
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)
@@ -542,7 +558,10 @@ def _key(span: Span) -> tuple[str, int, int]:
 
 
 def _point(node: ast.Member) -> ast.Expr:
-    """The point of the predicate `point in region`; if the point is `sweep(p)`, `p` is returned."""
+    """Return the point of the predicate `point in region`.
+
+    If the point is `sweep(p)` (the motion between samples), `p` is returned.
+    """
     match node.item:
         case ast.Call(func=ast.Name(name="sweep"), args=(arg,)):
             return arg.value
@@ -551,7 +570,7 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """Key that identifies a region in the predicate `point in region`: (text of point, text of region)."""
+    """Return a key for the region in the predicate `point in region`: (text of point, text of region)."""
     point, region = (" ".join(part.span.text.split()) for part in (_point(node), node.region))
     return point, region
 

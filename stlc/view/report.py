@@ -1,8 +1,8 @@
 """`report.html`: results of a run, its settings, its failures and the commands that repeat it.
 
-It begins with an interactive animation of the latest closed-loop run. The page is self-contained: style,
-pictures and its one script are embedded, and it needs no network. Without scripts it shows a still picture;
-it follows the reader's light or dark scheme. Parts without data are left out.
+The page begins with an interactive animation of the latest closed-loop run. It is self-contained: style,
+pictures and its only script are embedded, and no network is needed. Without scripts, the page shows a still
+picture. Its colours follow the reader's light or dark scheme. Parts without data are left out.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ REPORT = "report.html"
 
 
 def write_report(run: RunDir) -> Path:
-    """Write the report of a run and its pictures as PNG into the run's folder; return the report's path.
+    """Write the report of a run, and its pictures as PNG, into the run's folder.
+
+    Returns the path of the report.
 
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
@@ -112,7 +114,8 @@ def render_report(contents: RunContents, sections: list[Section]) -> str:
 def headline(contents: RunContents) -> Html:
     """Result of the run in one sentence, with advice.
 
-    The result is that of the closed-loop runs if any were simulated, otherwise that of the policy's plans.
+    This is the result of the closed-loop runs if any were simulated, otherwise the result of the policy's
+    plans.
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
     obeyed, viable = obeyed_sentence(simulation), viable_sentence(simulation)
@@ -359,9 +362,9 @@ def _set(record: Mapping[str, Any]) -> list[str]:
 
 
 def _simulate(contents: RunContents) -> list[str]:
-    """Arguments of the command that repeats the latest closed-loop run.
+    """Return the command that repeats the latest closed-loop simulation, as a list of words.
 
-    If there was none, they simulate the run with the paper's guard.
+    If there was none, the command simulates the run with the paper's guard.
     """
     done = contents.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
@@ -384,7 +387,10 @@ def _simulate(contents: RunContents) -> list[str]:
 
 
 def texts_section(contents: RunContents) -> Section | None:
-    """Section with the texts of specification, system and derived files; all but the first are collapsed."""
+    """Section with the texts of the specification, the system and derived files.
+
+    All texts but the first are collapsed.
+    """
     if not contents.texts:
         return None
     blocks = []

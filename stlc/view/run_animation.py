@@ -1,7 +1,7 @@
 """Animation of a closed-loop run: the drawing of its world (simulated environment), a map, or signals.
 
-The map shows the paths over the regions of the specification. Signals are drawn if there is neither a world
-nor a region.
+The map shows the paths over the regions of the specification. It is drawn if there is no world. Signals are
+drawn if there is neither a world nor a region.
 """
 
 from __future__ import annotations
@@ -63,9 +63,10 @@ class AnimationFiles:
 def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
     """Return the animation of the run's latest closed-loop simulation; None if nothing was recorded.
 
-    The world (simulated environment), loaded from the run's folder, draws the scene. Without a world, or if
-    drawing fails, the animation shows the paths of the trace over the regions of its specification, else the
-    signals. The default title consists of specification, scenario and run.
+    The scene is drawn by the world (simulated environment), which is loaded from the run's folder. Without a
+    world, or if drawing fails, the animation shows the paths of the trace over the regions of its
+    specification. Without regions, it shows the signals. The default title consists of specification,
+    scenario and run.
     """
     title = _title(run) if title is None else title
     return _scene_animation(run, title) or _signal_animation(run, title)
@@ -83,7 +84,7 @@ def animate(
 
     Args:
         run: a run with a closed-loop simulation.
-        max_frames: maximum number of frames; more instants are subsampled evenly.
+        max_frames: maximum number of frames. If there are more instants, some are left out evenly.
         max_bytes: maximum size of the GIF; the picture is made smaller to meet it.
 
     Returns:
@@ -116,8 +117,8 @@ class RecordedScene:
     """A recorded scene with the world (simulated environment) that draws it.
 
     Attributes:
-        scene: name -> values recorded, (frames, …); `violated` (frames, agents) is added if verdicts are
-            known.
+        scene: name -> recorded values, (frames, …). If verdicts are known, `violated`, (frames, agents), is
+            added: True where a violation is marked.
         world: draws the scene.
         dt: seconds between frames.
         judged: verdicts on the agents; None if they cannot be evaluated.
@@ -132,7 +133,10 @@ class RecordedScene:
 
     @property
     def stage(self) -> Stage | None:
-        """Robots and the balls around them (3D scene) to be drawn by PyBullet; None if the world has none."""
+        """Joint angles of the robots, and the balls around them, to be drawn by PyBullet.
+
+        None if the world contains no such robots.
+        """
         return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
 
     @property
@@ -157,8 +161,8 @@ class RecordedScene:
 def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None:
     """Return the recorded scene of the run's latest closed-loop simulation.
 
-    If `guarded` is False, it is the scene of the simulation of the same seed without the guard. Returns None
-    if the scene was not recorded, or if its world (simulated environment) cannot be loaded.
+    If `guarded` is False, the scene of the simulation without the guard is returned, with the same seed.
+    Returns None if the scene was not recorded, or if its world (simulated environment) cannot be loaded.
     """
     from stlc.controller.world import world_type
     from stlc.dynamics.declaration.load import load_system_decl
@@ -187,7 +191,7 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
 
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
-    """Verdicts on the agents of a scene; None if the trace belongs to another simulation."""
+    """Verdicts on the agents of a scene; None if the trace does not belong to this scene."""
     decisions, trace = scene.get("decision"), load_trace(run.path / trace_name)
     if decisions is None or trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
         return None
@@ -224,7 +228,7 @@ class RunPanel:
         events: violations.
         names: names of the agents.
         requirements: names of the evaluated requirements.
-        vector_frames: function from a range of frames to their drawing commands.
+        vector_frames: function that returns the drawing commands of the given frames.
     """
 
     title: str
@@ -250,8 +254,9 @@ WITHOUT, WITH = "without the guard", "with the guard"
 def run_panels(run: RunDir) -> list[RunPanel]:
     """Panels for a page on the latest closed-loop simulation: its first seed without and with the guard.
 
-    There is only one panel if no simulation without the guard was recorded. If there is no world (simulated
-    environment) to draw the scene, the only panel shows the trace. The list is empty without a recording.
+    If no simulation without the guard was recorded, there is only one panel. If there is no world (simulated
+    environment) to draw the scene, the only panel shows the trace. If nothing was recorded, the list is
+    empty.
     """
     found, other = recorded_scene(run), recorded_scene(run, guarded=False)
     try:
@@ -331,7 +336,7 @@ def _scenario(run: RunDir) -> str | None:
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    """Animation of the trace: paths over the regions of its specification if it names any, else signals."""
+    """Animation of the trace: its paths over regions or, without regions, its signals."""
     trace = readable(lambda: load_trace(run.path / TRACE))
     if trace is None:
         return None

@@ -1,6 +1,6 @@
-"""Animation of a recorded scene: a legend above, the drawing by its world, and strip charts below.
+"""Animation of a recorded scene, with a legend above it and strip charts below it.
 
-A world is the simulated environment of a closed-loop run.
+The world, which is the simulated environment of a closed-loop run, draws the scene.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class SceneOptions:
         draw: function that draws a frame of a scene on axes: `draw(axes, scene, index)`.
         dt: seconds between frames.
         title: title of the picture.
-        keys: further legend entries: label -> colour.
+        keys: additional legend entries, label -> colour.
         strip: strip charts; None: no charts.
     """
 
@@ -140,7 +140,10 @@ def _moment(scene: Scene, frames: int) -> int:
 
 
 def ratio_of(draw: DrawScene, scene: Scene) -> float:
-    """Aspect ratio (height / width) of the picture that `draw` makes of a scene, limited to 0.15 to 1.6."""
+    """Return the aspect ratio (height / width) of the picture that `draw` makes of a scene.
+
+    It is limited to the range 0.15 to 1.6.
+    """
     with picture_style():
         axes = new_figure(4, 4).add_subplot()
         draw(axes, scene, 0)
@@ -181,7 +184,10 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
 
 
 def keys_of(scene: Scene, own: Mapping[str, str]) -> list[LegendKey]:
-    """Legend entries: recorded sources of decisions, rejected plans, violations, and the entries in `own`."""
+    """Return the legend entries of a scene, and those in `own` (label -> colour).
+
+    The entries of the scene are the recorded sources of decisions, rejected plans, and violations.
+    """
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
     keys = [LegendKey(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
     if "rejected" in scene and np.isfinite(scene["rejected"]).any():

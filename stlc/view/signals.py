@@ -79,9 +79,9 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
 
 
 def margin_limits(rho: Floats) -> tuple[float, float]:
-    """Lower and upper limit of a robustness plot, with 0 inside; large margins are cut off.
+    """Lower and upper limit of a robustness plot; 0 lies between them.
 
-    Violations thus remain visible beside large margins.
+    Large margins are cut off, so that violations remain visible beside them.
     """
     finite = rho[np.isfinite(rho)]
     if not len(finite):
@@ -137,8 +137,8 @@ def choose_traces(
 ) -> tuple[Choice, ...]:
     """Choose the traces to draw: the least robust one, and the one with most interventions of the guard.
 
-    If there are no interventions, the second trace is one of median robustness. If both are the same trace,
-    it is returned once.
+    If there are no interventions, the second one is a trace of median robustness. If the first and the second
+    are the same trace, it is returned once.
 
     Args:
         least: robustness per trace, (traces,); NaN if unknown.
@@ -197,7 +197,10 @@ def left_out(trace: Trace) -> list[str]:
 
 
 def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
-    """(kind, name) of each panel: numeric signals, discrete signals, decisions, requirements."""
+    """Return (kind, name) of each panel.
+
+    The order is: numeric signals, discrete signals, decisions, requirements.
+    """
     columns = trace.signature.columns
     rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
     if len(rows) > MOST_LINES:
@@ -255,9 +258,9 @@ def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, 
 
 
 def _broken(values: Floats) -> Floats:
-    """Return a signal with NaN at its jumps (such as resets), so that no line is drawn across them.
+    """Return a signal with NaN at its jumps (such as resets).
 
-    A signal that changes mainly by large steps is returned unchanged.
+    No line is then drawn across a jump. A signal that changes mainly by large steps is returned unchanged.
     """
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
@@ -283,7 +286,7 @@ def _draw_discrete(axes: Axes, trace: Trace, values: Floats, column: Column) -> 
 
 
 def constant_ranges(values: NDArray[Any]) -> list[tuple[int, int, Any]]:
-    """Ranges of consecutive equal values, as (start, stop, value)."""
+    """Return the ranges in which `values` is constant, as triples (start, stop, value)."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, values[a].item()) for a, b in pairwise(edges) if b > a]
 
@@ -297,8 +300,8 @@ class Strip:
 
     Attributes:
         times: times of the frames in seconds, (frames,).
-        margins: requirement -> least robustness of all agents, (frames,), if the requirement is evaluated
-            from the instant of each frame on; NaN if unknown.
+        margins: requirement -> least robustness of all agents, (frames,). At each frame, the requirement is
+            evaluated from this instant on. NaN if unknown.
         decisions: source of each decision, (frames, agents); None if not recorded.
         words: description of the margins, for a heading.
         units: requirement -> unit of its margin; it contains only requirements that have a unit.
@@ -312,7 +315,10 @@ class Strip:
 
     @property
     def rows(self) -> list[str]:
-        """Names of the at most `MOST_ROWS` requirements with the least margins, which get a strip chart."""
+        """Names of the requirements that get a strip chart.
+
+        These are the requirements with the least margins, at most `MOST_ROWS`.
+        """
         known = [name for name, rho in self.margins.items() if np.isfinite(rho).any()]
         least = sorted(known, key=lambda name: float(np.nanmin(finite(self.margins[name]))))[:MOST_ROWS]
         return [name for name in known if name in least]
@@ -330,7 +336,10 @@ class Strip:
         return np.asarray((self.decisions > 0).sum(1))
 
     def stacked(self) -> Iterator[tuple[str, Floats, Floats]]:
-        """Yield bands of interventions, stacked by source: colour, lower edge, and upper edge (frames,)."""
+        """Yield one band per source of interventions, stacked: colour, lower edge, and upper edge.
+
+        The edges are numbers of agents, (frames,).
+        """
         base = np.zeros(len(self.times))
         for source, color in enumerate(DECIDED[1:], start=1):
             more = base + (0 if self.decisions is None else (self.decisions == source).sum(1))
@@ -341,10 +350,10 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class FrameUpdate:
-    """Artists that change from frame to frame, and their update.
+    """Drawn objects (artists) that change from frame to frame.
 
     Attributes:
-        turn: function that updates the artists to the frame of a given index.
+        turn: function that changes the artists to show the frame of a given index.
         artists: the artists.
     """
 
@@ -353,7 +362,7 @@ class FrameUpdate:
 
 
 def draw_strip(strip: Strip, panels: list[Axes]) -> list[FrameUpdate]:
-    """Draw the strip charts, one per panel; return the artists that change from frame to frame."""
+    """Draw the strip charts, one per panel; return the parts that change from frame to frame."""
     updates: list[FrameUpdate] = []
     free = list(panels)
     if strip.acted.any():
@@ -401,7 +410,10 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> FrameUpdate:
 
 
 def _titled(axes: Axes, name: str) -> Text:
-    """Write a chart's name on its left; return the text on its right, which shows the present value."""
+    """Write the name of a chart on its left.
+
+    Returns the text on the right of the chart, which is to show the present value.
+    """
     axes.axhspan(*axes.get_ylim(), color=FAINT, alpha=0.25, lw=0, zorder=0)
     beside: Any = {"transform": axes.transAxes, "va": "center", "fontsize": 8, "color": INK}
     axes.text(-0.012, 0.5, picture(name), ha="right", **beside)
@@ -409,7 +421,10 @@ def _titled(axes: Axes, name: str) -> Text:
 
 
 def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
-    """Cover the times after the present frame, and draw a line at the present time; return the update."""
+    """Cover the times after the present frame, and draw a line at the present time.
+
+    Returns the update of both to another frame.
+    """
     from matplotlib.patches import Rectangle
 
     axes.set_xlim(float(times[0]), float(times[-1]))
@@ -430,7 +445,10 @@ def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
 
 
 def signal_animation(trace: Trace, *, title: str = "") -> Animation:
-    """Animation of a trace's signals, for a run without a drawing: one panel per signal, with all agents."""
+    """Animation of the signals of a trace: one panel per signal, with all agents.
+
+    It is used for a run without a drawing of its world.
+    """
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 
@@ -455,7 +473,10 @@ def signal_animation(trace: Trace, *, title: str = "") -> Animation:
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
-    """Draw a signal of at most `MOST_AGENTS` agents; return the function that updates it to a frame."""
+    """Draw a signal of at most `MOST_AGENTS` agents.
+
+    Returns a function that changes the drawing to show the frame of a given index.
+    """
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     axes.set_ylabel(labelled(name, trace.signature[name].unit.text).replace(" [", "\n[", 1))

@@ -1,6 +1,6 @@
 """Style of all pictures: few colours, colour-blind safe, legible on light and dark backgrounds.
 
-Figures are built without pyplot and inside `picture_style`, so that matplotlib's global settings stay
+Figures are made without pyplot, in the context `picture_style`. The global settings of matplotlib thus stay
 unchanged.
 """
 
@@ -104,7 +104,7 @@ _RC: Any = {
 
 @contextmanager
 def picture_style() -> Iterator[None]:
-    """Apply matplotlib's settings for pictures within the block.
+    """Context in which matplotlib has the settings for pictures.
 
     Raises MissingError (R301) if matplotlib or Pillow is not installed.
     """
@@ -118,7 +118,10 @@ def picture_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure; its size is in inches. Call this inside `picture_style`."""
+    """Return an empty figure of the given size in inches.
+
+    It must be called in the context `picture_style`.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -184,7 +187,7 @@ class Picture:
 
 
 def _themed(svg: str) -> str:
-    """Replace the colours in an SVG by CSS variables, which are set for the light and the dark scheme."""
+    """Replace the colours in an SVG by CSS variables, which have values for the light and the dark scheme."""
     inks = "|".join(ON_DARK)
     svg = re.sub(rf"({inks})\b", lambda ink: f"var(--c{ink[1][1:]})", svg[svg.index("<svg") :])
     light = ";".join(f"--c{ink[1:]}:{ink}" for ink in ON_DARK)

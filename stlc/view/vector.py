@@ -1,7 +1,7 @@
-"""Animations as drawing commands instead of pixels: paths, texts and images, for a page that replays them.
+"""Animations as drawing commands instead of pixels: paths, texts and images.
 
-`CommandRenderer` is a matplotlib renderer that records the commands. A command that several frames use is
-stored once. Coordinates are integers in quarters of a dot, from the upper left.
+A web page replays the commands. `CommandRenderer` is a matplotlib renderer that records them. A command that
+several frames use is stored once. Coordinates are integers in quarters of a pixel, from the upper left.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ _LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outli
 def vector_frames(
     draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]
 ) -> VectorAnimation:
-    """Record frames drawn by `draw(axes, index)` on axes that fill a figure; `size` is in inches."""
+    """Record the drawing commands of the given frames.
+
+    The function `draw(axes, index)` draws frame `index` on axes that fill a figure of `size` inches.
+    """
     with picture_style():
         figure = new_figure(*size)
         figure.set_dpi(DPI)
@@ -49,7 +52,7 @@ def vector_frames(
 
 
 def vector_animation(animation: Animation, frames: Sequence[int]) -> VectorAnimation:
-    """Return the given frames of an animation as drawing commands."""
+    """Return the frames of an animation whose indices are in `frames`, as drawing commands."""
     with picture_style():
         figure = new_figure(*animation.size)
         figure.set_dpi(DPI)
@@ -77,7 +80,7 @@ class CommandRenderer(RendererBase):
         self._frames.append([])
 
     def recorded(self) -> VectorAnimation:
-        """Return the drawing commands recorded since the renderer was made, by frame."""
+        """Return all drawing commands that the renderer has recorded, by frame."""
         frames = tuple(tuple(frame) for frame in self._frames)
         return VectorAnimation(self.width, self.height, tuple(self._known), frames)
 

@@ -1,4 +1,7 @@
-"""Verdicts on recorded closed-loop runs by the specification in the trace: margins and violations."""
+"""Verdicts on recorded closed-loop runs: margins and violations.
+
+The runs are evaluated by the specification that is stored in their trace.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +38,14 @@ FLASHES = 4
 def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
     """Return a monitor of the specification that is stored in a trace.
 
-    A trace may store two specifications: the one that controls were planned for, and a separate one that
-    evaluates closed-loop runs.
+    A trace may store two specifications: the one for which the controls were planned, and a separate one that
+    evaluates closed-loop runs (drives).
 
     Args:
         trace: the recorded trace.
         text: specification to use if the trace stores none.
         system: path of the system file, which supplies external functions.
-        drives: True: use the separate specification for closed-loop runs, if it is stored.
+        drives: whether to use the separate specification, if there is one.
 
     Raises:
         SpecError: the specification is invalid.
@@ -55,9 +58,10 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, driv
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
-    """Robustness of each requirement from each sample on, (traces, samples); NaN where undefined.
+    """Robustness of each requirement at each sample, (traces, samples); NaN where undefined.
 
-    A requirement that is evaluated once has the same value at every sample.
+    At each sample, the requirement is evaluated from this sample on. A requirement that is evaluated only
+    once has the same value at every sample.
     """
     found = monitor.requirement_robustness(trace)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
@@ -78,7 +82,7 @@ def judged_at_start(verdict: Verdict) -> list[str]:
 
 
 def trace_names(trace: Trace) -> list[str]:
-    """Names of the traces: numbers, with seed and agent if recorded."""
+    """Names of the traces: their numbers and, if recorded, seed and agent."""
     seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
     if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
         return [f"trace {index}" for index in range(trace.traces)]
@@ -97,11 +101,11 @@ class SceneVerdicts:
 
     Attributes:
         trace: recorded traces of these agents.
-        monitor: monitor of the specification that controls were planned for.
+        monitor: monitor of the specification for which the controls were planned.
         verdict: verdict of that monitor.
         executed: verdict by the separate specification for closed-loop runs. It is `verdict` if the trace
             stores no such specification.
-        consistent: True at samples from which the world behaves as the model, (agents, samples); None if not
+        consistent: whether the world behaves as the model from a sample on, (agents, samples); None if not
             recorded.
     """
 
@@ -113,10 +117,10 @@ class SceneVerdicts:
 
     @property
     def marked(self) -> set[str]:
-        """Requirements whose violations are marked in the picture.
+        """Names of the requirements whose violations are marked in the picture.
 
-        If the trace has a separate specification for closed-loop runs, these are all its requirements.
-        Otherwise these are the requirements tagged `@safety`, or all if none is tagged.
+        If the trace has a separate specification for closed-loop runs, all of its requirements are marked.
+        Otherwise the requirements with the tag `@safety` are marked, or all if none has this tag.
         """
         safety = {each.name for each in self.executed if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
@@ -140,8 +144,8 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins, and of the sources of decisions.
 
-    The margins are those of agents for which the world behaves as the model, if enough of them are known;
-    otherwise they are those of all agents.
+    The margins are shown only where the world behaves as the model. If too few of these are known, all
+    margins are shown.
 
     Args:
         judged: verdicts on the agents.
@@ -158,9 +162,10 @@ def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Stri
 
 
 def model_consistent(trace: Trace, agents: int) -> Mask | None:
-    """True at samples from which the world behaves as the model for the length of a plan, (agents, samples).
+    """Return for each agent and sample whether the world behaves as the model predicts.
 
-    None if the trace does not record where the world deviates from the model.
+    The array is (agents, samples). It is True at a sample if this is so for the length of a plan from there
+    on. None is returned if the trace does not record where the world deviates from the model.
     """
     steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
     if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
@@ -170,9 +175,9 @@ def model_consistent(trace: Trace, agents: int) -> Mask | None:
 
 
 def least(rho: Floats, counts: Mask | bool = True) -> Floats:
-    """Least robustness over the agents where `counts` is true: (agents, samples) -> (samples,).
+    """Least robustness over the agents at each sample: (agents, samples) -> (samples,).
 
-    NaN if no robustness is known.
+    Only values where `counts` is True are used. The result is NaN where no robustness is known.
     """
     known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
     return np.where(np.isfinite(known), known, np.nan)
@@ -191,8 +196,8 @@ class Event:
         requirement: name of the requirement.
         agent: number of the agent's trace.
         sample: sample of the cause, at which the deciding predicate is false.
-        until: last sample up to which it stays false.
-        start: sample at which the requirement was evaluated; its time windows are relative to it.
+        until: last sample up to which the predicate stays false.
+        start: sample at which the requirement was evaluated, from which its time windows are counted.
         because: cause in one line.
     """
 
@@ -207,8 +212,8 @@ class Event:
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
     """Violations by the first `agents` traces, in order of time.
 
-    The time of a violation is the time of its cause. Several overlapping windows may be violated for the same
-    cause; it is listed once. The list contains at most `most` violations of each requirement.
+    The time of a violation is the time of its cause. Overlapping windows may be violated for the same cause.
+    It is then listed only once. The list contains at most `most` violations of each requirement.
     """
     found: list[Event] = []
     for judgement in verdict:
@@ -236,7 +241,9 @@ def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> li
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:
-    """True for agents to be marked in a frame, (frames, agents): during a violation, and blinking after it.
+    """Return which agents are to be marked in which frame: booleans, (frames, agents).
+
+    An agent is marked during a violation. After it, the mark blinks for a while.
 
     Args:
         events: violations.

@@ -9,7 +9,10 @@ from typing import Any
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """Format a share: 0.957 is `95.7 %`, None is "". Rounding never gives 100 % below 1, or 0 % above 0."""
+    """Format a share: 0.957 is `95.7 %`, None is "".
+
+    A share below 1 is never rounded to 100 %, and a share above 0 is never rounded to 0 %.
+    """
     if value is None:
         return ""
     while digits < 4 and 0 < value < 1 and round(100 * value, digits) in (0, 100):
@@ -31,7 +34,10 @@ def number(value: float | None, unit: str = "") -> str:
 
 
 def spread(mean: float, half: float | None) -> tuple[str, str]:
-    """Format a mean and the half-width of its interval, with two significant digits of the half-width."""
+    """Format a mean and the half-width of its interval, as two texts.
+
+    The half-width has two significant digits, and the mean has as many decimals as the half-width.
+    """
     if not half:
         return number(mean), "" if half is None else "0"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{half:.1e}"))))
@@ -86,7 +92,7 @@ def guard_words(name: object) -> GuardWords:
 
 
 def labelled(name: str, unit: str) -> str:
-    """Format a name with its unit, `v [m/s]`, for axes; the name alone without a unit."""
+    """Format a name with its unit, `v [m/s]`, for axes; only the name if there is no unit."""
     return f"{name} [{unit}]" if unit not in ("", "1") else name
 
 
@@ -96,9 +102,9 @@ def count(many: int, what: str) -> str:
 
 
 def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
-    """Guard -> results of its drives (closed-loop runs of one agent with one seed).
+    """Return the results of the drives under each guard, from `eval/simulate.json`: guard -> results.
 
-    They come from `eval/simulate.json`; empty if the file is too old.
+    A drive is the closed-loop run of one agent with one seed. The mapping is empty if the file is too old.
     """
     guards = (simulation or {}).get("guards")
     each = guards.items() if isinstance(guards, Mapping) else ()
@@ -109,9 +115,10 @@ def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, An
 def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
     """Sentence `198 of 200 drives obeyed every rule; without the guard 150`, from `eval/simulate.json`.
 
-    A drive is the closed-loop run of one agent with one seed. A specification for drives may be given
-    separately. Otherwise the sentence tells how many drives satisfy, from every instant on, the specification
-    that controls were planned for. "" if the file contains no drives.
+    A drive is the closed-loop run of one agent with one seed. The rules are those of the separate
+    specification for drives. If there is none, the sentence counts the drives that satisfy, from every
+    instant on, the specification for which the controls were planned. It is "" if the file contains no
+    drives.
     """
     each = drives_of(simulation)
     if not each:
@@ -138,8 +145,8 @@ CAUSES = {
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
     """Sentence with the number of lost drives, and with the number of other drives that obeyed every rule.
 
-    A drive is the closed-loop run of one agent with one seed. It is lost if no satisfying plan is known from
-    its start, or after an exogenous event. "" if no drive was lost.
+    A drive is the closed-loop run of one agent with one seed. A drive is lost if no satisfying plan is known
+    from its start, or after an exogenous event. The sentence is "" if no drive was lost.
     """
     each = list(drives_of(simulation).values())
     if not each or not each[-1]["lost"]:
@@ -159,9 +166,10 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
-    """Text: the reason for which a drive (closed-loop run of one agent) violated a rule; "" if unknown.
+    """Text with the reason why a drive violated a rule; "" if it is unknown.
 
-    `broken` is an entry of the list `broken` in `eval/simulate.json`.
+    A drive is the closed-loop run of one agent with one seed. `broken` is an entry of the list `broken` in
+    `eval/simulate.json`.
     """
     cause = broken.get("cause") or {"why": "start" if broken["lost"] else ""}
     if cause["why"] in ("start", ""):
