@@ -65,7 +65,7 @@ class Times:
 
 
 def _dividing(horizon: float, dt: float) -> str:
-    """Help text that proposes a time step of which the horizon is a whole multiple.
+    """Help text that proposes a time step that fits into the horizon a whole number of times.
 
     `horizon` and `dt` are in seconds. The proposed step has four digits and is at most `dt`.
     """
@@ -122,7 +122,10 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 
 
 def recorded_times(trace: Trace, given: Times) -> Times:
-    """Return time step and horizon of a trace. Raises TraceError (E602) if its step differs from `given`."""
+    """Return the time step and the horizon of a trace.
+
+    Raises TraceError (E602) if the time step of the trace differs from that in `given`.
+    """
     dt = as_fraction(trace.dt)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"

@@ -82,8 +82,8 @@ def rule_known(
 ) -> NDArray[np.bool_]:
     """Return for each instant in `starts` whether its value is exact: booleans, (count,).
 
-    A value is exact if it depends only on the first `samples` samples. `horizon` is the length of a planning
-    window in steps.
+    The trace has `samples` samples. A value is exact if it depends on no later samples. `horizon` is the
+    length of a planning window in steps.
     """
     window = window_of(rule, horizon)
     if window is None:

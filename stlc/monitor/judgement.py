@@ -144,7 +144,7 @@ class Judgement:
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """Lower and upper bound on the robustness, which is the least one over the evaluated instants.
+        """Lower and upper bound on the least robustness over the evaluated instants.
 
         The bounds hold for all continuations of the trace. They are floats, or arrays for a batch of traces.
         """
@@ -181,7 +181,7 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Index of the trace and sample at which the robustness is least.
+        """Pair (trace, sample): index of the trace, and the sample, at which the robustness is least.
 
         If the requirement is violated, the upper bounds on the robustness (`high`) are compared. Otherwise
         the lower bounds (`low`) are compared.
@@ -227,7 +227,11 @@ class Verdict:
 
     @property
     def statuses(self) -> list[Status]:
-        """Status of each trace: violated if any requirement is violated, satisfied if all are satisfied."""
+        """Status of each trace: `violated`, `satisfied`, `inconclusive` or `out of scope`.
+
+        A trace that violates the assumptions is out of scope. Any other trace is violated if it violates any
+        requirement, satisfied if it satisfies all of them, and else inconclusive.
+        """
         rows = [judgement.statuses for judgement in self.requirements]
         return [
             "out of scope"

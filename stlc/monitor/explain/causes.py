@@ -91,7 +91,7 @@ class CauseNode:
 
     @property
     def instants(self) -> set[tuple[str, int]]:
-        """Pairs (signal, sample) that a predicate reads."""
+        """Pairs (signal, sample) of the values that a predicate reads."""
         return {(name, self.sample + later) for name, later in self.reads}
 
     @property

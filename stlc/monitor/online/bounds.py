@@ -39,7 +39,8 @@ class Bounds(NamedTuple):
 class Tracker(Protocol):
     """Incremental evaluator of one requirement on a growing trace.
 
-    Instants become settled in order: the value at a settled instant can no longer change with later samples.
+    An instant is settled if later samples can no longer change the value there. Instants become settled in
+    order.
     """
 
     @property

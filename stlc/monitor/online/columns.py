@@ -57,7 +57,8 @@ class ColumnReader:
     Args:
         formulas: formulas to evaluate; each of their predicates is the value of a column.
         end: value of a column after its last row: -inf if "lower", +inf if "upper". If "both", a column has
-            two parts, one for each of these cases. If "truncate", windows are clipped at the last row.
+            two parts side by side, one for each of these cases. If "truncate", windows are clipped at the
+            last row.
         going_on: whether the trace continues after the last row.
         back: lookback of the formulas: number of rows that they read before the first requested row. Unknown
             values (NaN) in rows before these have no effect.
@@ -310,7 +311,10 @@ _SINCE = ColumnReader([ir.Since("since", ir.Window(0, None), column("left"), col
 
 
 def _since(left: Floats, right: Floats, last: Floats | None) -> Floats:
-    """Values s of an unbounded `since`: `s(k) = min(left(k), max(right(k), s(k - 1)))`."""
+    """Return the values s of an unbounded `since`: `s(k) = min(left(k), max(right(k), s(k - 1)))`.
+
+    `last` contains the values in the row before the first one, (traces,), or is None.
+    """
     (found,) = _SINCE({"left": left, "right": right}, 0, len(left))
     if last is None:
         return np.asarray(found)

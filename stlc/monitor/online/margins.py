@@ -132,7 +132,7 @@ class _Watched:
         return self.last
 
     def _settled(self, samples: int) -> int:
-        """The first window start whose value may still change after `samples` samples."""
+        """The first window start at which more than `samples` samples may still change the robustness."""
         if self.ahead is None:
             return 0
         whole = max(samples - self.ahead, 0)

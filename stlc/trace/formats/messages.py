@@ -50,7 +50,7 @@ class MessageNumber:
     Attributes:
         name: path of the number in the message, such as `twist.linear.x`.
         value: the number.
-        whole: whether the field is an integer or a truth value.
+        whole: whether the field contains an integer or a truth value.
     """
 
     name: str
