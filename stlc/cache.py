@@ -1,8 +1,8 @@
 """The cache folder: files that can be computed again, shared by processes, protected from other users.
 
-Code is loaded from here, so the folder and each file read from it must belong to the user, be no link, and be
-writable by the user only. Otherwise, or if no such folder can be created, a temporary folder of the process
-is used (`temporary`), or nothing is cached.
+Code is loaded from here. So the folder and each file read from it must belong to the user, and only the user
+may be able to write to them. They must not be links. Otherwise, or if no such folder can be created, a
+temporary folder of the process is used (`temporary`), or nothing is cached.
 """
 
 from __future__ import annotations

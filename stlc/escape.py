@@ -110,8 +110,8 @@ def _raw(char: str) -> bool:
 def c_string(text: str) -> str:
     """A string literal of C99 and C++11 that holds the text in UTF-8, with its quotes.
 
-    Characters other than printable ASCII are written as three octal digits; question marks do not form
-    trigraphs. The literal is not a format string: print it by `%s`.
+    A byte that is not printable ASCII is written as a backslash and three octal digits. Question marks are
+    written so that they form no trigraphs. The literal is not a format string: print it with `%s`.
     """
     data = _SURROGATE.sub("\ufffd", text).encode()
     return '"' + "".join(_C_BYTES.get(byte) or f"\\{byte:03o}" for byte in data) + '"'

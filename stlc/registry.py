@@ -126,7 +126,7 @@ class Registry(Generic[T]):
 class PackageRegistry(Registry[T]):
     """A table of plugins whose entries are modules of a package: the plugin `NAME` is the file `NAME.py`.
 
-    Listing the names imports no module. Modules whose names begin with `_` are no entries.
+    Listing the names imports no module. Modules whose names begin with `_` are not entries.
 
     Args:
         kind: noun for an entry in messages, such as "method".

@@ -160,9 +160,10 @@ def write_onnx(run: Run, folder: Path) -> None:
 
 
 def _facts(run: Run) -> dict[str, object]:
-    """Content of `controller.json`: names, units, ranges, hashes, and the grid of the backup policy.
+    """Content of `controller.json`: names, units, ranges, hashes, and the prefixes of the backup policy.
 
-    The grid tells the control sequences that the backup policy tries as the first part of a plan.
+    The prefixes are the sequences of actions that the backup policy tries as the first part of a plan. They
+    are given by the values of each control, and by their lengths.
     """
     task, grid = run.task, backup.grid_of(run.task)
     feedback = task.system.decl.feedback

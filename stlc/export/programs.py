@@ -1,8 +1,9 @@
 """Torch modules of a controller and of its guard, for export with any number of agents.
 
-The guard (Meng and Fan 2023) takes the first T0 steps of a plan from a grid of control sequences.
-`stlc.controller.guard.shooting` tries a longer T0 only if no plan was found with a shorter one. An exported
-program cannot stop early: it always tries every T0, and returns the same plans.
+The guard (Meng and Fan 2023) replaces the first T0 actions of a plan by a prefix: a sequence of actions from
+a list that is fixed in advance. The policy plans the rest. The guard in stlc tries longer prefixes only if no
+plan was found with shorter ones. An exported program cannot stop early. It tries the prefixes of all lengths,
+and returns the same plans.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
 class Deciding(nn.Module):
     """Module from states (B, n) to plan (B, T, m), rho and safe (B,), requirements (B, R); all float64.
 
-    `rho` is the robustness of the plan, `safe` that of the safety requirements alone.
+    `rho` is the robustness of the specification under the plan, `safe` that of the safety requirements alone,
+    and `requirements` that of each requirement.
     """
 
     def __init__(self, task: Task, network: PlanNetwork) -> None:
@@ -100,11 +102,10 @@ _NOTHING: tuple[Tensor, ...] = ()
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """Plans that the guard tries with one number T0 of first controls, and their verdicts.
+    """Plans that the guard tries with prefixes (first actions) of one length T0, and their verdicts.
 
-    The first T0 controls of each plan are one choice from a grid of control sequences. The arrays are
-    (states, choices, …). `falls` is the robustness of the safety requirements on every first part of a plan;
-    it is computed for the longest T0 only.
+    The arrays are (states, choices, …), with one choice for each prefix. `falls` is the robustness of the
+    safety requirements on every first part of a plan. It is computed for the longest prefixes only.
     """
 
     plans: Tensor
@@ -118,10 +119,19 @@ class _Tried:
 class Guarding(nn.Module):
     """Module from states (B, n) and the policy's plans (B, T, m) to the plans that the guard chooses.
 
-    The guard is that of Meng and Fan 2023. Outputs in float64: plan (B, T, m), rho and safe (B,), and
-    requirements (B, R). Outputs in int64: source (B,) and t0 (B,). The source is 1 if the plan satisfies the
-    specification or the safety requirements; else it is 2, and the plan keeps the safety requirements as long
-    as possible. t0 is the number of first steps taken from the grid.
+    The guard is that of Meng and Fan 2023. It replaces the first actions of a plan by a prefix: a sequence of
+    actions from a list that is fixed in advance. The policy plans the rest.
+
+    Outputs in float64:
+        plan (B, T, m): the chosen plan.
+        rho (B,): robustness of the specification under the chosen plan.
+        safe (B,): robustness of the safety requirements alone.
+        requirements (B, R): robustness of each of the R requirements.
+
+    Outputs in int64:
+        source (B,): 1 if the plan satisfies the specification or the safety requirements. Else it is 2, and
+            the plan keeps the safety requirements as long as possible.
+        t0 (B,): number of actions in the prefix of the plan; 0 if the system file declares no prefixes.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
@@ -159,11 +169,11 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans that the guard tries with one number T0 of first controls, and their verdicts.
+        """All plans that the guard tries with the prefixes `prefixes`, and their verdicts.
 
-        The first T0 controls of a plan are one of the sequences `prefixes` of the backup policy. In the first
-        plan they are those of the policy's own plan `own`. The later controls come from the policy, for the
-        state reached after T0 steps from `x`. With `falls`, the robustness of the safety requirements on
+        A prefix consists of the first T0 controls of a plan; all prefixes here are equally long. In the first
+        plan, the prefix comes from the policy's own plan `own`. The later controls come from the policy, for
+        the state reached after T0 steps from `x`. With `falls`, the robustness of the safety requirements on
         every first part of each plan is computed as well.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
@@ -217,8 +227,8 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Select results state by state: those in `before` where `decided` is True, else those in `here`.
 
-    `decided` marks the states for which a plan was found with fewer first controls T0; `before` holds the
-    results of these plans.
+    `decided` marks the states for which a plan with a shorter prefix was found. `before` holds the results of
+    the plans with shorter prefixes, `here` those of the plans with the present ones.
     """
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)

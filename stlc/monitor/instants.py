@@ -1,7 +1,7 @@
 """Instants at which a requirement is evaluated, and its values there.
 
-A requirement that mentions the horizon `T` holds for every planning window. It is evaluated at each sample
-that has a full window of length `T` after it. In its formula, `end` is the end of this window. Other
+A requirement that mentions the horizon `T` applies to every planning window: it is evaluated at each sample
+that is followed by a full window of length `T`. In its formula, `end` is the end of this window. Other
 requirements are evaluated once, at the start of the trace. So are requirements with absolute operators
 (`always@[a, b]`), whose interval counts from the start of the mission.
 """

@@ -171,7 +171,11 @@ class Signals:
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
-        """Reshape values (1, batch) of one sample to the shape of the given signals without time axis."""
+        """Reshape values (1, batch) of one sample, with one entry per trace.
+
+        The result has the shape that the signals were given in, without the time axis: (traces,) for signals
+        (traces, samples), and a single number for signals (samples,).
+        """
         flat = values.reshape(self.shape)
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 

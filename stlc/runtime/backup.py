@@ -1,6 +1,6 @@
 """Search for a plan in place of one that violates the specification, without torch.
 
-This is the search of the paper's guard, on the ONNX graphs of an exported controller. In torch,
+This is the search of Meng and Fan (2023), on the ONNX graphs of an exported controller. In torch,
 `prefix_shooting` and `longest_safe_prefix` of `stlc.controller.guard.stages` do the same.
 """
 
@@ -25,7 +25,8 @@ class Found:
     """Plan found for one state.
 
     `judged` is the plan with its verdicts, as one row. `source` is the rule that chose the plan, `BACKUP` or
-    `SAFEST`. `t0` is the number of first steps of the plan that were taken from a grid of controls.
+    `SAFEST`. `t0` is the length of the prefix: the number of first actions of the plan that the search tried
+    from a list, instead of letting the policy plan them.
     """
 
     judged: JudgedPlans
@@ -34,11 +35,11 @@ class Found:
 
 
 def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
-    """Search a plan for a state in which the policy's plan violates the specification.
+    """Search for a plan from a state in which the policy's plan violates the specification.
 
-    The first T0 steps of a plan are taken from a grid. T0 grows until a plan satisfies the specification or
-    at least its safety requirements; if none does, the plan that keeps the safety requirements longest is
-    returned.
+    Every plan that is tried begins with a prefix, a sequence of T0 actions from a list that is fixed in
+    advance. The policy plans the rest. T0 grows until a plan satisfies the specification or at least its
+    safety requirements. If no plan does, the plan that keeps the safety requirements longest is returned.
 
     Args:
         graphs: graphs of the controller.
@@ -69,8 +70,8 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
     """All plans for the prefix length T0 = `length`, with verdicts, one per row.
 
-    The first T0 steps of a plan are a prefix from the grid (in the first row, those of the policy's own plan
-    `own`); the other steps come from the policy.
+    The first T0 steps of a plan are one of the prefixes to try; in the first row, they come from the policy's
+    own plan `own`. The policy plans the other steps.
     """
     grid = graphs.facts.grid
     heads = np.concatenate((own[None, :length], grid.prefixes(length)))

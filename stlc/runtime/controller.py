@@ -35,8 +35,8 @@ class ControlDecision:
         robustness: robustness of each requirement, by name.
         source: rule that first chose the plan; for a plan that is kept from an earlier step, it differs from
             `rule`.
-        t0: number of first steps of the plan that the backup policy took from a grid; 0 for the policy's own
-            plan.
+        t0: number of first steps of the plan that are a prefix tried by the backup policy; 0 for the policy's
+            own plan.
         policy_rho: robustness of the policy's plan; -inf if it is not a number.
     """
 
@@ -74,7 +74,8 @@ class Controller:
 
     Attributes:
         facts: description of the controller: names, units, ranges, hashes.
-        guard: "paper" searches another plan if the chosen one violates the specification; "none" does not.
+        guard: "paper" searches for another plan if the policy's plan violates the specification; "none"
+            always returns the policy's plan.
     """
 
     def __init__(
@@ -131,7 +132,11 @@ class Controller:
         return tuple(each.name for each in self.facts.controls)
 
     def reset(self) -> None:
-        """Forget the previous plans, and set the states that the specification adds as for a new mission."""
+        """Prepare for a new mission.
+
+        The previous plans are dropped. The states that the specification adds to the system, such as timers,
+        return to their initial values.
+        """
         self._previous = self._added = None
 
     def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> ControlDecision:

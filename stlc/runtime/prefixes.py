@@ -1,7 +1,8 @@
-"""Prefixes (first controls of a plan) that the backup policy tries: all of a grid, or a sample.
+"""Prefixes (first controls of a plan) that the backup policy tries.
 
-Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the same prefixes.
-There are two ways to sample:
+In a prefix, each control takes one of a few given values at each step. Either all such prefixes are tried, or
+a sample of them. Samples are computed with 64-bit integers, so that NumPy, torch and the exported C try the
+same prefixes. There are two ways to sample:
 
 "lattice" is Richtmyer's sequence of low discrepancy, in fixed point: entry d of point k is k sqrt(p_d) mod 1,
 where p_d is the d-th prime (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS

@@ -94,7 +94,7 @@ class _Clock:
         """Convert the next chunk to a trace whose times continue those of the previous chunks.
 
         Raises:
-            TraceError: E602, a time is not on the grid; also the errors of `stlc.trace.trace.trace_of`.
+            TraceError: E602, a time is not on the time grid; also errors of `stlc.trace.trace.trace_of`.
         """
         names = dict(reading.names)
         renamed = names.pop(CLOCK, None)
@@ -119,7 +119,7 @@ class _Clock:
         return np.asarray((instants - begin) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
     def _check(self, times: NDArray[np.float64]) -> None:
-        """Check that every time is on the grid, up to rounding. Raises TraceError (E602)."""
+        """Check that every time is on the time grid, up to rounding. Raises TraceError (E602)."""
         wanted = self.t0 + self.dt * (self.samples + np.arange(len(times)))
         off = np.abs(times - wanted)
         bad = ~(off <= TOLERANCE * self.dt + 1e-9 * np.abs(wanted))

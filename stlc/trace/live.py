@@ -357,7 +357,7 @@ class Gridded:
         name: name of the stream, for messages.
         reading: the requested grid, and the kinds of the signals.
         t0: time of the first sample in seconds.
-        dt: time step of the grid in seconds; known once the first sample of the grid was yielded.
+        dt: time step of the time grid in seconds; known once the first sample on the grid was yielded.
     """
 
     name: str
@@ -371,7 +371,7 @@ class Gridded:
     _last: float = -math.inf
 
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
-        """Yield the samples on the grid one by one; none is yielded before the time step is known."""
+        """Yield the samples on the time grid one by one; none is yielded before the time step is known."""
         waiting: list[float] = []
         for moment in chain([first], rest):
             now = self._take(moment)
@@ -419,7 +419,7 @@ class Gridded:
         self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
 
     def _ready(self, now: float) -> Iterator[Sample]:
-        """Yield the samples of the grid that are known once a sample at time `now` has arrived."""
+        """Yield the samples on the time grid that are known once a sample at time `now` has arrived."""
         assert self._spacing is not None
         until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
         stop = min(until, default=now)
@@ -428,7 +428,7 @@ class Gridded:
         yield from self._upto(lambda grid: grid + self._slack < stop, (stop - self.t0) / self.dt + 1, now)
 
     def _rest(self) -> Iterator[Sample]:
-        """Yield the remaining samples of the grid at the end of the stream."""
+        """Yield the remaining samples on the time grid at the end of the stream."""
         count = math.floor((self._last - self.t0) / self.dt + self._slack / self.dt) + 1
         yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
 
@@ -439,7 +439,7 @@ class Gridded:
     def _upto(
         self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
     ) -> Iterator[Sample]:
-        """Yield the next samples of the grid, as long as they are known.
+        """Yield the next samples on the time grid, as long as they are known.
 
         Args:
             known: function from times of the grid, in seconds, to booleans: True if the sample at this time

@@ -1,4 +1,4 @@
-"""Resampling of signals to one grid: discrete signals are held, real ones interpolated linearly.
+"""Resampling of signals to one time grid: discrete signals are held, real ones interpolated linearly.
 
 If the gap between two samples of a signal is too long, the signal is unknown (NaN) within it.
 """

@@ -233,7 +233,7 @@ def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) 
 def save_trace(path: Path | str, trace: Trace) -> None:
     """Write a trace; the suffix of the path determines the format.
 
-    A `.csv` file contains the signals only; an `.mcap` file contains no extras.
+    A `.csv` file contains the signals only. An `.mcap` file does not contain the arrays `trace.extras`.
 
     Raises:
         UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.

@@ -370,10 +370,10 @@ class MapRegion:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """Time intervals in which a requirement refers to the region; the region is then called active.
+        """Time intervals (first, last) in which the region is active.
 
-        The intervals are in seconds since the start of the trace. They are empty if the region is always
-        active.
+        A region is active while a requirement refers to it. Times are in seconds since the start of the
+        trace. If the region is active all the time, the tuple is empty.
         """
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
@@ -431,7 +431,7 @@ class Plane:
         *,
         count: int = GRID,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Evaluate the signed distance to a region's border on a grid.
+        """Evaluate the signed distance to a region's border, positive inside, at the points of a grid.
 
         Args:
             region: the region.
@@ -440,7 +440,9 @@ class Plane:
             count: number of grid points along each axis.
 
         Returns:
-            Horizontal and vertical coordinates, (count,) each, and distances (count, count), row by row.
+            Ascending horizontal coordinates (count,), ascending vertical coordinates (count,), and distances
+            (count, count). Entry [i, k] of the distances is at vertical coordinate i and horizontal
+            coordinate k.
         """
         (left, right), (low, high) = window
         xs, ys = np.linspace(left, right, count), np.linspace(low, high, count)

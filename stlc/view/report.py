@@ -364,7 +364,7 @@ def _set(record: Mapping[str, Any]) -> list[str]:
 def _simulate(contents: RunContents) -> list[str]:
     """Return the command that repeats the latest closed-loop simulation, as a list of words.
 
-    If there was none, the command simulates the run with the paper's guard.
+    If there was none, the command simulates the run with the guard "paper".
     """
     done = contents.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]

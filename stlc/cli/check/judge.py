@@ -104,7 +104,7 @@ def found(name: str, runs: Path) -> Path:
 def judge(name: str, question: Question, runs: Path) -> Checked:
     """Load the trace called `name`, judge it with the options in `question`, and explain its violations.
 
-    If there is no file at the path `name`, it is searched in the newest run below `runs`.
+    If there is no file at the path `name`, the file is looked for in the newest run below `runs`.
 
     Raises:
         StlcError: the trace or the specification is invalid, or the two do not fit together.

@@ -125,12 +125,12 @@ def simulate(
     """Deploy a trained policy in the world of its system.
 
     The newest run by default. With --method, RUN is a specification, and a planner controls the system
-    without training. With --backup the paper's backup policy guards the policy. For comparison, the same
-    seeds are simulated without the backup policy, too. Trace, scene and figures are written to the run's
-    folder. A drive is the closed-loop run of one agent with one seed. Drives are judged by the specification
-    that the system file names (key `judge` of its section `test`). Means over seeds have 95 % intervals
-    (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their strength in
-    percent, as in mismatch-20. --scenario disturbed runs all of them.
+    without training. With --backup the backup policy of Meng and Fan (2023) guards the policy. For
+    comparison, the same seeds are simulated without the backup policy, too. Trace, scene and figures are
+    written to the run's folder. A drive is the closed-loop run of one agent with one seed. Drives are judged
+    by the specification that the system file names (key `judge` of its section `test`). Means over seeds have
+    95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets
+    their strength in percent, as in mismatch-20. --scenario disturbed runs all of them.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable

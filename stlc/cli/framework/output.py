@@ -1,6 +1,6 @@
 """Output: results to the standard output, messages to the standard error.
 
-A closed pipe (`stlc … | head`) is no error: the remaining output is dropped, and the exit code is unchanged.
+A closed pipe (`stlc … | head`) is not an error: the remaining output is dropped; the exit code is unchanged.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def noticing() -> Iterator[None]:
 def wants_color(stream: TextIO) -> bool:
     """True if colour codes may be written to `stream`.
 
-    `--color always` or `never` decides; else there is no colour if `NO_COLOR` is set, or if `stream` is no
+    `--color always` or `never` decides; else there is no colour if `NO_COLOR` is set, or if `stream` is not a
     terminal.
     """
     mode = COLOR.get()
@@ -317,7 +317,7 @@ def _write(stream: TextIO | None, text: str) -> None:
 
 @contextmanager
 def tolerate_closed(stream: TextIO) -> Iterator[None]:
-    """Context in which a closed pipe is no error: all later output to `stream` is dropped."""
+    """Context in which a closed pipe is not an error: all later output to `stream` is dropped."""
     try:
         yield
     except BrokenPipeError:

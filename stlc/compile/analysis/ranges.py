@@ -1,4 +1,9 @@
-"""Interval arithmetic on numbers of the IR, and the range of nearly all values of random draws."""
+"""Intervals that contain the values of an expression.
+
+For an expression of signals, the interval follows from the ranges of the signals (interval arithmetic). For a
+number drawn at random, the interval contains nearly all values, for example three standard deviations on
+either side of the mean.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,16 @@
 """Absolute operators (`always@[a, b]`) over future formulas, rewritten to be over past formulas.
 
-The interval of an absolute operator counts from the start of the mission. `eventually@[a, b] always[0, c] p`
-holds iff p has held for c at some sample from a + c to b + c. The rewritten formula thus refers to the sample
-at which the inner formula is decided. There it needs only memory of the past: one timer per window. If the
-parts of a formula are decided at different samples, the truth of the earlier parts is stored until the last
-part is decided. This takes one state per sample of delay.
+The interval of an absolute operator counts from the start of the mission. Example: `eventually@[a, b]
+always[0, c] p` is true if and only if, at some sample from a + c to b + c, p has held since c samples ago.
+The rewritten formula thus refers to the sample at which the inner formula is decided. At this sample, only
+memory of the past is needed: one timer per window. If the parts of a formula are decided at different
+samples, the truth of the earlier parts is stored until the last part is decided. This takes one state per
+sample of delay.
 
-In the example, `always[0, c] p` must begin by b, so the formula is violated as soon as p fails after b. The
-rewritten formula is a `left until@ right`; its left side detects this at once, not only at b + c. The method
-is that of Maler, Nickovic and Pnueli, "Real time temporal logic: past, present, future" (2005).
+In the example, the window of `always[0, c] p` must begin no later than b. If the formula is still undecided
+at b, it is violated as soon as p fails. The rewritten formula is a `left until@ right`. Its left side becomes
+false at this moment, not only at b + c. The method is that of Maler, Nickovic and Pnueli, "Real time temporal
+logic: past, present, future" (2005).
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ Formulas: TypeAlias = tuple[typed.Formula, ...]
 
 
 class TooFarError(Exception):
-    """A formula has unbounded lookahead or needs more than finite memory; the message says why."""
+    """A formula needs unbounded lookahead or too much memory of the past; the message says why."""
 
     def __init__(self, span: Span, why: str) -> None:
         super().__init__(why)
@@ -311,9 +313,9 @@ class _Writer:
     # ------------------------------------------------------------------ formulas delayed in time
 
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
-        """Return a past formula with the truth that `formula` had `steps` samples ago.
+        """Return a past formula that is true if `formula` was true `steps` samples ago.
 
-        `formula` looks at most `steps` samples ahead, so the samples up to now decide this truth.
+        `formula` looks at most `steps` samples ahead. So the samples up to now decide whether it was true.
         """
         if not looks_ahead(formula):
             return self._ago(formula, steps)
@@ -333,7 +335,7 @@ class _Writer:
     def _written_out(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
     ) -> typed.Formula:
-        """Return a past formula with the truth that an `until` or `release` had `steps` samples ago.
+        """Return a past formula that is true if an `until` or `release` was true `steps` samples ago.
 
         The operator is expanded sample by sample.
 

@@ -4,10 +4,11 @@ A timer counts the samples before the current one: `historically[0, c] p` is `p 
 is the number of samples for which p has held; `once[0, c] p` is `p or since_p <= c`, where `since_p` is the
 number of samples since p last held. Windows of the past are cut at the start of the mission.
 
-At a single instant, timers decide truth but have no gradient. Along a plan, the operator is therefore
-evaluated on the samples of the plan. For the samples before the plan, the timer's value at the first sample
-of the plan is used. At step k of the plan, for example, `held` has grown to `held + k` if p has held since.
-`historically[0, c] p` is then false while `held + k` is less than c.
+At a single instant, timers tell whether a past operator is true, but they have no gradient. Along a plan, the
+operator is therefore evaluated on the samples of the plan. The timer is used only for the samples before the
+plan: its value at the first sample of the plan is read. For example, suppose that p holds at all samples of
+the plan. At step k, `held` has then grown to `held + k`. `historically[0, c] p` is false while `held + k` is
+less than c.
 """
 
 from __future__ import annotations
@@ -61,19 +62,19 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """Return the test for use in an `or`, as the replacement of a past operator.
+        """Return the formula `left >= right` for use in an `or`, in place of a past operator.
 
-        Its robustness is +inf where the test holds and -inf where it fails.
+        Its robustness is +inf where it is true and -inf where it is false.
         """
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
-        """Return the test for use in an `and`, as the replacement of a past operator.
+        """Return the formula `left >= right` for use in an `and`, in place of a past operator.
 
-        Where the test fails, its robustness is negative and finite: it is proportional to the number of steps
-        that are missing until the test holds.
+        Along a plan, its robustness is +inf where it is true. Where it is false, its robustness is finite and
+        negative: it is proportional to the number of steps by which `left` is less than `right`.
         """
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
@@ -81,10 +82,7 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides of the test at any sample of a plan.
-
-        They are computed from the timer's value at the first sample of the plan.
-        """
+        """Both sides of the test at any sample of a plan, computed from the timer at its first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -195,8 +193,9 @@ class Past:
     def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
         """Rewrite `p since[0, c] q`, or its negation if not `positive`, with a timer.
 
-        The operator holds if q holds now or held at most c ago, and p has held at every sample from then to
-        now. Windows that end before now are rewritten by `_since_before` and `_lasting`.
+        The operator is true if q is true now, or if q was true at a sample at most c samples ago and p has
+        been true at every sample since then. Windows that end before now are rewritten by `_since_before` and
+        `_lasting`.
         """
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
@@ -226,7 +225,7 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """Add a timer; return the test that q held earlier and p from then to the previous sample.
+        """Add a timer; return the test that q was true earlier, and p from then on to the previous sample.
 
         p and q are the operands of `node`, `p since q`. q must have held at a sample at most `most` samples
         ago; if `most` is None, at any earlier sample. If `positive` is False, the test is negated, and `left`
@@ -271,7 +270,7 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Return a formula with the truth that `body` had `steps` samples ago.
+        """Return a formula that is true if `body` was true `steps` samples ago.
 
         One state is added per sample of delay. Before the start of the mission, the truth is `before`. `body`
         belongs to the operator `node`. If more than `REGISTER` states are needed, E309 is appended to `sink`.
@@ -301,8 +300,8 @@ class Past:
         """Rewrite `p since[a, b] q`, with a > 0, in terms of windows that end now.
 
         `node` is the operator, `window` its interval in samples. If `positive` is False, the negation of
-        `node` is rewritten. The operator holds if `historically[0, a] p` holds now, and `p since[0, b - a] q`
-        held a ago.
+        `node` is rewritten. The operator is true if `historically[0, a] p` is true now, and
+        `p since[0, b - a] q` was true `a` samples ago.
         """
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=in_steps(ir.Window(0, hi - lo), node.span))

@@ -41,7 +41,7 @@ class Timer:
         initial: value at the start of a mission.
         update: value one step later, as a function of the state at the start of the step.
         low: least value.
-        high: greatest value, at which the count saturates; a larger value would change no formula.
+        high: greatest value, at which the count stops; for all formulas, a larger value would mean the same.
         about: meaning in words, for `stlc compile` and generated code.
     """
 

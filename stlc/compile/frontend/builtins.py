@@ -191,7 +191,7 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
     The call has as many arguments as the function takes.
 
     Raises:
-        Failed: an argument is no formula (E201) or has a wrong type (E205).
+        Failed: an argument is not a formula (E201) or has a wrong type (E205).
     """
     value, expr = values[0], call.args[0].value
     match name:

@@ -37,7 +37,7 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value as a number; a member of an enum becomes the number that stands for the member.
 
     Raises:
-        Failed: the value is a formula or a bool (E202), or anything else that is no number (E205).
+        Failed: the value is a formula or a bool (E202), or anything else that is not a number (E205).
     """
     match value:
         case Number(kind="bool"):
@@ -61,7 +61,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
     """Return a value as a number; unlike in `as_number`, a bool is allowed and counts as 0 or 1.
 
     Raises:
-        Failed: the value is a formula other than `true` and `false` (E202), or anything else that is no
+        Failed: the value is a formula other than `true` and `false` (E202), or anything else that is not a
             number (E205).
     """
     match value:
@@ -97,7 +97,7 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
     The result is in negation normal form: negations are pushed down to the predicates.
 
     Raises:
-        Failed: the value is no formula (E201), or its truth depends on several instants (E202).
+        Failed: the value is not a formula (E201), or its truth depends on several instants (E202).
     """
     formula = as_formula(value, expr, need, scope)
     if not is_state(formula):
@@ -111,7 +111,7 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
     """Return a value that must be a vector of numbers.
 
     Raises:
-        Failed: the value is no vector (E205).
+        Failed: the value is not a vector (E205).
     """
     if isinstance(value, VectorValue):
         return value

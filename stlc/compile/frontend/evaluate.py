@@ -366,7 +366,7 @@ def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
     """Return the value of an expression as a formula.
 
     Raises:
-        Failed: the expression has errors, or its value is no formula (E201).
+        Failed: the expression has errors, or its value is not a formula (E201).
     """
     return as_formula(evaluate(expr, scope), expr, need, scope)
 
@@ -375,7 +375,7 @@ def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> lis
     """Return the values of independent expressions as formulas.
 
     Raises:
-        Failed: an expression has errors, or its value is no formula (E201).
+        Failed: an expression has errors, or its value is not a formula (E201).
     """
     return _all(partial(formula, expr, need, scope) for expr, need in exprs)
 

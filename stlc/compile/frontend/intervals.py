@@ -85,7 +85,7 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
     """Return a value as a time.
 
     Raises:
-        Failed: the value is not constant (E303), has another unit (E203), or is no number (E205).
+        Failed: the value is not constant (E303), has another unit (E203), or is not a number (E205).
     """
     if isinstance(value, TimeExpr):
         return value
@@ -168,7 +168,7 @@ def interval(
 
     Raises:
         Failed: the interval ends before it starts (E301), begins before now (E302), is not constant (E303),
-            or has a bound that is no time (E203).
+            or has a bound that is not a time (E203).
     """
     if node is None:
         return typed.Interval(typed.Time(), None, span=place)

@@ -197,9 +197,9 @@ Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region
 
 
 def is_formula(value: Value) -> bool:
-    """True if a value is a formula with a margin of its own.
+    """True if a value is a formula whose robustness is more than a comparison of a bool with 1/2.
 
-    The result is False for a bool signal: its formula only compares the signal with 1/2.
+    A bool signal b is also a formula: b >= 1/2. For it, the result is False.
     """
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 

@@ -192,8 +192,8 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
 def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
     """Return a formula with the delays of `shift` converted from seconds to samples.
 
-    Findings are appended to `sink`: E205 for a delay that is no whole number of samples or too long, E311 for
-    an unknown time step or horizon. A delay with an error is replaced by one sample.
+    Findings are appended to `sink`: E205 for a delay that is too long or not a whole number of samples, E311
+    for an unknown time step or horizon. A delay with an error is replaced by one sample.
     """
 
     def leaf(num: ir.Num) -> ir.Num:
@@ -223,7 +223,7 @@ def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
 
 
 def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
-    """Return E205 for a delay that is no whole number of steps or exceeds `MAX_DELAY`, else None."""
+    """Return E205 for a delay that is not a whole number of steps or exceeds `MAX_DELAY`, else None."""
     if steps.denominator != 1 and grid.dt is not None:
         low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
         message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"

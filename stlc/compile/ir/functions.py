@@ -226,7 +226,7 @@ def _operator(name: str, symbol: str, rule: UnitRule, *rest: Any, **flags: Any) 
 
 
 def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """Return the table entry of a step function with whole values, such as `floor`; its slope is 0.
+    """Return the table entry of a step function with integer values, such as `floor`; its slope is 0.
 
     `kernel` is the name of the function in NumPy.
     """

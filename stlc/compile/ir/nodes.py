@@ -45,7 +45,7 @@ class ShiftedSignal:
 
 @dataclass(frozen=True, slots=True)
 class FrozenVar:
-    """Value bound by an enclosing `Freeze`; the name is unique in the specification."""
+    """Value that an enclosing `Freeze` has stored under this name, which is unique in the specification."""
 
     name: str
 
@@ -338,10 +338,15 @@ class Shift(Operator):
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """Formula `body` in which each bound `FrozenVar` has the value that its number has now.
+    """`freeze p0 = p in body`: in `body`, `p0` is the value of `p` at the instant of the `freeze` itself.
 
-    The bound values are the same at all instants at which `body` is read. Where a bound number is undefined,
-    so are the predicates that read it.
+    This value is the same at all instants at which `body` is evaluated. If the value is undefined, the
+    predicates that read `p0` are undefined too.
+
+    Attributes:
+        bindings: pairs (p0, p) of a name and an expression. In `body`, `FrozenVar` refers to the name.
+        body: formula that reads the names.
+        span: source location.
     """
 
     bindings: tuple[tuple[str, Num], ...]

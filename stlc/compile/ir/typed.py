@@ -162,7 +162,12 @@ class Edge(Node):
 
 @dataclass(frozen=True, slots=True)
 class Freeze(Node):
-    """`freeze p0 = p in body`: each bound `ir.FrozenVar` keeps the value that its number has now."""
+    """`freeze p0 = p in body`: in `body`, `p0` is the value of `p` at the instant of the `freeze` itself.
+
+    Attributes:
+        bindings: pairs (p0, p) of a name and an expression. In `body`, `ir.FrozenVar` refers to the name.
+        body: formula that reads the names.
+    """
 
     bindings: tuple[tuple[str, ir.Num], ...]
     body: Formula

@@ -118,7 +118,8 @@ class ClosedLoop:
     """Closed-loop results of a trained policy.
 
     Attributes:
-        shares: result of each simulated guard, the cheapest first; empty if no run was completed.
+        shares: results of the simulated guards, one entry per guard, the cheapest guard first; empty if no
+            run was completed.
         steps: length of a run in steps.
         judge: name of the specification that judges the runs; None if the specification of the plans judges
             them.

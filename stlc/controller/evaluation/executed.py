@@ -40,10 +40,11 @@ class Executed:
         rules: requirement -> whether it holds, (starts, rows). There is a single start for a requirement
             that does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        consistent: (starts, rows), whether all steps in the planning window from the start instant equal the
-            predictions of the model.
-        eventless: (starts, rows), whether no exogenous event occurs in the planning window. All its steps
-            then follow the true dynamics, from which the model may differ. None if events were not recorded.
+        consistent: (starts, rows), whether the model predicts every step in the planning window from the
+            start instant, up to rounding errors.
+        eventless: (starts, rows), whether no exogenous event occurs in the planning window. If none occurs,
+            all steps in the window follow the true dynamics, from which the model may differ. None if events
+            were not recorded.
         viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
     """
 

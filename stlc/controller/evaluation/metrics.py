@@ -39,7 +39,7 @@ class Seed:
         satisfied_agents: (agents,), whether every requirement holds at all start instants.
         safe_agents: (agents,), whether every safety requirement holds at all start instants.
         viable: (agents,), whether the trajectory is safe, or a search finds a safe plan from its first state.
-        consistent: whether all steps in the planning window from a start instant equal those of the model.
+        consistent: whether the model predicts every step in the planning window from a start instant.
         eventless: whether no exogenous event occurs in the planning window; None if not recorded.
         searched: visited states whose feasibility was determined; None if there are none.
         feasible: visited states with a known satisfying plan; None if `searched` is None.

@@ -1,8 +1,8 @@
-"""Rules for closed-loop runs, and their verdicts.
+"""Rules for closed-loop runs, and verdicts of the rules on recorded runs.
 
-The rules are a second specification, which a system file names by `test: {judge: …}`. The specification of
-the plans judges each plan over its horizon. In contrast, the rules judge a closed-loop run once, from its
-first to its last sample. They may use past operators and describe the world.
+The rules are a second specification, which a system file names by `test: {judge: …}`. The first specification
+judges each plan over its horizon. In contrast, the rules judge a closed-loop run once, from its first to its
+last sample. The rules may use past operators, and may refer to the world.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class Rules:
 class Lost:
     """Loss of a run that broke a rule: since when no good plan was known, and why.
 
-    A plan is good if it satisfies the specification of the plans. If a safety rule was broken, a plan that
-    satisfies the requirements tagged `@safety` is good. A good plan is known at an instant if the followed
-    plan is good, or if a search finds a good plan.
+    If the run broke a rule tagged `@safety`, a plan is good if it satisfies the requirements tagged
+    `@safety`. Otherwise a plan is good if it satisfies the whole specification of the plans. A good plan is
+    known at an instant if the followed plan is good, or if a search finds a good plan.
 
     Attributes:
         why: cause of the loss. `start`: no good plan was known, even at the start. `told`: a good plan was
@@ -99,8 +99,8 @@ class Broken:
         row: index of the run in the recording.
         rules: broken rule -> time of the violation, in seconds from the start; None if no single instant
             decides.
-        lost: time since which no good plan was known, and the cause; see `Lost`. None if all plans followed
-            until the violation were good, or if the cause was not determined.
+        lost: time since which no good plan was known, and the cause; see `Lost`, which defines good. None if
+            all plans followed until the violation were good, or if the cause was not determined.
     """
 
     row: int
@@ -109,7 +109,7 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """True if no good plan was known at the start, or none after an exogenous event; see `Lost`."""
+        """True if no good plan (see `Lost`) was known at the start, or none after an exogenous event."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
@@ -121,8 +121,8 @@ class RunVerdicts:
         rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the runs that broke a rule, in the order of their rows.
         viable: mask, (rows,), of the runs that could have obeyed the rules, as far as is known. It is True
-            for a run that obeyed them. It is False for a run that broke a rule if no good plan was known at
-            the start, or none after an exogenous event (see `Lost`). It is True for other runs that broke a
+            for a run that obeyed them. It is False for a run that broke a rule if no good plan (see `Lost`)
+            was known at the start, or none after an exogenous event. It is True for other runs that broke a
             rule, and for inconclusive runs from whose start a safe plan is known.
     """
 
@@ -320,7 +320,9 @@ def _lost(
 ) -> Lost | None:
     """Find since when no good plan was known in a run that broke a rule, and why.
 
-    A plan is good if it satisfies the specification, or its safety requirements if a safety rule was broken.
+    The run broke either a rule tagged `@safety`, or only other rules. In the first case, a plan is good if it
+    satisfies the requirements tagged `@safety`. In the second case, a plan is good if it satisfies the whole
+    specification of the plans.
 
     Args:
         broken: the run. The first rule that it broke counts; if it broke rules tagged `@safety`, the first of
@@ -361,13 +363,14 @@ def _lost(
 def judge_runs_by_plans(
     held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
 ) -> RunVerdicts:
-    """Judge closed-loop runs by the specification of the plans, which then serves as their rules.
+    """Judge closed-loop runs by the specification of the plans, if there is no other specification for runs.
 
-    A run obeys a requirement if the requirement holds at every start instant. Otherwise the run breaks it at
-    the first start instant at which it does not hold.
+    A row is one run. A start is a sample of the run at which a requirement is evaluated. A run obeys a
+    requirement if the requirement holds at every start. Otherwise the run breaks the requirement at the first
+    start at which it does not hold.
 
     Args:
-        held: requirement -> whether it holds, (starts, rows) booleans.
+        held: requirement -> whether it holds at each start of each run, (starts, rows) booleans.
         viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
         dt: time step in seconds.
     """

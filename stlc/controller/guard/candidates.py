@@ -44,8 +44,8 @@ class Candidates:
             tagged `@safety`.
         cost: performance cost of the objective, (…); 0 where not computed.
         source: index into `SOURCES`, (…) int64.
-        prefix_length: T0, the number of first actions taken from a grid, (…) int64; 0 for plans without such
-            a prefix.
+        prefix_length: T0, the number of first actions that come from a sampled prefix, (…) int64; 0 for plans
+            without such a prefix.
     """
 
     plans: Tensor
@@ -213,8 +213,8 @@ class Limits:
             plan.
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
-        places: number of best plans of sampled shooting from which local searches start.
-        again: number of plans that each local search from these places judges.
+        places: number of plans from which local searches start after sampled shooting: its best ones.
+        again: number of plans that each of these local searches judges.
         rescue: whether to search for a plan that satisfies only phi_safe, without use of the policy, if no
             other stage found a safe plan.
         margin: name of a safety requirement -> robustness margin in the unit of the requirement. Both guards

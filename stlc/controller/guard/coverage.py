@@ -1,10 +1,10 @@
-"""Probability that the backup policy finds a satisfying plan: the paper's lower bound, and the exact value.
+"""Probability that the backup policy finds a satisfying plan: a lower bound, and the exact value.
 
 The lower bound is Theorem 1 of Meng and Fan (2023). A prefix is a sequence of T0 actions, the first of a
 plan. It is assumed that every prefix near a certain prefix u* leads to a satisfying plan. The prefix u* is
 unknown, and uniformly distributed over the control ranges. Another prefix is near u* if, at every step, each
-control differs by at most `radius` between the two. The backup policy tries the prefixes of a grid. It finds
-a satisfying plan if one of these is near u*.
+control differs by at most `radius` between the two. The backup policy tries the prefixes in which each
+control takes one of L given values. It finds a satisfying plan if one of these prefixes is near u*.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ RADII = (0.01, 0.02, 0.05, 0.1, 0.2, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One control of the grid.
+    """One control, and the values that it takes in the prefixes that the backup policy tries.
 
     Attributes:
         name: name of the control.
         low: lower end of its range.
         high: upper end of its range.
-        values: grid values in ascending order.
+        values: these values in ascending order.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Axis:
     values: tuple[float, ...]
 
     def covered(self, radius: float) -> float:
-        """Exact share of the control's range that lies within `radius` (in its unit) of a grid value."""
+        """Exact share of the control's range that lies within `radius` (in its unit) of one of `values`."""
         total, reached = 0.0, self.low
         for value in self.values:
             left, right = max(value - radius, reached), min(value + radius, self.high)
@@ -49,9 +49,9 @@ class Axis:
         return total / (self.high - self.low)
 
     def bound(self, radius: float) -> float:
-        """Lower bound of Theorem 1 on the covered share, (2 L - 4) radius / range, for L grid values.
+        """Lower bound of Theorem 1 on the covered share, (2 L - 4) radius / range, for L values.
 
-        The theorem does not account for the ends of the range, so the bound is 0 for 2 grid values or fewer.
+        The theorem does not account for the ends of the range, so the bound is 0 for 2 values or fewer.
         """
         return max(2 * len(self.values) - 4, 0) * radius / (self.high - self.low)
 
@@ -60,19 +60,21 @@ class Axis:
 class Chance:
     """Probability that the backup policy finds a satisfying plan, with prefixes of one length.
 
-    A prefix consists of the first T0 actions of a plan. The backup policy tries the prefixes of a grid. It is
-    assumed that a prefix leads to a satisfying plan if it differs from an unknown prefix u* by at most
-    `radius` in each control. All values of u* within the control ranges are equally likely.
+    A prefix consists of the first T0 actions of a plan. The backup policy tries the prefixes in which each of
+    the m controls takes one of L given values. It is assumed that a prefix leads to a satisfying plan if it
+    differs from an unknown prefix u* by at most `radius` in each control. All values of u* within the control
+    ranges are equally likely.
 
     Attributes:
         radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
             control's range.
         length: number of actions of a prefix, T0.
         candidates: number of prefixes that are tried: M = L^(m T0), or the size of the sample of them.
-        theorem: the paper's bound, a product with one factor per control and step; limited to 1.
-        bound: the same product, but with each factor limited to 1. In the paper's product a factor may exceed
-            1, because overlapping intervals around the grid values are counted more than once. Therefore
-            `theorem` may exceed the exact probability.
+        theorem: the bound of Meng and Fan (2023), a product with one factor per control and step; limited
+            to 1.
+        bound: the same product, but with each factor limited to 1. In `theorem` a factor may exceed 1,
+            because overlapping intervals around the values are counted more than once. Therefore `theorem`
+            may exceed the exact probability.
         exact: exact probability under the same assumptions; for a sample of the prefixes, a lower bound.
         sampled: whether only a sample of the prefixes is tried.
     """

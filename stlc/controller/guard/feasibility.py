@@ -54,7 +54,7 @@ def solve(
             None: plans of 3 constant pieces at the ends and middles of the control ranges (see `extremes`).
         passes: maximum number of passes.
         tries: number of plans judged per pass and state.
-        generator: random numbers of the search; a generator with seed 0 if None.
+        generator: source of the random numbers of the search; a generator with seed 0 if None.
         stop: function that returns True to end the search early.
 
     Returns:

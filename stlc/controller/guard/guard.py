@@ -32,8 +32,8 @@ class GuardDecision:
         action: (agents, m) float64, physical units.
         plan: (agents, T, m), the followed plan.
         source: (agents,) int64, an index into `SOURCES`.
-        t0: (agents,) int64, prefix length of `plan`: number of its first actions that the backup policy took
-            from a grid; 0 for the policy's own plan.
+        t0: (agents,) int64, prefix length of `plan`: number of its first actions that come from the guard's
+            sampled prefixes; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
         safe: (agents,) bool, whether `plan` satisfies phi_safe (the requirements tagged `@safety`).
         policy_rho: (agents,) float64, robustness of the policy's plan; -inf if this plan is not finite.
@@ -80,7 +80,8 @@ class Guard:
     Args:
         task: specification and system.
         policy: proposes plans.
-        mode: method that replaces a rejected plan. "paper": the paper's backup policy. "full": the stages of
+        mode: method that replaces a rejected plan. "paper": the backup policy of Meng and Fan (2023), which
+            tries sampled first actions and lets the policy plan the rest. "full": the stages of
             `stlc.controller.guard.stages`. "none": plans are judged but not replaced.
         grid: control values of the backup policy; by default those of the system file.
         limits: computational limits and robustness margins of a decision. A margin changes which plans are

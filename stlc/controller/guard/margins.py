@@ -1,11 +1,12 @@
 """Robustness margins of guards: requests on the command line, calibration, tightened tasks.
 
-A guard accepts a plan that is safe according to the model. By the time that the guard judges the rest of the
-plan, the plan has lost robustness, because the true dynamics and the true initial state differ from those of
-the model. If the margin is larger than this loss, the rest is still safe according to the model. So a safe
-plan exists. Calibration measures the loss of the policy's plans from training states. The first steps of each
-plan, until the guard judges again, are simulated with the scenario's true dynamics, and the other steps with
-the model.
+A guard accepts a plan that is safe according to the model. When the plan is executed, it loses robustness,
+because the true dynamics and the true initial state differ from those of the model. If the plan was accepted
+with a margin larger than this loss, its rest is still safe when the guard judges it. So a safe plan is known
+then.
+
+Calibration measures the loss of the policy's plans from training states. The first steps of each plan, until
+the guard judges again, are simulated with the scenario's true dynamics, and the other steps with the model.
 """
 
 from __future__ import annotations
@@ -130,8 +131,15 @@ class MarginRequest:
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
         """Return the requested margin of each safety requirement, without margins of 0.
 
-        A calibrated margin replaces `every`, and an entry of `named` replaces both. `mode`: name of the
-        guard; with "none" nothing is calibrated. `replan`: steps between two decisions of the guard.
+        The margin of a requirement is its entry in the attribute `named`. If it has none, its calibrated
+        margin is taken. If it has neither, its margin is the attribute `every`. Margins are calibrated only
+        if `share` is not None, for the given policy.
+
+        Args:
+            task: specification and system.
+            policy: policy that makes the plans.
+            mode: name of the guard; with "none" no margin is calibrated.
+            replan: number of steps between two decisions of the guard.
 
         Raises:
             UsageError: U101, a name in `named` belongs to no safety requirement.

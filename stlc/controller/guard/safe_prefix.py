@@ -1,4 +1,4 @@
-"""Upper bounds on the robustness of plan prefixes over all continuations."""
+"""Upper bounds on the robustness of plan prefixes, over all plans that continue a prefix."""
 
 from __future__ import annotations
 

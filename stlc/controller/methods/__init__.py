@@ -213,7 +213,7 @@ class Learner(ABC):
         return last | facts | {"next_look": self.next_validation}
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state that the methods `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
         self.loss = float(facts.get("loss", math.nan))

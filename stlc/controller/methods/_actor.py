@@ -81,7 +81,7 @@ class ActorLearner(Learner):
     """Reinforcement learning of an actor (a network that chooses one action per step)."""
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reason, under the name `verdicts`, why plans are judged in torch; "" if they are judged in C."""
+        """Mapping with the single key `verdicts`: the reason why plans are judged in torch; "" if in C."""
         reasons = super().torch_reasons()
         return {"verdicts": reasons["verdicts"]}
 

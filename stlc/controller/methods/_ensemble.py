@@ -254,7 +254,7 @@ class Predictor:
 
         Args:
             inputs: (k, B, inputs), where k is at most `elites`.
-            generator: random numbers of the noise.
+            generator: source of the random numbers of the noise.
 
         Returns:
             Changes in physical units, (k, B, outputs).

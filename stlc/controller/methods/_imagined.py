@@ -180,9 +180,9 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from the tensors that the method `tensors` returned.
+        """Restore the episodes from `tensors`, a result of the method of the same name.
 
-        The names in the argument lack the prefix `episodes.`.
+        The names of the tensors here lack the prefix `episodes.`.
         """
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
@@ -235,7 +235,7 @@ class LearntModel:
         Args:
             x: states, (k, B, n), where k is at most the number of networks that predict.
             u: controls within their ranges, (k, B, m).
-            generator: random numbers of the predictions.
+            generator: source of the random numbers of the predictions.
 
         Returns:
             Next states, (k, B, n).
@@ -345,7 +345,7 @@ class ModelLearner(Learner):
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state that the methods `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))

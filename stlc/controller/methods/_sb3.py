@@ -1,7 +1,7 @@
 """Soft actor-critic of stable-baselines3 over batched episodes, trained step by step.
 
-The library's own `save` writes pickles; here networks, optimisers, entropy coefficient, replay buffer and
-random numbers are stored as tensors in the run's checkpoint.
+The library's own `save` writes pickles. Here networks, optimisers, entropy coefficient, replay buffer and the
+states of the random generators are stored as tensors in the run's checkpoint.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class RandomState:
         return {"torch": self.torch, "numpy": torch.tensor([*keys.tolist(), position])}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the states that the method `tensors` returned."""
+        """Restore both states from `tensors`, a result of the method of the same name."""
         *keys, position = tensors["numpy"].tolist()
         self.torch = tensors["torch"]
         self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
@@ -291,7 +291,7 @@ class SacLearner(ActorLearner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state that the methods `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         super().restore(tensors, facts)
         model, buffer = self.model, self.model.replay_buffer
         self.actor.load_state_dict(below(tensors, "policy"))

@@ -204,7 +204,7 @@ class SoftActorCritic(nn.Module):
         return found
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the weights and optimisers that the method `tensors` returned."""
+        """Restore weights and optimisers from `tensors`, a result of the method of the same name."""
         self.load_state_dict(below(tensors, "sac.weights"))
         for name, optimizer in self.optimizers.items():
             restore_optimizer(optimizer, below(tensors, f"sac.{name}"))

@@ -254,7 +254,7 @@ class MbpoLearner(ModelLearner):
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state that the methods `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 

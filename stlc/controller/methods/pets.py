@@ -134,7 +134,7 @@ class PetsPolicy(Policy):
         Args:
             x0: states, (B, n).
             steps: number of steps.
-            generator: random numbers of the search and of the predictions.
+            generator: source of the random numbers of the search and of the predictions.
             guess: mean of the first round, (B, steps, m); None: the middle of the control ranges.
 
         Returns:
@@ -185,7 +185,7 @@ class PetsPolicy(Policy):
         Args:
             x0: states, (B, n).
             sequences: controls of P sequences per state, (B, P, steps, m).
-            generator: random numbers of the predictions.
+            generator: source of the random numbers of the predictions.
         """
         members, each = self._shape
         batch, count, steps = sequences.shape[:3]

@@ -373,7 +373,7 @@ class PpoLearner(ActorLearner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state that the methods `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
         super().restore(tensors | own, facts)
         self.network.load_state_dict(below(tensors, "network"))

@@ -82,7 +82,7 @@ class Executor(Protocol):
 
         Args:
             jobs: jobs in the order in which they start.
-            started: function that is called with each job when it starts.
+            started: function that receives each job when it starts.
         """
 
 
@@ -104,7 +104,7 @@ class LocalExecutor:
     ) -> Iterator[JobResult]:
         """Run jobs and yield the result of each when it ends.
 
-        `started` is called with each job when it starts, in another thread.
+        The function `started` receives each job when it starts; it runs in another thread.
         """
         for share in core_shares(self.workers):
             self.shares.put(share)

@@ -85,7 +85,7 @@ class PlanSearch:
         task: specification and system.
         states: initial states, (B, n) float64.
         budget: limits of the search.
-        generator: random numbers of the planner.
+        generator: source of the random numbers of the planner.
         start: initial guesses of plans, (B, T, m); the middle of every control range if none were given.
         plans: the best plans found, (B, T, m).
         rho: robustness of these plans, (B,); -inf before the first plan.
@@ -271,7 +271,7 @@ def plan(
         budget: limits of the search; by default `SECONDS` of processor time per initial state.
         seed: seed of the planner's random numbers.
         start: initial guesses of plans, (B, T, m).
-        progress: function that is called with the search after each round.
+        progress: function that receives the search after each round.
         options: options of the planner.
 
     Returns:

@@ -98,7 +98,7 @@ class Environments:
         task: specification and system.
         count: number of episodes, N.
         reward: name of the reward.
-        generator: random numbers for the initial states.
+        generator: source of the random numbers for the initial states.
         ahead: number of initial states that are drawn at a time, since drawing few is slow; 0: `count`.
 
     Raises:

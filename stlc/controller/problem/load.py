@@ -33,7 +33,7 @@ def load_task(
         system: system file, searched by `find_system`; by default the one that the specification names.
         overrides: constants of the specification and keys of the system file to change, name -> text.
         hint: what the user may do if no system is named.
-        found: function that is called with the path of the system file before it is read.
+        found: function that receives the path of the system file before it is read.
 
     Raises:
         UsageError: U101, no system is named; U102, there is no such file.

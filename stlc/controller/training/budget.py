@@ -109,8 +109,9 @@ class TimeBudget:
             now: function that reads the clock, in seconds.
             started: clock reading at the start.
             allowed: the user's budget in seconds; 0: unlimited.
-            late: function from a budget in seconds to the predicted number of seconds by which the whole
-                command would exceed it, because of other work such as loading. None: no excess.
+            late: function that receives `allowed`. It predicts by how many seconds the whole command would
+                exceed this budget if the training used all of it; loading, for example, takes time too.
+                None: the command takes no more time than the training.
         """
         over = late(allowed) if allowed and late is not None else 0.0
         return cls(now, started, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))

@@ -1,7 +1,7 @@
 """Diagnosis of failed training runs.
 
-It finds a declared mirror symmetry that the system lacks, a non-finite quantity in a training step, or a
-requirement that no plan satisfies.
+The diagnosis finds a declared mirror symmetry that the system lacks, a non-finite quantity in a training
+step, or a requirement that no plan satisfies.
 
 A training step computes, in this order: plans from the network, states, the robustness of each requirement
 and the performance terms, gradients. The first quantity that is not finite is reported. If a search finds no
@@ -280,7 +280,11 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
 
 
 def refuted(task: Task) -> bool:
-    """True if bounds prove that some requirement is violated by every plan, from each fixed initial state."""
+    """True if bounds prove that one of the requirements cannot be satisfied.
+
+    That is: every plan violates this requirement, from every initial state that was tested. The tested states
+    are `STARTS` random ones, the same in each diagnosis.
+    """
     return any(_impossible(task, rule) for rule in task.rules)
 
 
@@ -289,19 +293,19 @@ def _alone(task: Task, rules: Sequence[CompiledRequirement]) -> Task:
 
 
 def _starts(task: Task) -> torch.Tensor:
-    """Fixed initial states for the diagnosis: random ones with a fixed seed, (STARTS, n)."""
+    """Initial states that the diagnosis tests, (STARTS, n): random ones, the same in each diagnosis."""
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
 def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
-    """Search for plans from the fixed initial states that satisfy the requirements `rules` alone."""
+    """Search, from the tested initial states, for plans that satisfy the requirements `rules` alone."""
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
     return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """True if exploration from a few fixed initial states finds a plan that satisfies `rules` alone."""
+    """True if exploration from two of the tested initial states finds a plan that satisfies `rules` alone."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
@@ -349,7 +353,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Sentence for a message: how many plans the search tried, and that this is no proof.
+    """Sentence for a message: how many plans the search tried, and that this is not a proof.
 
     `core`: the conflicting requirements.
     """
@@ -368,7 +372,10 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _impossible(task: Task, rule: CompiledRequirement) -> bool:
-    """True if bounds prove that every plan from each fixed initial state violates the requirement."""
+    """True if bounds prove that every plan violates the requirement, from each of the tested initial states.
+
+    See `_starts` for these states.
+    """
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
 

@@ -5,8 +5,9 @@ goal without losing another. Therefore plans are built from prefixes here. For e
 continuations show which parts of the specification are violated by every continuation, which are satisfied by
 every continuation, and which are open. Prefixes with a violated part are dropped. The others form layers, one
 per length. Two prefixes of a layer are in the same cell if they satisfy the same parts and end in the same
-region of the state space. A layer keeps only the best prefix of each cell. Advanced prefixes and those in
-rarely visited cells are extended first (Ecoffet et al. 2021, "First return, then explore").
+region of the state space. A layer keeps only the best prefix of each cell. Prefixes that satisfy many parts,
+and prefixes in rarely visited cells, are extended more often than others (Ecoffet et al. 2021, "First return,
+then explore").
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Layer:
         states: predicted trajectories, (rows, steps + 1, n).
         plans: controls, (rows, steps, m).
         met: True where a piece is satisfied by every continuation of a prefix, (rows, pieces).
-        kind: whole numbers that describe each prefix, (rows, entries): its satisfied pieces, and the rounded
+        kind: integers that describe each prefix, (rows, entries): its satisfied pieces, and the rounded
             values of its timers. Prefixes with equal rows are of the same kind.
         worth: sum of the lower bounds on the robustness of undecided pieces, (rows,).
         visits: number of times that each prefix was extended, (rows,).
@@ -157,7 +158,7 @@ class Exploration:
         Args:
             x: the initial state, (n,).
             sweeps: maximum number of sweeps; a sweep extends every layer (the prefixes of one length) once.
-            generator: random numbers of the exploration.
+            generator: source of the random numbers of the exploration.
             enough: function that is called before each sweep after the first; the exploration ends once it
                 returns True.
         """
@@ -196,7 +197,7 @@ class Exploration:
         Args:
             starts: initial states, (k, n).
             sweeps: total number of sweeps for plans of `USUAL` steps; fewer for longer plans.
-            generator: random numbers of the exploration.
+            generator: source of the random numbers of the exploration.
             spare: a local search improves each plan found until its robustness is `spare`.
             enough: function that is called repeatedly; the exploration ends once it returns True.
 

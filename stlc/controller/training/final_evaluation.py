@@ -38,7 +38,7 @@ class TrainingOutcome:
         score: result on held-out states; None if training was interrupted. Of several ranks (processes) only
             the first has a score.
         seconds: duration of the training, evaluation on held-out states included.
-        interrupted: whether `Watch.stop` ended it.
+        interrupted: whether the user ended the training before its last step.
         ranks: number of processes that trained together.
         why: if no plan was found from any initial state, the diagnosis of the conflicting requirements; else
             None.
@@ -65,7 +65,7 @@ class FinalEvaluation:
         task: problem that the policy was trained for.
         config: resolved options of the run.
         time: time budget of the run.
-        report: function that is called with the progress as a short text.
+        report: function that receives the progress as a short text.
         trained: clock reading at the end of the training, when the evaluation begins.
     """
 

@@ -401,7 +401,7 @@ class Trainer(Learner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from what `tensors` and `facts` returned."""
+        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         tensors, facts = self._restored(tensors, facts)
         super().restore(tensors, facts)
         self.accuracy = float(facts["accuracy"])

@@ -1,10 +1,11 @@
 """Plan repair by batched local search on the exact robustness, starting from the policy's own plan.
 
-The robustness gradient of a requirement such as stopping in a zone vanishes outside of the zone, and
-gradients do not lead across an obstacle; a search has neither problem. Each generation judges a batch of
-changed plans per state and retains the best. Changes are noise over a random interval of time, a constant
-shift over an interval, a random constant over an interval, and plans that solved other states. The native
-kernel runs the search if there is one, otherwise torch.
+For some requirements, such as stopping in a zone, the gradient of the robustness vanishes outside of the
+zone. Gradients also do not lead across an obstacle. A search has neither problem. In every generation, a
+batch of changed plans is judged for each state, and the best plan is retained. There are four kinds of
+change. Within a random time interval, noise is added, or a constant is added, or the controls are replaced by
+a random constant. Or the whole plan is replaced by one that solved another state. The search runs in the
+native kernel (compiled code) if there is one, otherwise in torch.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class Search:
     """A local search that runs concurrently with other work.
 
     Its result depends on states, plans, seed and plan library alone, not on timing, interruption or restart.
-    The native kernel runs on a thread of its own; torch runs in `advance`.
+    A search by the native kernel (compiled code) runs on a thread of its own. A search in torch runs inside
+    the method `advance`.
 
     Attributes:
         states: initial states, (B, n).
@@ -208,10 +210,11 @@ class Searcher:
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
-        """Prepare a native search, with copies of its inputs.
+        """Prepare a search in compiled code; its inputs are copied.
 
         Returns:
-            Function from a stop condition to the result, which runs the search on `threads` threads.
+            Function that runs the search on `threads` threads and returns the result. Its argument is a
+            condition that ends the search early.
         """
         native = self.task.native
         assert native is not None

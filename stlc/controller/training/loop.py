@@ -69,14 +69,16 @@ class Watch:
     """Callbacks of a training run.
 
     Attributes:
-        started: called once with the resolved options, the margin and the number of steps.
-        row: called with every row of `train.jsonl`.
-        stop: called after every step; True saves and ends the training.
-        deferring: context manager around the steps. Inside it, an interrupt is deferred until the present
-            step is finished and saved. Outside it, an interrupt may be raised anywhere.
-        late: function from a budget of wall time, in seconds, to the predicted number of seconds by which the
-            whole command would exceed it, because of other work such as loading.
-        evaluating: called with the progress of the final evaluation, as a short text.
+        started: receives, at the start, the options of the run. Among them are `margin`, the robustness that
+            plans are trained to reach, and `steps`, the number of training steps.
+        row: receives every row of `train.jsonl`.
+        stop: is called after every step. If it returns True, the state is saved and the training ends.
+        deferring: makes a context manager, which is active during the steps. Inside it, an interrupt is
+            deferred until the present step is finished and saved. Outside it, an interrupt may be raised
+            anywhere.
+        late: receives a budget of wall time in seconds. It predicts by how many seconds the whole command
+            would exceed the budget if the training used all of it; loading, for example, takes time too.
+        evaluating: receives the progress of the final evaluation, as a short text.
     """
 
     started: Callable[[dict[str, Any]], None] = lambda _chosen: None
@@ -107,7 +109,7 @@ def train(
 
     Raises:
         SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
-            S304, the declared mirror is no symmetry of the system or the specification.
+            S304, the declared mirror is not a symmetry of the system or the specification.
         MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, the process
             of another rank has ended or does not answer.
         RunError: R401, the loss or its gradient is not finite.

@@ -1,4 +1,4 @@
-"""Training loss: truncated robustness plus performance terms, as in Meng and Fan (2023, Eq. 8 to 10)."""
+"""Training loss: robustness up to a margin, plus performance terms (Meng and Fan 2023, Eq. 8 to 10)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ class Objective:
         margin: gamma; robustness above it does not reduce the loss.
         smoothing: k of smooth min and max; None: exact min and max with subgradients.
         switch: functions whose derivatives replace the derivatives of jumps and conditions in the dynamics.
-        saturation: s of `s log(1 + hinge / s)`, which keeps infeasible states from dominating; None: plain
-            hinge.
+        saturation: s in the loss term s log(1 + hinge / s), where hinge is max(margin - robustness, 0). This
+            term grows slowly, so that states without a satisfying plan do not dominate the loss. None: the
+            hinge itself is the loss term.
         stl_weight: lambda, the weight of the hinge on robustness.
         performance_weight: weight of the performance terms.
     """

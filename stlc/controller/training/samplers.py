@@ -42,7 +42,7 @@ class Supply(ABC):
     """
 
     state: ClassVar[tuple[str, ...]] = ("block",)
-    """Attributes that determine the next states."""
+    """Names of the attributes that determine the next states."""
 
     def __init__(self, task: Task, generator: torch.Generator, device: torch.device) -> None:
         self.task, self.generator, self.device = task, generator, device
@@ -70,7 +70,7 @@ class Supply(ABC):
         return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state from what `tensors` returned."""
+        """Restore the state from `tensors`, a result of the method of the same name."""
         for name in self.state:
             setattr(self, name, tensors[name].to(self.device))
 
@@ -109,7 +109,7 @@ class FixedSet:
         return {"states": self.states, "queue": self.queue}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state from what `tensors` returned."""
+        """Restore the state from `tensors`, a result of the method of the same name."""
         self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))
 
 

@@ -258,7 +258,7 @@ class _Draws:
         self.failed = len(reader.findings) > before
 
     def _draw(self, entry: Entry, where: str) -> None:
-        """Append the assignments that draw the initial value of one state (`entry`).
+        """Append to `found` the assignments that draw the initial value of one state (`entry`).
 
         `where` names the section in messages.
         """
@@ -270,14 +270,14 @@ class _Draws:
         self.ready |= {column.name for column in columns}
 
     def _needed(self, node: Node) -> None:
-        """Append the assignments of the local names (from `let`) that the expression `node` mentions."""
+        """Append to `found` the assignments of the local names (from `let`) that `node` reads."""
         texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
         for name in list(self.unresolved):
             if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
                 self._let(name)
 
     def _let(self, name: str) -> None:
-        """Append the assignment of the local name `name` (from `let`).
+        """Append to `found` the assignment of the local name `name` (from `let`).
 
         The assignments of the local names that it reads are appended first.
         """

@@ -47,8 +47,9 @@ class Expressions:
     Attributes:
         reader: collects the findings.
         scope: table of the names that expressions may use.
-        ready: columns that already have a value; None means all. Reading another column is an error.
-        amounts: True where numbers are added to columns, as in a disturbance. Then 5 degC is a temperature
+        ready: names (of states, parameters or local names) that already have a value; None means all. It is
+            an error to read another one.
+        amounts: True where numbers are added to states, as in a disturbance. Then 5 degC is a temperature
             difference, otherwise a temperature.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
             nothing.
@@ -65,8 +66,8 @@ class Expressions:
     ) -> Expressions:
         """Return a compiler that also knows the names in `entries`.
 
-        With `samplers`, functions such as `uniform` are known too. `ready` are the columns that already have
-        a value; None means all.
+        With `samplers`, functions such as `uniform` are known too. `ready` are the names (of states,
+        parameters or local names) that already have a value; None means all.
         """
         return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 

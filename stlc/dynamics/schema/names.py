@@ -178,7 +178,8 @@ class Context:
     def drawing(self, entries: MappingType[str, Entry], ready: frozenset[str] | None = None) -> Context:
         """Return this context with functions such as `uniform`, and with the additional names `entries`.
 
-        `ready` are the columns that already have a value, and may be read; None means all.
+        `ready` are the names (of states, parameters or local names) that already have a value, and may
+        therefore be read; None means all.
         """
         return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
 

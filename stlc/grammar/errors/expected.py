@@ -1,4 +1,4 @@
-"""Diagnostic E010, for a syntax error that is no common mistake: the expected tokens, and a repair.
+"""Diagnostic E010, for a syntax error that is not a common mistake: the expected tokens, and a repair.
 
 A message names the terminals (kinds of token) of the grammar in words, one by one or as a class. A repair is
 offered only if the repaired text parses.
@@ -53,7 +53,7 @@ _BEFORE_FORMULA = frozenset(
 
 
 def expected(failure: ParseFailure) -> Diagnostic:
-    """Return the diagnostic E010, with the expected tokens, for an error that is no common mistake."""
+    """Return the diagnostic E010, with the expected tokens, for an error that is not a common mistake."""
     repair = _repair(failure)
     if repair is not None:
         return repair
@@ -101,7 +101,7 @@ _NEAR_BY, _LEAST_LETTERS = 4, 3
 
 
 def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
-    """Return the finding for a number followed by a word that is no unit, such as `5 furlong`; else None."""
+    """Return the finding for a number before a word that is not a unit, such as `5 furlong`; else None."""
     found, previous = failure.found, failure.previous
     if found is None or previous is None or previous.kind != "number" or found.kind != "word":
         return None

@@ -81,8 +81,8 @@ def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 def hangs(text: Text, start: int, end: int) -> bool:
     """True if the body of a declaration may begin on the line of the `=` and continue below it.
 
-    This holds if its tokens, from `start` to `end`, are one bracket, with or without a name before it, as in
-    `circle(…)`.
+    This is the case if the body, the tokens from `start` to `end`, is a single pair of brackets with its
+    contents. A name may stand before the bracket, as in `circle(…)`.
     """
     last = end - 1
     opening = text.partner.get(last, last)

@@ -66,7 +66,8 @@ class CauseNode:
             instant of the window; `sample` is the first one. Otherwise None.
         reads: for a predicate, pairs (signal, offset): it reads the signal `offset` samples after `sample`.
         parts: the children, which explain this node; empty for a predicate.
-        main: index in `parts` of the child on the main path. Its value is the robustness of the sub-formula.
+        main: index in `parts` of the child on the main path. The robustness of this child determines that of
+            the sub-formula.
         premise: whether the sub-formula is the left side of an implication.
         moves: whether the robustness of the sub-formula changes if only the value of the deciding predicate
             (`leaf`) changes. Example of False: a `freeze` stores the value of a signal at a sample, and the

@@ -64,7 +64,7 @@ class Tracker(Protocol):
         """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at the instants `starts` after the trace has ended.
+        """Final bounds on the robustness at the instants `starts`, as no more samples follow.
 
         A window that extends to the end of the trace now ends with the last sample.
         """

@@ -1,8 +1,8 @@
 """Time series of robustness values that grow sample by sample.
 
-Only rows that the windows of a formula still need are stored. Such a time series is called a column. There is
-a least and a greatest value of each row, over all continuations of the trace. The two are equal where nothing
-is unknown.
+Such a time series is called a column. It has one row per sample; only the rows that a formula still needs are
+stored. For each row there are two values: the least and the greatest robustness over all continuations of the
+trace. They are equal if no later sample can change the robustness.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ColumnReader:
     The order of computation is cached for every range of rows.
 
     Args:
-        formulas: formulas to evaluate; each of their predicates is the value of a column.
+        formulas: formulas to evaluate; each of their predicates stands for a column.
         end: value of a column after its last row: -inf if "lower", +inf if "upper". If "both", a column has
             two parts side by side, one for each of these cases. If "truncate", windows are clipped at the
             last row.
@@ -137,7 +137,8 @@ class Side:
             values are stored side by side, (rows, 2). If "truncate", windows are clipped at the last sample.
         beyond: number of instants after the last sample at which the formula reads its columns.
         truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
-        least: bound on a predicate that reads unknown samples (NaN): True lower, False upper, None both.
+        least: bound that is computed for a predicate that reads unknown samples (NaN). True: the lower bound;
+            False: the upper bound; None: both.
         rows: column name -> view of its stored rows, the first of which is sample `base`.
         history: storage of the rows.
     """

@@ -21,7 +21,7 @@ class ColumnHistory:
 
     Args:
         beyond: number of rows stored after the last sample.
-        fill: value of rows that are not written yet: one number, or one per column of the array.
+        fill: value of rows that are not written yet: one number, or one number per entry of a row.
 
     Attributes:
         first: index of the first stored sample.

@@ -55,9 +55,10 @@ class Margin:
 
 @dataclass(slots=True)
 class _Watched:
-    """A requirement, and its counts over window starts (the samples at which it is evaluated).
+    """A requirement, and the number of its violations on each trace.
 
-    A window start is settled if later samples can no longer change the robustness there.
+    A window start is a sample at which the requirement is evaluated. It is settled if later samples can no
+    longer change the robustness there.
 
     Attributes:
         rule: the requirement.
@@ -101,10 +102,14 @@ class _Watched:
         return max(self.next - history(self.rule.formula), 0)
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """Return the margin of the requirement at the latest sample, and update the counts.
+        """Return the margin of the requirement at the latest sample.
 
-        The latest sample has the index `samples` - 1. `env` contains the stored samples of each signal,
-        (stored, traces), beginning with sample `first`.
+        The attributes `violated`, `next` and `last` are updated.
+
+        Args:
+            env: signal -> its stored samples, (stored, traces), beginning with sample `first`.
+            first: index of the first stored sample.
+            samples: number of samples received; the latest one has the index `samples` - 1.
         """
         if not self.everywhere and self.next:
             assert self.last is not None
@@ -132,7 +137,7 @@ class _Watched:
         return self.last
 
     def _settled(self, samples: int) -> int:
-        """The first window start at which more than `samples` samples may still change the robustness."""
+        """The first window start at which the robustness may still change after `samples` samples."""
         if self.ahead is None:
             return 0
         whole = max(samples - self.ahead, 0)

@@ -211,7 +211,7 @@ class PacedTracker:
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at instants `starts` after the trace has ended."""
+        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:

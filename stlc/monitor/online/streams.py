@@ -72,7 +72,7 @@ class ColumnPlan:
     Attributes:
         formula: the formula, in which columns replace the predicates and unbounded past operators.
         streams: the columns; each one depends only on signals and on columns before it.
-        lag: number of the latest rows of the columns that later samples may still change.
+        lag: number of rows at the end of the columns that later samples may still change.
     """
 
     formula: ir.Formula

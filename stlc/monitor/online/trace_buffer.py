@@ -1,6 +1,6 @@
 """Buffer of the latest samples of a stream, from which causes of violations are found.
 
-A cause that older samples show is found and stored before these samples are dropped.
+The cause of a violation is found and stored before the samples that show it are dropped.
 """
 
 from __future__ import annotations

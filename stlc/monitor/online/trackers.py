@@ -89,9 +89,9 @@ def first_needed(planned: ColumnPlan, samples: int) -> int:
 class _CutTracker(ABC):
     """Base of evaluators for requirements whose windows may be clipped at the end of the trace.
 
-    An instant is settled if no later sample can change its value. If windows are clipped, this is already
-    done at settled instants. At all other instants, windows keep their full length, and bounds are computed
-    in which later samples are unknown.
+    An instant is settled if no later sample can change its value. If windows are to be clipped, they are
+    clipped at settled instants even while the trace continues. At all other instants, windows keep their full
+    length, later samples are unknown, and bounds are computed.
     """
 
     __slots__ = ()
@@ -99,7 +99,7 @@ class _CutTracker(ABC):
     @property
     @abstractmethod
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """The first instant at which a later sample may still change the robustness."""
 
     @property
     @abstractmethod
@@ -134,7 +134,7 @@ class _CutTracker(ABC):
         return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """Return bounds at instants `starts` after the trace has ended."""
+        """Return final bounds on the robustness at the instants `starts`, as no more samples follow."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -305,7 +305,7 @@ class IntervalTracker:
 
     Attributes:
         shared: the shared columns.
-        which: number of the formula among those that share the columns.
+        which: index of the formula among those that share the columns.
         ahead: lookahead in samples.
     """
 
@@ -334,7 +334,10 @@ class IntervalTracker:
         return Bounds(*self.shared.values(self.which, start, stop).T)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at instants `starts` after the trace has ended; samples after its end stay unknown."""
+        """Final bounds on the robustness at the instants `starts`, as no more samples follow.
+
+        If the formula reads samples after the end of the trace, these stay unknown.
+        """
         return self.live(starts.start, starts.stop)
 
     def drop(self, start: int) -> int:
@@ -348,11 +351,11 @@ class PlanningWindowTracker(_ColumnTracker):
     """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
 
     The planning window of instant k ends with sample k + `window`. The value at k depends only on samples up
-    to this one.
+    to k + `window`.
 
     An interval in the formula may extend beyond the planning window. Predicates are then unknown beyond the
-    window, but past operators evaluated there still read samples inside it. In this case samples are
-    processed one by one: the value at k is stored as soon as sample k + `window` arrives.
+    window, but past operators that are evaluated there still read samples inside the window. In this case
+    samples are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
 
     Attributes:
         window: samples from an instant to the end of its planning window.
@@ -463,7 +466,7 @@ class UnboundedTracker:
 
     @property
     def settled(self) -> int:
-        """Always 0: the value may change until the end of the trace."""
+        """The first instant whose value may still change: always 0, as any later sample may change it."""
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
@@ -481,7 +484,7 @@ class UnboundedTracker:
         return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at instants `starts` after the trace has ended."""
+        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
@@ -570,7 +573,7 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> Bounds:
-        """Bounds at instants `starts` after the trace has ended."""
+        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
 

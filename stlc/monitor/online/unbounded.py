@@ -1,13 +1,14 @@
 """Formulas with windows to the end of the trace, evaluated at one sample in bounded memory.
 
-The trace is divided at a sample called the frontier. Example: `always p` is the minimum of two numbers, the
-least `p` before the frontier, and `always p` from the frontier on. The first number is known and takes
-constant memory. The second number may still change.
+The trace is divided at a sample called the frontier. Example: the robustness of `always p` is the minimum of
+two numbers. The first is the least robustness of p before the frontier. It is known, and takes constant
+memory. The second is the robustness of `always p` from the frontier on. It may still change.
 
-In general, the value of the formula is a polynomial of minima and maxima. Its variables are the values that
-the unbounded operators have from the frontier on. Its coefficients depend only on the samples before the
-frontier, which can therefore be dropped. There is one coefficient for each subset of the variables. It is the
-value of the formula if these variables are +inf and all others are -inf.
+In general, the value of the formula is a function of such unknown numbers, the variables: the values that the
+unbounded operators have from the frontier on. The function consists of minima and maxima only. It is
+therefore determined by its values, called coefficients, for variables that are +inf or -inf. There is one
+coefficient for each subset of the variables: the variables in the subset are +inf, and all others are -inf.
+The coefficients depend only on the samples before the frontier, so these samples can be dropped.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ class UnboundedOperators:
         root: the formula over columns.
         parts: column `$k` -> the subformula that it replaces.
         origins: column `!k` -> its operator in the formula, with the original window.
-        operators: column `!k` -> formula for the value of its operator. It combines the columns `$0`, `$1`, …
-            on the samples received with the column `!k`.
+        operators: column `!k` -> formula for the value of its operator. The formula combines the columns
+            `$0`, `$1`, … (samples received) with the column `!k` (later samples).
     """
 
     root: ir.Formula
@@ -135,11 +136,11 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
 
 
 def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Return the name of the column for the value of `origin` on samples not yet received.
+    """Return the name of the column that stands for the unknown value of `origin` on future samples.
 
     `origin` is an unbounded operator. The column is added to `found` if it is missing. Two operators share a
     column only if they are written in the same way: `next (always p)` and `always (next p)` get two columns.
-    They read the same signals, but their values differ at the end of the trace.
+    Both operators read the same samples, but their values differ at the end of the trace.
     """
     return _column_of(origin, found.origins, "!")
 
@@ -159,9 +160,10 @@ def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], pref
 def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
     """Rewrite an unbounded `until` or `release`, so that received and later samples are separated.
 
-    An `until` holds in two cases. It may be satisfied on the samples received. Or its left side is true on
-    all of these samples, and the `until` is satisfied on the later ones. The value on later samples is
-    unknown: a column (time series) of its own stands for it. For `release`, exchange `and` and `or`.
+    An `until` is true in two cases. In the first case, the samples received satisfy it. In the second case,
+    its left side is true on all of these samples, and the later samples satisfy the `until`. The value of the
+    `until` on later samples is unknown. A new column (time series) stands for it. For `release`, exchange
+    `and` and `or`.
     """
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
     name = _rest(DelayedFormula(node, steps), found)
@@ -192,14 +194,15 @@ def _neutral(origin: DelayedFormula) -> float:
 class UnboundedState:
     """Lower or upper bound on a formula with unbounded windows, computed incrementally.
 
-    The bound is a polynomial of minima and maxima, which the docstring of the module explains. Its variables
-    are the values that the unbounded operators have from sample `at`, the frontier, on.
+    The samples before the frontier `at` are summarized in coefficients, as the docstring of the module
+    explains. The bound is computed from these coefficients and from the values that the unbounded operators
+    have from the frontier on.
 
     Attributes:
-        bones: the formula, decomposed into its unbounded operators and the other subformulas.
+        bones: the decomposition of the formula into its unbounded operators and its other subformulas.
         side: columns (time series) of the predicates and past operators, evaluated for the bound.
         begin: the sample at which the formula is evaluated.
-        at: the frontier. The coefficients account for all samples before it.
+        at: the frontier, a sample. The coefficients summarize all samples before it.
         coefficients: one row per subset of the operators, (subsets, traces). A coefficient is the value of
             the formula if the operators of the subset are +inf from `at` on, and the others -inf. None before
             the first `advance`.
@@ -227,9 +230,11 @@ class UnboundedState:
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
-        """Move the frontier `at` to sample `settled`.
+        """Move the frontier `at` to sample `settled`, and update `coefficients`.
 
-        The coefficients of the polynomial then account for all samples before `settled`.
+        The coefficients then summarize all samples before `settled`, so that these can be dropped. They
+        describe how the value of the formula depends on the still unknown values of the unbounded operators
+        from `settled` on.
         """
         count = settled - self.at
         if count <= 0:
@@ -291,13 +296,11 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Evaluate the polynomial at several points.
+        """Return the values (points, traces) of the formula at several points.
 
-        A point is one value for every variable, that is, for every unbounded operator. `rests` contains the
-        points, (operators, points, traces).
-
-        Returns:
-            Values of the formula, (points, traces).
+        A point consists of one value for each unbounded operator: its value from the frontier on. `rests`
+        contains the points, (operators, points, traces). The values of the formula follow from these and
+        `coefficients`.
         """
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)

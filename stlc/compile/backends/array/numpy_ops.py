@@ -163,7 +163,7 @@ class NumpyOps:
         return np.full(shape, value, dtype=like.dtype)
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """Array that counts `first`, `first + 1`, … along time."""
+        """Array with the numbers `first`, `first + 1`, …, `first + count - 1` along time."""
         numbers = np.arange(first, first + count, dtype=like.dtype)
         return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
 

@@ -284,7 +284,7 @@ class CasadiOps:
         return SymbolicColumn(casadi.SX([value] * (shape[0] if shape else 1)))
 
     def counted(self, first: int, count: int, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """Time series that counts `first`, `first + 1`, …."""
+        """Time series of the numbers `first`, `first + 1`, …, `first + count - 1`."""
         return SymbolicColumn(casadi.SX([float(k) for k in range(first, first + count)]))
 
     def empty(self, shape: tuple[int, ...], like: SymbolicColumn) -> SymbolicColumn:

@@ -195,7 +195,10 @@ class OnnxOps:
         return known.expand(*(1 if length == BATCH else length for length in shape))
 
     def counted(self, first: int, count: int, like: Value) -> Value:
-        """Array that counts `first`, `first + 1`, … along time; an unknown batch size becomes 1."""
+        """Array with the numbers `first`, `first + 1`, …, `first + count - 1` along time.
+
+        The other dimensions are those of `like`. An unknown batch size becomes 1.
+        """
         numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
         return numbers.expand(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 

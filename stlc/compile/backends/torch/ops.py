@@ -293,7 +293,7 @@ class TorchOps:
         return torch.stack(list(parts))
 
     def counted(self, first: int, count: int, like: Tensor) -> Tensor:
-        """Array that counts `first`, `first + 1`, … along time."""
+        """Array with the numbers `first`, `first + 1`, …, `first + count - 1` along time."""
         numbers = torch.arange(first, first + count, dtype=like.dtype, device=like.device)
         return numbers.view(-1, *(1,) * (like.ndim - 1)).expand(count, *like.shape[1:])
 

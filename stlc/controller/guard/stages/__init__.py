@@ -1,8 +1,9 @@
 """Stages of guards, one per file; each declares to which guards it belongs and its position in their order.
 
-A stage is one method to find a better plan. A guard runs its stages in order; each proposes plans for the
-agents that it may still help, and the highest-ranked plan (`stlc.controller.guard.candidates.rank`) of each
-agent is kept. A file holds a class `STAGE`; files whose names begin with `_` hold shared code.
+A stage is one method to find a better plan. A guard runs its stages in order. Each stage proposes plans for
+the agents whose plan it may still improve. Of all plans of an agent, the highest-ranked one is kept
+(`stlc.controller.guard.candidates.rank`). A file holds a class `STAGE`; files whose names begin with `_` hold
+shared code.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Setup:
         grid: values of the controls in prefixes, and lengths of prefixes.
         limits: computational limits of a decision.
         guard: name of the guard.
-        generator: random numbers for the searches of all stages.
+        generator: source of the random numbers for the searches of all stages.
     """
 
     task: Task

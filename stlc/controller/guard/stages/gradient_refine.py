@@ -64,7 +64,7 @@ class GradientAscent:
 
     Args:
         task: specification and system.
-        generator: random numbers of the perturbations, which are drawn once.
+        generator: source of the random numbers of the perturbations, which are drawn once.
         enough: target robustness; the ascent of an agent's plans ends once one of them reaches it.
     """
 

@@ -1,4 +1,4 @@
-"""Longest safe prefix: the paper's last resort where no plan is safe over the whole horizon."""
+"""Longest safe prefix: the last resort of Meng and Fan (2023) if no plan is safe over the whole horizon."""
 
 from __future__ import annotations
 

@@ -1,11 +1,13 @@
-"""Prefix shooting: sampled prefixes, continued by the policy (the paper, section "MPC-based Deployment").
+"""Prefix shooting: plans that begin with one of many prefixes (first actions), after which the policy plans.
 
-The lengths T0 = 1, 2, … are tried in turn. The prefixes of a length are all sequences of T0 actions on a grid
-of L values for each of m controls. There are M = L^(m T0) such prefixes; if M is too large, a random sample
-is tried. Each prefix is applied from the present state, and the policy plans from its end. The search ends at
-the first T0 with which a plan satisfies the specification, or at least the requirements tagged `@safety`. One
-addition to the paper (decision record 37 in `docs/decisions`): the remainder of the previous plan is also a
-candidate, so that a safe plan is not lost after its first action.
+The method is that of Meng and Fan (2023), section "MPC-based Deployment". The prefix lengths T0 = 1, 2, … are
+tried in turn. A prefix of length T0 is a sequence of T0 actions in which each of the m controls has one of L
+values. There are M = L^(m T0) such prefixes; if M is too large, a random sample is tried. Each prefix is
+applied from the present state, and the policy plans from the state that the prefix leads to. The search ends
+at the first T0 with which a plan satisfies the specification, or at least the requirements tagged `@safety`.
+
+The remainder of the previous plan is also a candidate, so that a safe plan is not lost after its first
+action. This is not in the paper (decision record 37 in `docs/decisions`).
 """
 
 from __future__ import annotations

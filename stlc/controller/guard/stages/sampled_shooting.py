@@ -1,7 +1,8 @@
-"""Sampled shooting: a few sampled actions, then the policy's plan from there.
+"""Sampled shooting: plans that begin with a few sampled actions (a prefix), after which the policy plans.
 
-The paper's backup policy tries all prefixes of the length T0 = 1, then those of the next length, and so on.
-Here samples of all lengths are judged in one batch, and local search starts from the best plans.
+The backup policy of Meng and Fan (2023) tries all prefixes with one action, then all with two, and so on.
+Here a sample of the prefixes of every length is judged in one batch. Local search then starts from the best
+plans.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class SampledPrefixes:
-    """Prefixes (first actions of plans), sampled once; the policy plans from their ends.
+    """Sample of prefixes (first actions of plans), drawn once; the policy plans the actions after a prefix.
 
     Args:
         task: specification and system.
@@ -91,7 +92,7 @@ class SampledShooting(GuardStage):
         """Mask of the agents whose plan does not satisfy the specification.
 
         If `Limits.rescue` is True, agents without a safe plan are excluded, because the stage of random
-        restarts has already searched for one. All False if the grid has no prefixes.
+        restarts has already searched for one. All False if there are no prefixes.
         """
         none = len(self.prefixes.heads) == 0
         return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
