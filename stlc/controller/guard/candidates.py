@@ -234,9 +234,10 @@ class Limits:
 
 
 def grid_of(task: Task) -> PrefixGrid:
-    """Grid of control values and prefix lengths for the backup policy, from the system file.
+    """Prefixes that the backup policy tries, as the system file declares them.
 
-    Without `levels` in the file, the values of a control are evenly spaced over its range.
+    They are given by the values of each control, and by their lengths. Without `levels` in the file, the
+    values of a control are evenly spaced over its range.
     """
     decl = task.system.decl
     values = tuple(

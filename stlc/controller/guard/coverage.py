@@ -89,7 +89,7 @@ class Chance:
 
 
 def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
-    """The controls of a task with their grid values."""
+    """The controls of a task, with the values that they take in the prefixes of `grid`."""
     controls = zip(task.system.decl.controls, grid.values, strict=True)
     return tuple(Axis(each.name, each.low, each.high, tuple(sorted(values))) for each, values in controls)
 
@@ -97,17 +97,17 @@ def axes_of(task: Task, grid: PrefixGrid) -> tuple[Axis, ...]:
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
     """Compute the probability that the backup policy finds a satisfying plan with prefixes of one length.
 
-    A prefix consists of the first `length` actions of a plan. The backup policy tries the prefixes of the
-    grid that `axes` describes. It is assumed that a prefix leads to a satisfying plan if it differs from an
-    unknown prefix u* by at most `radius` in each control. All values of u* within the control ranges are
-    equally likely.
+    A prefix consists of the first `length` actions of a plan. The backup policy tries the prefixes in which
+    each control takes one of its values in `axes`. It is assumed that a prefix leads to a satisfying plan if
+    it differs from an unknown prefix u* by at most `radius` in each control. All values of u* within the
+    control ranges are equally likely.
 
-    If the grid has M > `samples` prefixes, a sample of them is drawn with replacement. A given prefix is then
+    If there are M > `samples` prefixes, a sample of them is drawn with replacement. A given prefix is then
     tried with probability 1 - (1 - 1 / M)^samples; `bound` and `exact` are multiplied by this number. Both
     are then lower bounds, since several prefixes may lead to a satisfying plan.
 
     Args:
-        axes: the controls with their grid values.
+        axes: the controls, with the values that they take in prefixes.
         radius: greatest distance from u* at which a prefix leads to a satisfying plan, as a share of each
             control's range.
         length: number of actions of a prefix, T0.

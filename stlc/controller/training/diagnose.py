@@ -353,7 +353,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Sentence for a message: how many plans the search tried, and that this is not a proof.
+    """Sentence for a message. It says how many plans the search tried, and that this is not a proof.
 
     `core`: the conflicting requirements.
     """

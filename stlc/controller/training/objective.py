@@ -42,7 +42,7 @@ class Objective:
 
 
 def paper_objective(task: Task) -> Objective:
-    """Objective of Meng and Fan (2023, Eq. 6 to 10): a hinge, at margin gamma, on smooth robustness.
+    """Objective of Meng and Fan (2023, Eq. 6 to 10): max(gamma - rho, 0), where rho is a smooth robustness.
 
     Minima and maxima are smoothed by log-sum-exp, and conditions in the dynamics by tanh.
     """
@@ -57,7 +57,7 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """Objective of the method `guided`: exact min and max, and a saturating hinge at `margin`."""
+    """Objective of the method `guided`, with exact min and max; see `Objective.saturation`."""
     return Objective(
         margin=margin,
         smoothing=None,

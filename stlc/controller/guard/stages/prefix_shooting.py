@@ -103,7 +103,9 @@ class PrefixShooting(GuardStage):
             yield group, found
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
-        """Let the policy plan from the ends of M + 1 prefixes, and judge the plans: (agents, M + 1).
+        """Judge plans that begin with M + 1 different prefixes: (agents, M + 1).
+
+        After a prefix, the policy plans the rest, from the state that the prefix leads to.
 
         The first prefix consists of the first T0 actions of `own`, the policy's plans, (agents, T, m). The
         others are `prefixes`, (M, T0, m). At most `grid.batch` trajectories are computed at a time. For a

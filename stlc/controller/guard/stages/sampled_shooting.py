@@ -31,9 +31,9 @@ class SampledPrefixes:
 
     Args:
         task: specification and system.
-        policy: policy that plans from the ends of the prefixes.
+        policy: policy that plans from the states that the prefixes lead to.
         grid: values of the controls, and lengths of prefixes.
-        most: maximum number of prefixes per length; if the grid has more, a random sample is used.
+        most: maximum number of prefixes per length; if there are more, a random sample is used.
     """
 
     def __init__(self, task: Task, policy: Policy, grid: PrefixGrid, most: int) -> None:
@@ -49,7 +49,7 @@ class SampledPrefixes:
         self._most = max(grid.batch // max(len(self.heads), 1), 1)
 
     def finished(self, x: Tensor) -> Candidates:
-        """Let the policy plan from the ends of all prefixes, and judge the plans: (agents, k).
+        """Let the policy plan from the states that the prefixes lead to, and judge the plans: (agents, k).
 
         `x`: states in which the prefixes begin, (agents, n) float64.
 
