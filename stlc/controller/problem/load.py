@@ -30,7 +30,7 @@ def load_task(
 
     Args:
         spec: specification file, searched by `find_spec`.
-        system: system file, searched by `find_system`; by default the one that the specification names.
+        system: system file, which `find_system` looks for; by default the one that the specification names.
         overrides: constants of the specification and keys of the system file to change, name -> text.
         hint: what the user may do if no system is named.
         found: function that receives the path of the system file before it is read.

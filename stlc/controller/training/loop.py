@@ -103,7 +103,7 @@ def train(
         task: problem to train for.
         config: the user's options.
         folder: folder of the run.
-        watch: callbacks.
+        watch: functions that are called during the run; see `Watch`.
         ranks: processes that train together. All of them call this function at the same time; only the first
             writes files.
 
@@ -157,7 +157,7 @@ def resume(
         budget: additional seconds. If neither `steps` nor `budget` is given, the run uses the rest of its
             budget, or completes its step schedule if it has no budget.
         device: torch device.
-        watch: callbacks.
+        watch: functions that are called during the run; see `Watch`.
         ranks: processes that train together; their number must be the same as before.
 
     Raises:
