@@ -129,8 +129,8 @@ class Guarding(nn.Module):
         requirements (B, R): robustness of each of the R requirements.
 
     Outputs in int64:
-        source (B,): 1 if the plan satisfies the specification or the safety requirements. Else it is 2, and
-            the plan keeps the safety requirements as long as possible.
+        source (B,): 1 if the plan satisfies the specification, or at least the safety requirements. 2 if no
+            such plan was found; the plan then keeps the safety requirements for as long as possible.
         t0 (B,): number of actions in the prefix of the plan; 0 if the system file declares no prefixes.
     """
 

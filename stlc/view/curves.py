@@ -69,7 +69,10 @@ def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
-    """Draw measured shares faintly, and their moving average above them."""
+    """Draw a curve of measured shares as a faint line, and its moving average as a clear line on top.
+
+    `seconds` are the times of the measurements. `style` holds arguments of `Axes.plot` for the clear line.
+    """
     axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
     axes.plot(seconds, _smoothed(shares), **style)
 

@@ -168,8 +168,8 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 def _changed_line(each: Mapping[str, Any]) -> str:
     """Line that compares the closed-loop runs with a guard to the same runs without a guard.
 
-    It tells how many runs are satisfied only with the guard, and how many only without it. It is "" if no run
-    was compared.
+    The line tells how many runs satisfy their requirements only with the guard, and how many only without it.
+    The line is "" if there are no runs to compare.
     """
     if not each.get("compared"):
         return ""

@@ -61,11 +61,17 @@ GUARDS: dict[Mode, tuple[Mode, ...]] = {
 def simulate(
     run: RunArgument = "latest",
     backup: Annotated[
-        bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
+        bool | None,
+        typer.Option(
+            "--backup/--no-backup", help="Guard by the paper's backup policy, as --guard paper does."
+        ),
     ] = None,
     guard: Annotated[
         str | None,
-        typer.Option(metavar="none|paper|full", help="Guard of the policy; `full` repairs plans first."),
+        typer.Option(
+            metavar="none|paper|full",
+            help="Guard, by default none; `full` repairs plans before it tries the backup.",
+        ),
     ] = None,
     time_limit: Annotated[
         str | None,
@@ -74,7 +80,9 @@ def simulate(
             help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
         ),
     ] = None,
-    ceiling: Annotated[int, typer.Option(min=0, help="Visited states to check for a feasible plan.")] = 0,
+    ceiling: Annotated[
+        int, typer.Option(min=0, help="Number of visited states to check for a feasible plan.")
+    ] = 0,
     margin: Annotated[
         list[str] | None,
         typer.Option(
@@ -96,24 +104,30 @@ def simulate(
     fail_under: FailUnderOption = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="An overlay of the system file, `all` of them, or `disturbed`."),
+        typer.Option(metavar="NAME", help="A scenario, `all` scenarios of the system file, or `disturbed`."),
     ] = None,
-    live: Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show margins and decisions during the simulation.")
+    ] = False,
     margins: Annotated[
         str | None,
         typer.Option(
             "--robustness",
             metavar="FILE",
-            help="Write robustness margins to it, a JSON object per agent and step; `-` prints them.",
+            help="Write robustness margins to FILE, a JSON object per agent and step; `-` prints them.",
         ),
     ] = None,
     windows: Annotated[
-        bool, typer.Option("--windows", help="Also show the verdict on plans per window.")
+        bool,
+        typer.Option(
+            "--windows", help="Also show results on plans, such as the share that satisfies the spec."
+        ),
     ] = False,
     method: PlannerOption = None,
     option: PlannerOptionsOption = None,
     budget: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Processor time of a planner's plan; 20ms.")
+        str | None,
+        typer.Option(metavar="TIME", help="With --method: processor time per plan; by default 20ms."),
     ] = None,
     system: SystemOption = None,
     set_: SetOption = None,

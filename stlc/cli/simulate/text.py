@@ -246,8 +246,9 @@ def _number(metric: Record, unit: str, digits: int) -> str:
 def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
     """Text on the agents whose closed-loop runs violated a requirement tagged `@safety`.
 
-    An example is `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`. An agent is viable if
-    a plan that satisfies these requirements is known from its start.
+    An example is `not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`. The viable agent is
+    agent 7 of seed 2. An agent is viable if a plan that satisfies the safety requirements is known from its
+    start.
     """
     if not unsafe:
         return f"all {agents} agents were driven safely"
@@ -261,7 +262,10 @@ def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
 
 
 def _listed(agents: Sequence[Record]) -> str:
-    """Text that lists the first few agents by seed: `seed 2: 7, 11; seed 5: 0`."""
+    """Text that lists the first few agents by seed.
+
+    Example: `seed 2: 7, 11; seed 5: 0` for the agents 7 and 11 of seed 2 and the agent 0 of seed 5.
+    """
     shown = agents[:MOST_LISTED]
     seeds = dict.fromkeys(each["seed"] for each in shown)
     parts = (

@@ -51,7 +51,7 @@ class Meter:
 
     @property
     def over(self) -> bool:
-        """True if the size or the depth exceeds its limit."""
+        """True if the declaration has more than `MAX_NODES` nodes or is nested deeper than `MAX_LEVELS`."""
         return self.nodes > MAX_NODES or self.deepest > MAX_LEVELS
 
     def enter(self) -> None:
@@ -68,7 +68,7 @@ class Meter:
         self.level -= 1
 
     def charge(self, cost: Cost) -> None:
-        """Add the size and depth (`cost`) of an expression that was evaluated before and is used again."""
+        """Count an expression again that was evaluated before; `cost` is its size and depth."""
         self.nodes += cost.nodes
         self.deepest = max(self.deepest, self.level + cost.levels)
 
@@ -76,8 +76,8 @@ class Meter:
     def measured(self) -> Iterator[Cost]:
         """Context that measures the size and depth of the expressions that are evaluated inside the context.
 
-        These expressions do not count towards the size limit. The context yields a `Cost`, which is filled in
-        when the context ends.
+        These expressions do not count towards the limits of the declaration. The context yields a `Cost`,
+        which is filled in when the context ends.
         """
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
@@ -90,10 +90,10 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """Context in which the counted size of expressions starts again at zero.
+        """Context in which size and depth are counted from zero.
 
-        The context is entered once per declaration, since the size limit holds for each declaration alone.
-        The previous count is restored at the end.
+        The context is entered once per declaration, since the limits hold for each declaration alone. The
+        previous counts are restored at the end.
         """
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False

@@ -67,7 +67,10 @@ def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope)
 
 
 class _Sweep:
-    """Signed distances of the segment between a point and its position at the next sample."""
+    """Calculator of signed distances between a segment and regions.
+
+    The segment is the straight line from a point to the position of the point at the next sample.
+    """
 
     def __init__(self, point: VectorValue, span: Span, scope: Scope) -> None:
         self.ends = (point, _later(point))
@@ -129,14 +132,14 @@ class _Sweep:
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
         """Return the greatest signed distance of the segment to a convex region, positive inside.
 
-        If the segment enters the region, the result is the greatest depth inside it (`_depth`). Otherwise, it
-        is the greatest number in `outside`.
+        If the segment enters the region, the result is the greatest depth of the segment in the region
+        (`_depth`). Otherwise, the result is the greatest number in `outside`.
 
         Args:
             faces: for each face of the region, the signed distances of both ends of the segment to the face,
                 positive inside.
-            outside: signed distances to the region of some points of the segment; the point that is nearest
-                to the region must be among them.
+            outside: lower bounds on the result for a segment that stays outside the region, such as the
+                signed distances of its two ends. The greatest of these bounds must be exact.
         """
         depth = self._depth(faces)
         close = self.apply("max", *outside)
@@ -201,7 +204,7 @@ class _Sweep:
         """Return the position in [0, 1] along the segment where the segment crosses a face.
 
         `face` contains the signed distances of the start and the end of the segment to the face. If the
-        segment crosses no face, the position is arbitrary.
+        segment does not cross the face, the position is arbitrary.
         """
         before, after = face
         slope = self.apply("sub", after, before)
@@ -228,7 +231,7 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[VectorValue]) -> list[Number]:
-        """Return the distance of the segment to each edge of a polygon, negative where they cross.
+        """Return the distance of the segment to each edge of a polygon, negative if the two cross.
 
         The magnitude is the least of the distances from the ends of the segment to the edge and from the ends
         of the edge to the segment.

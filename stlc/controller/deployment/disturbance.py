@@ -194,7 +194,7 @@ _CONDITION = "holds"
 
 
 class _Event:
-    """Compiled exogenous event of a system file; stores the truth of its condition at the previous step."""
+    """Compiled exogenous event of a system file; stores whether its condition held at the previous step."""
 
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
@@ -203,9 +203,12 @@ class _Event:
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:
-        """Mask of the agents for which the event occurs at this step, (agents,).
+        """Mask of the agents for which the event occurs at step number `step`, (agents,).
 
-        Stores the truth of the condition for the next step. `columns`: name of a state -> values, (agents,).
+        The method also stores, for each agent, whether the event's condition holds now. The next call needs
+        this for an event that occurs when its condition becomes true or becomes false.
+
+        `columns`: name of a state, or `t` for the time in seconds -> values, (agents,).
         """
         like = next(iter(columns.values()))
         due = self.decl.at == step if self.decl.at is not None else True
@@ -226,7 +229,9 @@ class _Event:
 
 
 class Events:
-    """The exogenous events of a deployment, and the truth of their conditions at the previous step.
+    """The exogenous events of a deployment.
+
+    Each event stores whether its condition held at the previous step.
 
     Args:
         declared: events in file order; later ones see the effects of earlier ones.

@@ -217,7 +217,7 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
 
     Returns:
         Results of the completed runs. If the world fails, or the rules (specification of closed-loop runs) do
-        not fit the system, there are none, and `why` contains the message.
+        not fit the system, `shares` is empty, and `why` contains the message.
     """
     test = run.task.system.decl.test
     try:
@@ -256,16 +256,16 @@ class _Trial:
         self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
 
     def simulate(self) -> None:
-        """Simulate seeds until the time is over or more runs would hardly change which guard is best."""
+        """Simulate seeds until the time is used up, or until it is clear enough which guard is best."""
         while (mode := self._next()) is not None:
             self._more(mode)
 
     def _next(self) -> Mode | None:
-        """Guard to simulate next; None if no further runs are needed.
+        """Guard to simulate next; None if the time is used up or no further runs are needed.
 
         At first, guards are simulated once each, from the cheapest one up to the first guard under which all
-        runs satisfy the mission. After that, only the guards whose share may still be the best are
-        considered: the one with the widest confidence interval is returned.
+        runs satisfy the mission. After that, only the guards whose share of satisfying runs may
+        still be the best are considered. Of these, the guard with the widest confidence interval is returned.
         """
         if self.left() <= 0.0:
             return None

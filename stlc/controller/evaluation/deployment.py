@@ -128,14 +128,16 @@ def deploy(
 def judged(
     guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
 ) -> Deployment:
-    """Evaluate a recorded deployment under a guard.
+    """Compute the metrics, verdicts and decision latency of a deployment that was recorded under a guard.
 
     Args:
-        guard: the guard that was deployed; the latency of its decisions is measured.
+        guard: the guard under which the deployment was recorded. It makes some decisions anew, so that their
+            latency can be measured.
         recording: the recorded deployment.
         ceiling: number of visited states whose feasibility is determined; see `feasible_states`.
         rules: specification that judges the closed-loop runs. If None, the specification of the plans judges
-            them from every start instant.
+            them: a run must satisfy it from every sample from which a whole planning window is recorded (see
+            `Executed`).
     """
     executed = judge_executed(guard.task, recording)
     runs = (

@@ -157,12 +157,15 @@ class _Drawing:
         self.possible = np.ones(count, np.bool_)
 
     def need(self, formula: ir.Formula, now: Instants, on: Flags) -> None:
-        """Add to the schedules that `formula` must hold at one sample.
+        """Make every schedule selected by `on` demand that `formula` holds at a given sample.
+
+        The demand is broken down into conditions on states, which are added to `needed`. Samples in windows
+        and operands of an `or` are chosen at random.
 
         Args:
             formula: the formula.
-            now: the sample for each schedule, (schedules,).
-            on: True for the schedules to which the formula is added, (schedules,).
+            now: for each schedule, the index of the sample at which the formula must hold, (schedules,).
+            on: True for the schedules that get the demand, (schedules,); the others stay unchanged.
         """
         if not on.any():
             return
@@ -235,7 +238,8 @@ class _Drawing:
     def _free(self, formula: ir.Formula) -> Flags:
         """Mask of the samples at which a formula may hold, (schedules, T + 1).
 
-        At these samples a schedule needs no condition whose negation the formula needs.
+        A sample is excluded if the schedule already needs, at this sample, the negation of a condition that
+        the formula needs.
         """
         free = np.ones((len(self.needed), self._last + 1), np.bool_)
         for part in self._scheduler.present(formula):
@@ -254,7 +258,7 @@ class _Drawing:
                 self.need(formula, first + k, on & (first + k <= last))
 
     def _hold(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
-        """Add to the schedules `on` that a condition must hold from sample `first` to sample `last`."""
+        """Make the schedules `on` demand that a condition holds from sample `first` to sample `last`."""
         within = (self._samples >= first[:, None]) & (self._samples <= last[:, None]) & on[:, None]
         for part in self._scheduler.parts(formula):
             if isinstance(part, ir.Truth):

@@ -175,11 +175,13 @@ class PlanNetwork(nn.Module):
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Mirror those of the states (B, n) that lie on one side of the symmetry.
+        """Replace states on one side of the mirror symmetry by their mirror images on the other side.
+
+        `x0`: states, (B, n).
 
         Returns:
-            All states, (B, n); and the mask of the mirrored states, (B,). Without a symmetry no state is
-            mirrored, and the mask is None.
+            The states after the replacement, (B, n); and a mask of the replaced states, (B,). If `mirror` is
+            None, all states are returned unchanged, and the mask is None.
         """
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 

@@ -47,8 +47,8 @@ class Expressions:
     Attributes:
         reader: collects the findings.
         scope: table of the names that expressions may use.
-        ready: names (of states, parameters or local names) that already have a value; None means all. It is
-            an error to read another one.
+        ready: names of the states, parameters and local names that already have a value. An expression that
+            reads another one is reported as an error (S202). None: all of them have a value.
         amounts: True where numbers are added to states, as in a disturbance. Then 5 degC is a temperature
             difference, otherwise a temperature.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
@@ -66,8 +66,8 @@ class Expressions:
     ) -> Expressions:
         """Return a compiler that also knows the names in `entries`.
 
-        With `samplers`, functions such as `uniform` are known too. `ready` are the names (of states,
-        parameters or local names) that already have a value; None means all.
+        With `samplers`, functions such as `uniform` are known too. `ready` are the names of the
+        states, parameters and local names that already have a value; None means all.
         """
         return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 
@@ -161,8 +161,8 @@ class Expressions:
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
         """Apply `resolve`, which determines names, types and units of an expression; return its result.
 
-        Returns None if `resolve` reports an error. A result that reads a column without a value is reported
-        (S202) and also gives None.
+        Returns None if `resolve` reports an error. If the expression reads a name that has no value yet (see
+        `ready`), the error S202 is reported, and None is returned, too.
         """
         sink: list[Diagnostic] = []
         try:

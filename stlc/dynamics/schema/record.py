@@ -174,7 +174,7 @@ def reads(schema: Mapping[str, Any], record: type | None = None) -> Callable[[_R
 
 
 def integer(low: int = 1, high: int = 10**9) -> Kind:
-    """Return the kind of value that is an integer between `low` and `high`."""
+    """Return the `Kind` of an integer between `low` and `high`."""
     return Kind(
         lambda cx, node, label: cx.reader.integer(node, label, low=low, high=high),
         {"type": "integer", "minimum": low, "maximum": high},
@@ -182,14 +182,14 @@ def integer(low: int = 1, high: int = 10**9) -> Kind:
 
 
 def number(low: float = 0.0) -> Kind:
-    """Return the kind of value that is a finite number of at least `low`."""
+    """Return the `Kind` of a finite number of at least `low`."""
     return Kind(
         lambda cx, node, label: cx.reader.number(node, label, low=low), {"type": "number", "minimum": low}
     )
 
 
 def word(options: Iterable[str]) -> Kind:
-    """Return the kind of value that is one of the words in `options`.
+    """Return the `Kind` of a value that must be one of the words in `options`.
 
     If `options` are the names of a registry, they are looked up anew each time a value is read.
     """
@@ -208,7 +208,7 @@ def fraction(cx: Context, node: Node, label: str) -> float | None:
 
 
 def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
-    """Return the kind of value that is kept as YAML node, to be read later when more names are known.
+    """Return the `Kind` of a value that is kept as a YAML node, to be read later when more names are known.
 
     `schema` is the JSON Schema of the value, and `record` the dataclass into which it will be read, if any.
     """
@@ -232,9 +232,9 @@ def items_of(schema: Mapping[str, Any]) -> Json:
 
 
 def list_of(kind: Kind, label: str) -> Kind:
-    """Return the kind of value that is a list of values of the kind `kind`.
+    """Return the `Kind` of a list whose items are of the kind `kind`.
 
-    Such a list is read as a tuple. Invalid items are reported and left out. `label` names an item in
+    The list is read as a tuple. Invalid items are reported and left out. `label` names an item in
     messages.
     """
 
@@ -246,12 +246,12 @@ def list_of(kind: Kind, label: str) -> Kind:
 
 
 def part(record: type) -> Kind:
-    """Return the kind of value that is a mapping, read into the dataclass `record`."""
+    """Return the `Kind` of a mapping in the file that is read into an object of the dataclass `record`."""
     return Kind(lambda cx, node, label: read(record, cx, node, label), json_schema(record), record)
 
 
 def section(record: type, *, free: bool = False) -> Kind:
-    """Return the kind of value that is a section of the file, kept as YAML node to be read later.
+    """Return the `Kind` of a section of the file, which is kept as a YAML node and read later.
 
     A section has the keys of the dataclass `record`. If `free`, its keys are arbitrary names, and each value
     has the keys of `record`.

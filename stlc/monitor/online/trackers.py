@@ -174,7 +174,7 @@ class _ColumnTracker(_CutTracker):
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns the index of the first sample still needed."""
+        """Free the memory of instants before `start`; return the index of the first sample still needed."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
@@ -341,7 +341,10 @@ class IntervalTracker:
         return self.live(starts.start, starts.stop)
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns `samples`, as no stored sample is needed."""
+        """Free the memory of instants before `start`; return the index of the first sample still needed.
+
+        The index is that of the next sample to arrive: the stored samples are not needed any more.
+        """
         self.shared.drop(self.which, start)
         return self.shared.samples
 
@@ -491,10 +494,9 @@ class UnboundedTracker:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
-        """Free the samples that later evaluations do not need, as the coefficients account for them.
+        """Free the samples that later evaluations do not need; return the index of the first one needed.
 
-        `UnboundedState` explains the coefficients. Returns the index of the first sample that is still
-        needed.
+        The effect of the freed samples is stored in coefficients, which `UnboundedState` explains.
         """
         for front in self._fronts:
             front.side.drop(min(front.at, self.samples - self._lag) - self._back)

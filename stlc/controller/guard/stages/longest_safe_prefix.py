@@ -21,8 +21,12 @@ if TYPE_CHECKING:
 class LongestSafePrefix(GuardStage):
     """Guard stage: the plan with the longest safe prefix.
 
-    Of plans with equally long safe prefixes, the one of highest robustness is taken. Of plans with equal
-    robustness, the one with the latest violation is taken.
+    The safe prefix of a plan is the first part of its trajectory, before the first sample at which a
+    safety requirement (tagged `@safety`) is violated.
+
+    Of plans with equally long safe prefixes, the plan with the highest robustness of the specification is
+    taken. Remaining ties are decided by the violation of the safety requirements, averaged over time: the
+    smaller one is better. The last criterion is the performance cost.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
@@ -37,7 +41,7 @@ class LongestSafePrefix(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Return, for each agent, the plan with the longest safe prefix among those of prefix shooting."""
+        """Return, for each agent in `rows`, the plan of prefix shooting with the longest safe prefix."""
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 PIECES = 12
 """Maximum number of constant pieces of a random plan."""
 LEAST = 1e-9
-"""Speed that is added to each, for its logarithm."""
+"""Small number that is added to every speed, so that its logarithm is finite."""
 SEEN = 0.1
 """Share of the library of random plans among which each schedule chooses, so that attempts differ."""
 MODERATE = 0.6
@@ -43,17 +43,19 @@ MODERATE = 0.6
 class SchedulePlanner:
     """Planner that draws random schedules of the goals and changes plans by Gauss-Newton steps to meet them.
 
-    A round begins with one attempt per schedule.
+    A schedule fixes, for every part of the specification, the time at which the part is to hold, and the
+    alternative of an `or` that is to hold. An attempt changes one plan until it meets one schedule. The
+    search runs in rounds, each with many attempts.
 
     Attributes:
         draws: number of schedules that are drawn per round.
-        schedules: number of these schedules that are attempted. Schedules that demand a low speed between
-            goals are preferred.
+        schedules: number of drawn schedules that are selected; there is one attempt for each.
+            Schedules that demand a low speed between goals are preferred.
         greed: strength of this preference; 0: the schedules are selected at random.
         steps: number of Gauss-Newton steps of an attempt.
         halvings: number of times that the worse half of the attempts is dropped, in equal intervals.
         library: number of random plans. An attempt begins with one of them that nearly meets its schedule.
-        rows: maximum number of conditions, the worst ones, that a Gauss-Newton step considers.
+        rows: maximum number of conditions that a Gauss-Newton step considers; the worst ones are taken.
         margin: distance from their boundaries at which conditions shall hold, as a share of the typical range
             of the states.
         best: number of plans that a local search improves at the end of a round.
@@ -76,10 +78,14 @@ class SchedulePlanner:
     first: int = 1_000
 
     def prepare(self, task: Task) -> Solver:
-        """Return a function that searches for plans by schedules.
+        """Return a function that draws random schedules and searches for plans that meet them.
+
+        A schedule fixes, for every part of the specification, the time at which the part is to hold, and the
+        alternative of an `or` that is to hold.
 
         Raises:
-            UsageError: U101, the specification has no condition on the states of one sample.
+            UsageError: U101, no part of the specification is a condition on the states of a single sample,
+                as `x > 1` is. Then there is nothing to schedule.
         """
         scheduler = GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
         if not scheduler.conditions:
@@ -111,7 +117,9 @@ class SchedulePlanner:
 
 
 class _Attempts:
-    """Attempts from one initial state.
+    """Attempts to find plans from one initial state.
+
+    Each attempt draws a random schedule and changes a plan until the plan meets the schedule.
 
     Args:
         options: the planner.
