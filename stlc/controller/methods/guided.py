@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from stlc.controller.training.objective import Objective
 
 
+LEARNING_RATE = 3e-3
+"""Default peak learning rate."""
+
+
 class Guided(NetworkMethod):
     """Gradient descent on exact robustness, supported by local search.
 

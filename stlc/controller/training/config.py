@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
 
-ENGINE_VERSION = 2
+ENGINE_VERSION = 3
 """Version of the training engine; results of older versions are recomputed."""
 
 DRIVES = 400

@@ -54,6 +54,8 @@ BARREN = 0.05
 """Share of failing states solved by local search below which exploration is used too."""
 LEARNT = 0.5
 """Accuracy on fresh states from which on exploration is not used."""
+NEAREST = 0.75
+"""Share of the states of a search round that are those whose plans fail by the least robustness."""
 EXPLORED = 4
 """Number of initial states that are explored before a search round."""
 RISE = 30
@@ -91,7 +93,7 @@ class Trainer(Learner):
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
-        self.accuracy = 0.0
+        self.accuracy, self.failing = 0.0, 0
         self.learnt = torch.empty(0, len(task.system.names), device=device)
 
     def advance(self) -> float:
@@ -217,13 +219,40 @@ class Trainer(Learner):
             return fresh.mean(self.ranks)
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
-        bad = (~good).nonzero()[:, 0][: self._effort[0]]
+        bad = self._to_repair(judged.rho, ~good)
         self.repairing = self._begin(x0[bad], plans[bad])
+        self.failing = int((~good).sum())
         self.accuracy = accuracy
         self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
         explored, self.explored = self.explored, 0
         found = replace(fresh, feasible=feasible, failing=failing, repaired=repaired, explored=explored)
         return found.mean(self.ranks)
+
+    def _to_repair(self, rho: Tensor, failing: Tensor) -> Tensor:
+        """Choose the failing states of a search round: those nearest to success, and some of the others.
+
+        A search repairs a plan that nearly satisfies the specification far more often than one that violates
+        it by much, and many of the latter start from infeasible states.
+
+        Args:
+            rho: robustness of the policy's plans, (B,).
+            failing: mask of the states whose plan violates the specification, (B,).
+
+        Returns:
+            Indices of the chosen states, (k,): `NEAREST` of them by decreasing robustness, then the rest in
+            the order in which they were drawn; all failing states if they fit into a round.
+        """
+        rows, most = failing.nonzero()[:, 0], self._effort[0]
+        near = self._nearest(len(rows))
+        chosen = torch.zeros_like(failing)
+        first = rows[rho[rows].argsort(descending=True, stable=True)[:near]]
+        chosen[first] = True
+        return torch.cat((first, rows[~chosen[rows]]))[:most]
+
+    def _nearest(self, failing: int) -> int:
+        """Number of states of a search round that are chosen by their robustness, out of `failing` states."""
+        most = self._effort[0]
+        return failing if failing <= most else math.ceil(NEAREST * most)
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
         """Start a search for better plans than `plans` from states `x0`; it runs until the next validation.
@@ -259,9 +288,11 @@ class Trainer(Learner):
         solved = found.solved
         self.buffer.add(found.states[solved], found.plans[solved])
         self.supply.follow(found.states[solved], found.plans[solved])
-        failing, repaired = len(solved), int(solved.sum())
-        rate = repaired / max(1, failing)
-        return failing, repaired, self.accuracy + (1.0 - self.accuracy) * rate
+        near = min(self._nearest(self.failing), len(solved))
+        nearest, others = solved[:near], solved[near:]
+        of_others = float(others.double().mean()) if len(others) else 0.0
+        rate = (int(nearest.sum()) + of_others * max(self.failing - near, 0)) / max(1, self.failing)
+        return len(solved), int(solved.sum()), self.accuracy + (1.0 - self.accuracy) * rate
 
     # ------------------------------------------------------------------ loss and supply
 
@@ -375,7 +406,7 @@ class Trainer(Learner):
         """Tensors of a checkpoint that differ between the ranks (processes), for this rank."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
-            counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
+            counts = [self.accuracy, self.buffer.count, self.barren, self.effort, self.failing]
             found["counts"] = torch.tensor(counts, dtype=torch.float64)
         count = len(self.buffer)
         if isinstance(self.training, FixedSet):
@@ -396,6 +427,7 @@ class Trainer(Learner):
         return super().facts() | {
             "solved": self.buffer.count,
             "accuracy": self.accuracy,
+            "failing": self.failing,
             "barren": int(self.barren),
             "effort": self.effort,
         }
@@ -404,7 +436,7 @@ class Trainer(Learner):
         """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
         tensors, facts = self._restored(tensors, facts)
         super().restore(tensors, facts)
-        self.accuracy = float(facts["accuracy"])
+        self.accuracy, self.failing = float(facts["accuracy"]), int(facts.get("failing", 0))
         self.effort = max(int(facts.get("effort", 0)), 0)
         self.barren = bool(facts.get("barren", 0)) and not self.exhausted
         self.objective = self.method.objective(self)
@@ -442,8 +474,13 @@ class Trainer(Learner):
         shared = ("network.", "average.", "adam.")
         common = {name: value for name, value in tensors.items() if name.startswith(shared)}
         own = below(tensors, f"rank{self.ranks.rank}")
-        accuracy, solved, barren, effort = own.pop("counts").tolist()
-        counts = {"solved": int(solved), "barren": int(barren), "effort": int(effort)}
+        accuracy, solved, barren, effort, failing = own.pop("counts").tolist()
+        counts = {
+            "solved": int(solved),
+            "barren": int(barren),
+            "effort": int(effort),
+            "failing": int(failing),
+        }
         return common | own, {**facts, "accuracy": accuracy, **counts}
 
 

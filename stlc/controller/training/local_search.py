@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stlc.compile.backends.c.emit import LANES
 from stlc.controller.problem.native import Effort
-from stlc.controller.problem.task import FLOAT32_SLACK
+from stlc.controller.problem.task import satisfied
 from stlc.controller.training.budget import cores
 from stlc.native import never
 
@@ -57,8 +57,12 @@ class SearchResult:
 
     @property
     def solved(self) -> Tensor:
-        """Mask of the states whose plan satisfies the specification by more than rounding errors, (B,)."""
-        return self.rho >= FLOAT32_SLACK
+        """Mask of the states whose plan satisfies the specification up to rounding errors, (B,).
+
+        A robustness of exactly 0 counts: where an allowance is counted in whole steps, no plan has more from
+        the states that need all of it.
+        """
+        return satisfied(self.rho)
 
     def to(self, device: torch.device) -> SearchResult:
         """The result with its tensors on `device`."""
