@@ -8,7 +8,7 @@ import torch
 from stlc import native
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.training.local_search import Searcher, SearchResult
 from stlc.controller.training.samplers import CAPACITY, ReplayBuffer
 from stlc.dynamics.model.system import System
 
@@ -46,6 +46,13 @@ def test_a_plan_that_is_good_enough_is_left_alone(task: Task) -> None:
     good = task.judge(x0, start).rho >= 0.02
     assert torch.equal(found.plans[good], start[good])
     assert not torch.equal(found.plans[~good], start[~good])
+
+
+def test_a_plan_without_any_margin_solves_its_state() -> None:
+    """Where an allowance is counted in whole steps, the best plan may have a robustness of exactly 0."""
+    rho = torch.tensor([-1e-3, -1e-7, 0.0, 0.3])
+    found = SearchResult(torch.zeros(4, 2), torch.zeros(4, 3, 1), rho)
+    assert found.solved.tolist() == [False, True, True, True]
 
 
 def test_search_depends_on_its_generator_alone(task: Task) -> None:

@@ -10,7 +10,7 @@ import torch
 from stlc import native
 from stlc.compile.semantics.switch import Hard, Tanh
 from stlc.controller.problem.task import Task, satisfied
-from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.controller.training.objective import VIOLATION, Objective, guided_objective, loss, paper_objective
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -45,7 +45,10 @@ def test_the_engine_uses_exact_operators_and_saturates(car_task: Task) -> None:
     outcome = loss(car_task, objective, x0, u)
     rho = car_task.robustness(car_task.rollout(x0, u, Hard()))
     hinge = (0.1 - rho).clamp(min=0)
-    assert torch.allclose(outcome, 0.2 * torch.log1p(hinge / 0.2), atol=1e-9)
+    violation = (-rho).clamp(min=0)
+    assert 0 < (violation > 0).double().mean() < 1
+    expected = 0.2 * torch.log1p(hinge / 0.2) + VIOLATION * 0.2 * torch.log1p(violation / 0.2)
+    assert torch.allclose(outcome, expected, atol=1e-9)
 
 
 def test_gradients_reach_every_control_that_matters(car_task: Task) -> None:

@@ -40,7 +40,9 @@ class Guided(NetworkMethod):
         By default the network proposes four plans per state. Half of the states of a training step are newly
         drawn. The other half are states from which the policy failed before, but the search found a plan.
         """
-        found = base_config(task, config, kind=self.options, batch=256, plans=4, searches=True)
+        found = base_config(
+            task, config, kind=self.options, batch=256, plans=4, rate=LEARNING_RATE, searches=True
+        )
         return replace(found, hard=found.batch)
 
     def objective(self, learner: Trainer) -> Objective:

@@ -43,8 +43,13 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 MARGIN_STATES = 128
-MARGIN_SHARE = 0.2
-MARGIN_RANGE = (0.01, 0.5)
+"""Number of states from which the search looks for the largest robustness, to choose the margin."""
+MARGIN_SHARE = 0.8
+"""Margin of the loss, as a share of the median of the largest robustness that the search finds."""
+MARGIN_RANGE = (0.04, 2.0)
+"""Least and greatest margin of the loss."""
+ENOUGH = 0.05
+"""Robustness at which the search for a satisfying plan stops, as a share of the margin."""
 TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
 """Limits for searches in torch, which are some hundred times slower than native ones.
 
@@ -56,6 +61,8 @@ LEARNT = 0.5
 """Accuracy on fresh states from which on exploration is not used."""
 NEAREST = 0.75
 """Share of the states of a search round that are those whose plans fail by the least robustness."""
+COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
+"""Facts of which every rank (process) has its own, in the order in which a checkpoint stores them."""
 EXPLORED = 4
 """Number of initial states that are explored before a search round."""
 RISE = 30
@@ -90,7 +97,7 @@ class Trainer(Learner):
         if self.searches:
             self.margin = ranks.agree(self._feasible_margin())
         self.objective = self.method.objective(self)
-        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
+        self.searcher = self._searcher(ENOUGH * self.margin)
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy, self.failing = 0.0, 0
@@ -406,8 +413,8 @@ class Trainer(Learner):
         """Tensors of a checkpoint that differ between the ranks (processes), for this rank."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
-            counts = [self.accuracy, self.buffer.count, self.barren, self.effort, self.failing]
-            found["counts"] = torch.tensor(counts, dtype=torch.float64)
+            facts = self.facts()
+            found["counts"] = torch.tensor([facts[name] for name in COUNTS], dtype=torch.float64)
         count = len(self.buffer)
         if isinstance(self.training, FixedSet):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
@@ -440,7 +447,7 @@ class Trainer(Learner):
         self.effort = max(int(facts.get("effort", 0)), 0)
         self.barren = bool(facts.get("barren", 0)) and not self.exhausted
         self.objective = self.method.objective(self)
-        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
+        self.searcher = self._searcher(ENOUGH * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(below(tensors, prefix))
         layout = self.optimizer.state_dict()
@@ -474,14 +481,8 @@ class Trainer(Learner):
         shared = ("network.", "average.", "adam.")
         common = {name: value for name, value in tensors.items() if name.startswith(shared)}
         own = below(tensors, f"rank{self.ranks.rank}")
-        accuracy, solved, barren, effort, failing = own.pop("counts").tolist()
-        counts = {
-            "solved": int(solved),
-            "barren": int(barren),
-            "effort": int(effort),
-            "failing": int(failing),
-        }
-        return common | own, {**facts, "accuracy": accuracy, **counts}
+        counts = dict(zip(COUNTS, own.pop("counts").tolist(), strict=False))  # fewer in old checkpoints
+        return common | own, {**facts, **counts}
 
 
 # ------------------------------------------------------------------ methods with a plan network

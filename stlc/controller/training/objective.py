@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 
+VIOLATION = 2.0
+"""Weight of the hinge at robustness 0 in the objective of `guided`, relative to the hinge at the margin."""
+
+
 @dataclass(frozen=True, slots=True)
 class Objective:
     """Parameters of the loss; gamma, k and lambda are the symbols of Meng and Fan (2023).
@@ -29,6 +33,8 @@ class Objective:
         saturation: s in the loss term s log(1 + hinge / s), where hinge is max(margin - robustness, 0). This
             term grows slowly, so that states without a satisfying plan do not dominate the loss. None: the
             hinge itself is the loss term.
+        violation: weight of a second hinge, at robustness 0, by which a plan that violates the specification
+            is penalised more than one whose robustness is only below gamma.
         stl_weight: lambda, the weight of the hinge on robustness.
         performance_weight: weight of the performance terms.
     """
@@ -37,6 +43,7 @@ class Objective:
     smoothing: float | None
     switch: Switch
     saturation: float | None
+    violation: float = 0.0
     stl_weight: float = 1.0
     performance_weight: float = 1.0
 
@@ -57,12 +64,13 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """Objective of the method `guided`, with exact min and max; see `Objective.saturation`."""
+    """Objective of the method `guided`: exact min and max, saturating hinges at `margin` and at 0."""
     return Objective(
         margin=margin,
         smoothing=None,
         switch=StraightThrough(slope),
         saturation=2.0 * margin,
+        violation=VIOLATION,
         performance_weight=performance_weight,
     )
 
@@ -83,12 +91,21 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
     rho, columns = _rolled(task, objective, x0, u)
     exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
     good = satisfied(exact.detach())
-    hinge = (objective.margin - rho).clamp(min=0.0)
-    if objective.saturation is not None:
-        hinge = objective.saturation * torch.log1p(hinge / objective.saturation)
     cost = task.performance(columns, rho, u)
     gated = torch.where(good, cost, torch.zeros_like(cost))
-    return objective.stl_weight * hinge + objective.performance_weight * gated
+    return objective.stl_weight * _shortfall(objective, rho) + objective.performance_weight * gated
+
+
+def _shortfall(objective: Objective, rho: Tensor) -> Tensor:
+    """Penalty on robustness `rho` (B,) below the margin, and on robustness below 0: (B,)."""
+
+    def hinge(at: float) -> Tensor:
+        below = (at - rho).clamp(min=0.0)
+        scale = objective.saturation
+        return below if scale is None else scale * torch.log1p(below / scale)
+
+    penalty = hinge(objective.margin)
+    return penalty + objective.violation * hinge(0.0) if objective.violation else penalty
 
 
 def native_rolled(
