@@ -27,4 +27,4 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of glibc")
 def test_freed_memory_is_used_again_without_page_faults() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
-    assert int(done.stdout) < 200  # 20 times 1.6 MB are some 8,000 pages
+    assert int(done.stdout) < 2_000  # 20 times 1.6 MB are some 8,000 pages; one tensor may move once (390)
