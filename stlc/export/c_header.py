@@ -333,6 +333,9 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "RULE_NAMES": ", ".join(c_string(rule.name) for rule in task.rules),
         "SAFETY": len(task.compiled.safety),
         "PLANS": network.plans,
+        **_changes(network),
+        "LOW": ", ".join(literal(each.low) for each in controls),
+        "HIGH": ", ".join(literal(each.high) for each in controls),
         "RAW": raw_width(controls),
         "OBSERVED": task.system.observed_count,
         "WIDEST": widest(network),
@@ -357,6 +360,24 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "COST": _block(cost(task)),
         "OVERALL": _block(_overall(task.rules, task.rules)),
         "SAFE": _block(_overall(task.compiled.safety, task.rules)),
+    }
+
+
+def _changes(network: PlanNetwork) -> dict[str, object]:
+    """Texts for the header about the network's changes of plans: placeholder -> number or C text.
+
+    Each change is that of a single control. Without changes, the arrays hold one row of zeros, as C has no
+    empty arrays.
+    """
+    changes = (
+        network.changes if len(network.changes) else network.changes.new_zeros(1, *network.changes.shape[1:])
+    )
+    changed = changes.abs().amax(1).argmax(1)
+    rows = changes.gather(2, changed[:, None, None].expand(-1, changes.shape[1], 1))[:, :, 0]
+    return {
+        "CHANGES": len(network.changes),
+        "CHANGED": ", ".join(map(str, changed.tolist())),
+        "CHANGE": ",\n".join("{" + ", ".join(map(literal, row)) + "}" for row in rows.tolist()),
     }
 
 

@@ -429,8 +429,11 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 # ---------------------------------------------------------------------------------------------- graphs
 
 
-def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
+def deciding(task: Task, network: PlanNetwork, *, varied: bool = True) -> dict[str, Value]:
     """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
+
+    If `varied` is False, the network's changes of plans are not tried: the plan is that of
+    `Policy.continuation`.
 
     Outputs are `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), and `requirements` (batch, R). If the
     specification adds states, the output `added` (batch, k) holds these states one step later.
@@ -439,9 +442,10 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
         Untranslatable: a part of the task has no ONNX form.
     """
     state = OnnxGraph().input("state", (BATCH, len(task.system.names)))
-    plans = proposed(task, network, columns_of(state, task.system.names))
+    plans = _options(task, network, state, varied=varied)
     table = _table(task, state, plans)
-    return _shown(_picked(table, _best(table["rank"]))) | _added(task, state)
+    tried = varied and len(network.changes) > 0
+    return _shown(_picked(table, _chosen(table, plans.shape[1], tried))) | _added(task, state)
 
 
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
@@ -460,10 +464,10 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     sheet = OnnxGraph()
     state = sheet.input("state", (BATCH, len(task.system.names)))
     begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
-    fresh = proposed(task, network, columns_of(state, task.system.names))
+    fresh = _options(task, network, state)
     count = fresh.shape[1]
     table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
-    best = _best(table["rank"].T[:count].T)
+    best = _chosen(table, count, len(network.changes) > 0)
     policy = _picked(table, best)
     better = ONNX_OPS.ge(_one(table["rank"], count), policy["rank"])
     if task.pending_goals.items:
@@ -472,6 +476,38 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     index = kept.reshaped(BATCH, 1).apply("Where", sheet.constant([[count]], "int64"), best, kind="int64")
     shown = {"kept": kept, "policy_plan": policy["plan"], "policy_rho": policy["rho"]}
     return _shown(_picked(table, index)) | shown | _added(task, state)
+
+
+def _options(task: Task, network: PlanNetwork, state: Value, *, varied: bool = True) -> Value:
+    """Return the plans among which the policy selects, (batch, count, T, m), in `state` (batch, n).
+
+    With `varied`, and if the network has changes to try, these are the best of the network's plans, and then
+    its changed copies; else all plans of the network.
+    """
+    plans = proposed(task, network, columns_of(state, task.system.names))
+    if not varied or not len(network.changes):
+        return plans
+    table = _table(task, state, plans)
+    best = _picked(table, _best(table["rank"]))["plan"].reshaped(BATCH, 1, *plans.shape[2:])
+    bounds = task.system.control_low, task.system.control_high
+    changes, low, high = (
+        state.sheet.constant(numbers.double().numpy()) for numbers in (network.changes[None], *bounds)
+    )
+    return joined([best, (best + changes).apply("Max", low).apply("Min", high)], axis=1)
+
+
+def _chosen(table: Mapping[str, Value], count: int, varied: bool) -> Value:
+    """Index, (batch, 1), of the plan that the policy selects among the first `count` plans in `table`.
+
+    If `varied`, the other plans are changed copies of plan 0, which count only if plan 0 violates the
+    specification.
+    """
+    best = _best(table["rank"].T[:count].T)
+    if not varied:
+        return best
+    good = ONNX_OPS.ge(_one(table["rho"], 0), -TOLERANCE).reshaped(BATCH, 1)
+    first = best.sheet.constant([[0]], "int64")
+    return good.apply("Where", first, best, kind="int64")
 
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:

@@ -20,7 +20,7 @@ from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.runtime import Controller
-from stlc.runtime.facts import DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, ControllerQuantity
+from stlc.runtime.facts import CONTINUE, DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, ControllerQuantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -129,9 +129,10 @@ class Latency:
 
 
 def write_onnx(run: Run, folder: Path) -> None:
-    """Write `decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and maybe `fall.onnx`.
+    """Write `decide.onnx`, `follow.onnx`, `judge.onnx` and `controller.json`, and up to two more files.
 
-    `fall.onnx` is written if the specification has safety requirements.
+    `fall.onnx` is written if the specification has safety requirements, `continue.onnx` if the policy tries
+    changed copies of its plans.
 
     Raises:
         UsageError: U101, a part of the task has no ONNX form.
@@ -144,6 +145,8 @@ def write_onnx(run: Run, folder: Path) -> None:
         FOLLOW: lambda: following(task, run.network),
         JUDGE: lambda: judging(task),
     }
+    if len(run.network.changes):
+        graphs[CONTINUE] = lambda: deciding(task, run.network, varied=False)
     if task.compiled.safety:
         graphs[FALL] = lambda: falling(task)
     digests = {}

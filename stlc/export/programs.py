@@ -44,7 +44,25 @@ class Deciding(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the best of the policy's plans and its verdict, equal to those of `Policy.plan_judged`."""
-        plans = self.network(x).to(x.dtype)
+        plan, rho, safe, each = self.proposed(x)
+        if not len(self.network.changes):
+            return plan, rho, safe, each
+        low, high = self._task.system.control_low.to(x), self._task.system.control_high.to(x)
+        changed = (plan[:, None] + self.network.changes).clamp(low, high)
+        found = self._best(x, torch.cat((plan[:, None], changed), 1))
+        pairs = zip((plan, rho, safe, each), found, strict=True)
+        good = rho >= -TOLERANCE
+        plan, rho, safe, each = (
+            torch.where(good.view(-1, *[1] * (own.dim() - 1)), own, other) for own, other in pairs
+        )
+        return plan, rho, safe, each
+
+    def proposed(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the best of the network's own plans and its verdict; see `Policy.continuation`."""
+        return self._best(x, self.network(x).to(x.dtype))
+
+    def _best(self, x: Tensor, plans: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the best of the plans (B, count, T, m) in states (B, n), and its verdict."""
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         flat = plans.reshape(-1, steps, controls)
@@ -195,7 +213,7 @@ class Guarding(nn.Module):
         head = heads.reshape(-1, *heads.shape[2:])
         ends = self._task.system.rollout_columns(starts, head)
         reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.system.names], 1)
-        tail = finite(self.deciding(reached)[0], self._task)
+        tail = finite(self.deciding.proposed(reached)[0], self._task)
         plans = torch.cat((head, tail[:, : self._task.horizon - length]), 1)
         judged = judged_by_torch(self._task, starts, plans)
         rows = [plans, judged.rho, judged.safe, judged.requirements, self._task.cost(judged)]

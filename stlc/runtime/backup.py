@@ -82,7 +82,7 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
         plans = np.repeat(own[None], len(some), 0)
         plans[:, :length] = some
         reached = graphs.judged(starts, plans)[1]["states"][:, length]
-        tail = finite(graphs.decided(reached)[0].plan, graphs.facts.controls)
+        tail = finite(graphs.continued(reached), graphs.facts.controls)
         plans[:, length:] = tail[:, : own.shape[0] - length]
         parts.append(graphs.judged(starts, plans)[0])
     return joined(parts)

@@ -19,6 +19,7 @@ Numbers: TypeAlias = NDArray[np.float64]
 FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
 DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
+CONTINUE = "continue.onnx"
 
 
 @dataclass(frozen=True, slots=True)

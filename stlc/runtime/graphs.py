@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, MissingError
-from stlc.runtime.facts import DECIDE, FALL, FOLLOW, JUDGE, Facts
+from stlc.runtime.facts import CONTINUE, DECIDE, FALL, FOLLOW, JUDGE, Facts
 
 Numbers: TypeAlias = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class Graphs:
 
     def prepare(self) -> None:
         """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
-        _ = self._judge, self._fall
+        _ = self._judge, self._fall, self._continue
 
     def decided(self, x: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """Return the best of the policy's plans in each state of `x`, and all outputs of the graph.
@@ -73,6 +73,13 @@ class Graphs:
         """
         found = _run(self._decide, {"state": x})
         return _judged(found["plan"], found), found
+
+    def continued(self, x: Numbers) -> Numbers:
+        """Plans that continue prefixes from the states `x` that these reach: (rows, n) -> (rows, T, m).
+
+        They are the best of the network's own plans, without the changes that `decided` may add.
+        """
+        return _run(self._continue, {"state": x})["plan"]
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """Choose, in each state of `x`, between the policy's plan and `begun`, the rest of the previous plan.
@@ -107,6 +114,10 @@ class Graphs:
     @cached_property
     def _judge(self) -> Any:
         return self._session(JUDGE)
+
+    @cached_property
+    def _continue(self) -> Any:
+        return self._session(CONTINUE) if CONTINUE in self.facts.graphs else self._decide
 
     @cached_property
     def _fall(self) -> Any:

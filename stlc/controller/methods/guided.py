@@ -43,7 +43,7 @@ class Guided(NetworkMethod):
         found = base_config(
             task, config, kind=self.options, batch=256, plans=4, rate=LEARNING_RATE, searches=True
         )
-        return replace(found, hard=found.batch)
+        return replace(found, hard=found.batch, varied=True)
 
     def objective(self, learner: Trainer) -> Objective:
         """Objective on exact robustness (not smoothed); it rewards robustness up to `learner.margin`.

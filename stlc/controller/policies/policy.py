@@ -1,12 +1,14 @@
 """Policies: map states to candidate plans, and select one of them by exact verdicts.
 
 A continuous function cannot jump from a path left of an obstacle to one right of it; a set of several plans
-can, and judging a few plans exactly costs well under a millisecond. Planners propose a single plan, and so do
-policies that are made from an actor (state -> action).
+can, and judging a few plans exactly costs well under a millisecond. For the same reason, slightly changed
+copies of a plan that just fails are judged, too (docs/decisions/0049-variations.md). Planners propose a
+single plan, and so do policies that are made from an actor (state -> action).
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from copy import copy
 from itertools import pairwise
@@ -15,14 +17,35 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.problem.task import rank
+from stlc.controller.problem.task import PlanVerdicts, rank, satisfied
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from stlc.controller.problem.task import PlanVerdicts, Task
+    from stlc.controller.problem.task import Task
     from stlc.dynamics.model.mirror import Mirror
+
+
+VARIATIONS = (0.01, 0.05)
+"""Sizes of the changes in `variations`, as shares of half the range of a control."""
+
+
+def variations(task: Task) -> Tensor:
+    """Small changes of plans, in physical units: (V, T, m), float64.
+
+    Each changes a single control by the same amount at every step, or by an amount that falls like half a
+    cosine from its value at the first step to its negative at the last one. V = 8 m: both signs and all
+    sizes of `VARIATIONS`.
+    """
+    steps, controls = task.horizon, task.system.control_low.shape[0]
+    half = 0.5 * (task.system.control_high - task.system.control_low).to("cpu", torch.float64)
+    time = torch.arange(steps, dtype=torch.float64)
+    shapes = torch.stack((torch.ones_like(time), torch.cos(math.pi * (time + 0.5) / steps)))
+    sizes = torch.tensor([sign * size for size in VARIATIONS for sign in (1.0, -1.0)], dtype=torch.float64)
+    amount = sizes[:, None, None, None] * torch.diag(half)[None, :, None, :]  # (sizes, changed control, 1, m)
+    found = amount[:, :, None] * shapes[None, None, :, :, None]
+    return found.reshape(-1, steps, controls)
 
 
 class Policy(ABC):
@@ -126,6 +149,7 @@ class PlanNetwork(nn.Module):
 
     Attributes:
         plans: number of plans.
+        changes: changes of plans that `BestOfKPolicy` tries, (V, T, m) float64; V is 0 without variations.
         mirror: the system's mirror symmetry; None if the system has none or the network does not use it.
         centre: mean of the observations, (k,), by which the network's inputs are centred.
         spread: standard deviation of the observations, (k,), by which the network's inputs are divided.
@@ -133,8 +157,17 @@ class PlanNetwork(nn.Module):
 
     centre: Tensor
     spread: Tensor
+    changes: Tensor
 
-    def __init__(self, task: Task, *, hidden: Sequence[int], plans: int, mirrored: bool = True) -> None:
+    def __init__(
+        self,
+        task: Task,
+        *,
+        hidden: Sequence[int],
+        plans: int,
+        mirrored: bool = True,
+        varied: bool = False,
+    ) -> None:
         super().__init__()
         self.plans = plans
         self.mirror: Mirror | None = task.system.mirror if mirrored else None
@@ -148,6 +181,8 @@ class PlanNetwork(nn.Module):
         self.body = nn.Sequential(*layers)
         self.register_buffer("centre", torch.zeros(widths[0]))
         self.register_buffer("spread", torch.ones(widths[0]))
+        changes = variations(task) if varied else variations(task)[:0]
+        self.register_buffer("changes", changes, persistent=False)
 
     def normalise(self, x0: Tensor) -> None:
         """Set `centre` and `spread` to mean and standard deviation of the observations of states (n, dim).
@@ -187,7 +222,11 @@ class PlanNetwork(nn.Module):
 
 
 class BestOfKPolicy(Policy):
-    """Trained policy: a network proposes several plans, and their exact robustness selects the best."""
+    """Trained policy: a network proposes several plans, and their exact robustness selects the best.
+
+    If no proposed plan satisfies the specification, the changes in `PlanNetwork.changes` are added to the
+    best of them, each by itself, and the best of the plan and its changed copies is selected.
+    """
 
     network: PlanNetwork
 
@@ -199,3 +238,30 @@ class BestOfKPolicy(Policy):
         """All plans of the network: (B, n) -> (B, plans, T, m)."""
         plans: Tensor = self.network(x0)
         return plans
+
+    @torch.no_grad()
+    def plan(self, x0: Tensor) -> Tensor:
+        """The selected plan from each state, in physical units: (B, n) -> (B, T, m) in the dtype of `x0`."""
+        return self.plan_judged(x0)[0] if len(self.network.changes) else super().plan(x0)
+
+    def continuation(self, x0: Tensor) -> Tensor:
+        """The best of the network's own plans, without changes: (B, n) -> (B, T, m)."""
+        return super().plan(x0)
+
+    @torch.no_grad()
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
+        """The selected plan from each state, as `plan` returns it, and the verdicts on these plans."""
+        plans, judged = super().plan_judged(x0)
+        failing = (~satisfied(judged.rho)).nonzero()[:, 0]
+        if not len(self.network.changes) or not len(failing):
+            return plans, judged
+        better, found = self._best(x0[failing], self._varied(plans[failing]))
+        return plans.index_copy(0, failing, better), judged.put(failing, found)
+
+    def _varied(self, plans: Tensor) -> Tensor:
+        """Each plan and its changed copies, within the control bounds: (k, T, m) -> (k, 1 + V, T, m)."""
+        low, high = (
+            bound.to(plans) for bound in (self.task.system.control_low, self.task.system.control_high)
+        )
+        changed = plans[:, None] + self.network.changes.to(plans)
+        return torch.cat((plans[:, None], changed.clamp(low, high)), 1)

@@ -71,6 +71,19 @@ class PlanVerdicts:
             self.rho[index], self.safe[index], self.requirements[index], self.plans[index], columns
         )
 
+    def put(self, index: Tensor, other: PlanVerdicts) -> PlanVerdicts:
+        """These verdicts, with those on the plans with indices `index`, (k,), replaced by `other`."""
+        columns = {
+            name: column.index_copy(1, index, other.columns[name]) for name, column in self.columns.items()
+        }
+        return PlanVerdicts(
+            self.rho.index_copy(0, index, other.rho),
+            self.safe.index_copy(0, index, other.safe),
+            self.requirements.index_copy(0, index, other.requirements),
+            self.plans.index_copy(0, index, other.plans),
+            columns,
+        )
+
 
 def satisfied(rho: Tensor) -> Tensor:
     """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.

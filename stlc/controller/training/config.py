@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
 
-ENGINE_VERSION = 3
+ENGINE_VERSION = 4
 """Version of the training engine; results of older versions are recomputed."""
 
 DRIVES = 400
@@ -104,6 +104,8 @@ class ResolvedConfig:
         seed: seed of all random numbers.
         hidden: widths of the network's hidden layers.
         plans: number of plans that the network proposes per state.
+        varied: True if changed copies of the best plan are tried where no proposed plan satisfies the
+            specification.
         batch: number of fresh states per step.
         hard: number of hard states per step. A hard state is used once the search has found a plan for it,
             so the first steps have none.
@@ -147,6 +149,7 @@ class ResolvedConfig:
     imitation: float = 1.0
     share: float = 0.05
     performance: float = 0.3
+    varied: bool = False
     held_out: int = HELD_OUT
     threads: int = 0
     samples: int = 0
@@ -195,6 +198,10 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
         if option.type in ("str", str):
             if not isinstance(value, str) or len(value) > MOST_TEXT:
                 raise ValueError(f"`{option.name}` is {value!r:.40}")
+            continue
+        if option.type in ("bool", bool):
+            if not isinstance(value, bool):
+                raise ValueError(f"`{option.name}` is {value!r:.40}, neither true nor false")
             continue
         kinds = (int, float) if option.type in ("float", float) else (int,)
         low, most = option.metadata.get("bounds", (0, _MOST.get(option.name, 1e12)))

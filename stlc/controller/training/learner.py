@@ -507,7 +507,9 @@ class NetworkMethod(Method):
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
         """Make a network with random weights, drawn from torch's global generator."""
-        return PlanNetwork(task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored)
+        return PlanNetwork(
+            task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored, varied=config.varied
+        )
 
     def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str = "cpu") -> BestOfKPolicy:
         """Load the policy of a run, with the moving average of the network's weights.

@@ -1,4 +1,4 @@
-"""Plans stay within their bounds; the monitor's choice is the best of the candidates."""
+"""Plans stay within their bounds; the choice is the best of the candidates, or of changed copies of it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from copy import deepcopy
 
 import torch
 
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.task import Task, rank
+from stlc.controller.policies.policy import VARIATIONS, BestOfKPolicy, PlanNetwork, variations
+from stlc.controller.problem.task import Task, rank, satisfied
 
 
-def _policy(task: Task, plans: int) -> BestOfKPolicy:
+def _policy(task: Task, plans: int, *, varied: bool = False) -> BestOfKPolicy:
     torch.manual_seed(0)
-    network = PlanNetwork(task, hidden=(16, 16), plans=plans)
+    network = PlanNetwork(task, hidden=(16, 16), plans=plans, varied=varied)
     network.normalise(task.sample(500, seed=1))
     return BestOfKPolicy(task, network)
 
@@ -57,3 +57,41 @@ def test_a_copied_network_has_weights_of_its_own(car_task: Task) -> None:
     assert not torch.equal(network(x0), copied(x0))
     assert torch.equal(network(x0), _policy(car_task, 2).network(x0))
     assert torch.equal(copied.centre, network.centre)
+
+
+def test_a_variation_changes_one_control_by_a_small_amount(car_task: Task) -> None:
+    changes = variations(car_task)
+    half = 0.5 * (car_task.system.control_high - car_task.system.control_low).double()
+    assert changes.shape == (8 * len(half), car_task.horizon, len(half))
+    assert ((changes != 0).any(1).sum(1) == 1).all()
+    assert (changes.abs() <= max(VARIATIONS) * half + 1e-12).all()
+    assert changes.sum(0).abs().max() < 1e-12  # each with its negative
+
+
+def test_the_best_variation_is_selected_where_every_plan_fails(car_task: Task) -> None:
+    plain, varied = _policy(car_task, 3), _policy(car_task, 3, varied=True)
+    x0 = car_task.sample(4000, seed=6, dtype=torch.float64)
+    before, judged_before = plain.plan_judged(x0)
+    after, judged = varied.plan_judged(x0)
+    good = satisfied(judged_before.rho)
+    assert torch.equal(after[good], before[good])
+    assert (satisfied(judged.rho) & ~good).any()
+    again = car_task.judge(x0, after)
+    assert torch.equal(judged.rho, again.rho)
+    assert torch.equal(judged.plans, after)
+    assert all(torch.equal(column, again.columns[name]) for name, column in judged.columns.items())
+    low, high = car_task.system.control_low.double(), car_task.system.control_high.double()
+    some = (~good).nonzero()[:200, 0]
+    chosen = rank(judged.rho, car_task.cost(judged), judged.safe)[some]
+    for change in varied.network.changes:
+        other = car_task.judge(x0[some], (before[some] + change).clamp(low, high))
+        assert (chosen >= rank(other.rho, car_task.cost(other), other.safe) - 1e-12).all()
+    assert torch.equal(varied(x0), after)
+
+
+def test_a_continuation_is_not_varied_and_weights_are_stored_without_changes(car_task: Task) -> None:
+    plain, varied = _policy(car_task, 3), _policy(car_task, 3, varied=True)
+    x0 = car_task.sample(200, seed=7, dtype=torch.float64)
+    assert torch.equal(varied.continuation(x0), plain(x0))
+    assert not torch.equal(varied(x0), plain(x0))
+    assert varied.network.state_dict().keys() == plain.network.state_dict().keys()
