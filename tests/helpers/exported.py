@@ -52,7 +52,7 @@ require slow: always[0, T] abs(v) <= 1.5 m/s
 
 
 def run_of(spec: str, system: str, folder: Path) -> Run:
-    """A run with a small network that has learnt nothing."""
+    """A run with a small network that has learnt nothing, and that tries changed copies of its plans."""
     return untrained(ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml", folder)
 
 
@@ -61,7 +61,7 @@ def untrained(spec: Path, system: Path, folder: Path) -> Run:
     task = Task.of(parse(read_source(spec)), System.load(system))
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = PlanNetwork(task, hidden=(16, 16), plans=3).eval()
+        network = PlanNetwork(task, hidden=(16, 16), plans=3, varied=True).eval()
     network.normalise(task.sample(200, seed=1))
     opened = open_folder(task, TrainConfig(steps=1), Launch(root=folder, name="test"))
     return Run(opened, task, BestOfKPolicy(task, network))
