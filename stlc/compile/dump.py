@@ -95,7 +95,10 @@ def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
 
 
 def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
-    """Return a formula wrapped to lines of `width`; comparisons and sums are not broken."""
+    """Return the lines of a formula, each of at most `width` characters where possible.
+
+    Comparisons and sums are not broken. All lines but the first begin with `hanging`.
+    """
     tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
     lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]

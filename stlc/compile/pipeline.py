@@ -64,7 +64,8 @@ class CompiledRequirement:
         weight: factor of its robustness in the overall minimum.
         scale: divisor of its robustness in the overall minimum.
         formula: formula in negation normal form, with time in steps.
-        lowered: formula before simplification, valid under every semantics.
+        lowered: formula before simplification, which can be evaluated under every semantics (definition of
+            minima and maxima).
         reach: lookahead in steps.
         windowed: whether the requirement mentions the horizon `T`, the length of a plan. If so, the formula
             must hold at each sample with at least T samples after it. But if `absolute` is True as well, the
@@ -99,7 +100,11 @@ class CompiledRequirement:
         return margin_unit(self.typed.formula)
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """Return the formula simplified by the laws of `semantics`."""
+        """Return the formula, simplified by the rules that are valid under `semantics`.
+
+        `semantics` defines minima and maxima, for example as smooth ones. Some simplifications need exact
+        minima and maxima.
+        """
         return self.formula if semantics.exact else simplify(self.lowered, semantics)
 
 

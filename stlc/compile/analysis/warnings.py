@@ -20,7 +20,7 @@ _TOLERANCE = 1e-6
 
 
 def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
-    """Yield W505 for each conjunction in a formula that no values of its signals satisfy."""
+    """Yield the warning W505 for each conjunction in a formula that no values of its signals satisfy."""
     reported: set[Span] = set()
     for node in nodes(formula):
         if isinstance(node, typed.Logic) and node.op == "and" and node.span not in reported:
@@ -118,7 +118,7 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W403 for each predicate with a modulo that may jump within the ranges of its signals.
+    """Yield the warning W403 for each predicate with a modulo that may jump within the ranges of its signals.
 
     A modulo such as `x % 360` jumps from 360 back to 0 where x is a multiple of 360.
 
@@ -154,7 +154,7 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Yield W503 for each implication in a formula whose left side is never true.
+    """Yield the warning W503 for each implication in a formula whose left side is never true.
 
     If there is no such implication, W503 is yielded if the formula as a whole is never false. `facts`
     contains the ranges that signals never leave; other declared ranges are not used, since a signal may leave
@@ -243,7 +243,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
 
 
 def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
-    """Return W502 for a `@safety` requirement that no finite prefix of a trace violates, else None.
+    """Return the warning W502 if no finite prefix of a trace violates a `@safety` requirement, else None.
 
     The message points to `tag`, the tag `@safety` in the source, unless `tag` is None.
     """

@@ -1,1 +1,1 @@
-"""State augmentation: states added to the system so that a plan knows the past of the mission."""
+"""State augmentation: states added to the system that store what happened earlier in the mission."""

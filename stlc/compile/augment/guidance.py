@@ -172,9 +172,9 @@ def _not_lost(left: ir.Num) -> ir.Formula:
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:
-    """Return the robustness of a state formula as a number, without its predicates on the clock and timers.
+    """Return the robustness of a state formula as a number; predicates on the clock and timers are left out.
 
-    The result is None if the formula has only such predicates.
+    If the formula has no other predicates, the result is None.
     """
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():

@@ -79,7 +79,7 @@ def _constant(formula: typed.Formula) -> bool:
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """Report E307 for the first absolute operator (`always@[a, b]`) below `outer`.
+    """Report the error E307 for the first absolute operator (`always@[a, b]`) below `outer`.
 
     The result is the formula `true`, a placeholder.
     """

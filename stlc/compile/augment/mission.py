@@ -1,4 +1,4 @@
-"""Absolute formulas (`always@[a, b] p`), and their progression over a plan.
+"""Absolute formulas such as `always@[a, b] p`, and the formulas that plans must satisfy because of them.
 
 The interval of an absolute formula counts from the start of the mission. The compiler adds a state that holds
 the formula's status: open (undecided), true or false. Once true or false, it stays so.
@@ -115,10 +115,11 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """Return the function from the signal of a formula's status to the value of the status one step later.
+    """Return a function that computes the status of `formula` one step later.
 
-    The status is open (undecided), true or false. An open status is decided by the current sample; a status
-    that is true or false stays so. `clock` is the mission clock (steps since the start of the mission).
+    The argument of the function is the signal of the status. The status is open (undecided), true or false.
+    The current sample may decide an open status. A status that is true or false stays so. `clock` is the
+    mission clock (steps since the start of the mission).
     """
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
@@ -222,7 +223,11 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Return a formula that holds while the mission clock (steps since the start) is within `window`."""
+    """Return a typed formula that holds while the mission clock is within `window`.
+
+    The mission clock counts the steps since the start of the mission. `span` becomes the source location of
+    the formula. `_inside` returns the same formula in the IR.
+    """
     started = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return started

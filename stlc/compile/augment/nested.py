@@ -1,4 +1,4 @@
-"""Absolute operators (`always@[a, b]`) over future formulas, rewritten to be over past formulas.
+"""Absolute operators (`always@[a, b]`) with future operators inside, rewritten with past operators inside.
 
 The interval of an absolute operator counts from the start of the mission. Example: `eventually@[a, b]
 always[0, c] p` is true if and only if, at some sample from a + c to b + c, p has held since c samples ago.
@@ -8,9 +8,9 @@ samples, the truth of the earlier parts is stored until the last part is decided
 sample of delay.
 
 In the example, the window of `always[0, c] p` must begin no later than b. If the formula is still undecided
-at b, it is violated as soon as p fails. The rewritten formula is a `left until@ right`. Its left side becomes
-false at this moment, not only at b + c. The method is that of Maler, Nickovic and Pnueli, "Real time temporal
-logic: past, present, future" (2005).
+at b, it is violated as soon as p fails. The rewritten formula has the form `left until@ right`. Its left side
+becomes false as soon as p fails, not only at b + c. The method is that of Maler, Nickovic and Pnueli, "Real
+time temporal logic: past, present, future" (2005).
 """
 
 from __future__ import annotations
@@ -180,7 +180,10 @@ def _end(node: typed.Temporal | typed.Until) -> int:
 
 @final
 class _Writer:
-    """Rewriter of the future operators below one absolute operator (`eventually@[a, b]`) as past operators.
+    """Rewriter that replaces the future operators in one absolute operator by past operators.
+
+    An absolute operator, such as `eventually@[a, b]`, has an interval that counts from the start of the
+    mission.
 
     Args:
         table: table of added states, which provides the mission clock (steps since the start of the mission).
@@ -196,8 +199,8 @@ class _Writer:
         """Return `eventually@[window] (when and what)`, rewritten with past operators only.
 
         All formulas in `when` must hold at the sample at which `what` holds; they look only into the past.
-        The operands of the result look only into the past, too: they refer to the sample at which `what` is
-        decided. The window of the result is shifted to these samples.
+        If `what` looks n samples ahead, it is decided n samples later. The result is therefore evaluated n
+        samples later: its window is shifted by n, and its operands look back from there.
         """
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))

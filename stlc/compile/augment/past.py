@@ -1,4 +1,4 @@
-"""Past operators as timers (added states), so that a plan carries the history before its first sample.
+"""Past operators rewritten with timers: states that the compiler adds to store what happened before a plan.
 
 A timer counts the samples before the current one: `historically[0, c] p` is `p and held >= c`, where `held`
 is the number of samples for which p has held; `once[0, c] p` is `p or since_p <= c`, where `since_p` is the
@@ -82,7 +82,7 @@ class _Test:
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides of the test at any sample of a plan, computed from the timer at its first sample."""
+        """Both sides of the test at any sample of a plan, computed from the timer at the first sample."""
         return self._extrapolated(self.left), self._extrapolated(self.right)
 
     def _extrapolated(self, side: ir.Num) -> ir.Num:
@@ -225,11 +225,12 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """Add a timer; return the test that q was true earlier, and p from then on to the previous sample.
+        """Add a timer; return the test that q was true earlier and p has been true since then.
 
         p and q are the operands of `node`, `p since q`. q must have held at a sample at most `most` samples
-        ago; if `most` is None, at any earlier sample. If `positive` is False, the test is negated, and `left`
-        and `right` are the negations of p and q.
+        ago; if `most` is None, at any earlier sample. p must have held at all samples from there to the
+        previous sample; the present sample does not count. If `positive` is False, the test is negated,
+        and `left` and `right` are the negations of p and q.
         """
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
@@ -272,8 +273,9 @@ class Past:
     ) -> typed.Formula:
         """Return a formula that is true if `body` was true `steps` samples ago.
 
-        One state is added per sample of delay. Before the start of the mission, the truth is `before`. `body`
-        belongs to the operator `node`. If more than `REGISTER` states are needed, E309 is appended to `sink`.
+        One state is added per sample of delay. Before the start of the mission, the truth is `before`. `node`
+        is the operator that needs the delay, for messages. If more than `REGISTER` states are needed, E309 is
+        appended to `sink`.
         """
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")

@@ -1,4 +1,4 @@
-"""States that the compiler adds to carry the history before a plan: initial values and updates.
+"""States that the compiler adds to store what happened before a plan: initial values and updates.
 
 `clock`: number of steps since the start of the mission. `status`: whether an absolute formula (`always@[a, b]
 p`, whose interval counts from the start of the mission) is open (undecided), true or false. `latch`: whether
@@ -41,7 +41,7 @@ class Timer:
         initial: value at the start of a mission.
         update: value one step later, as a function of the state at the start of the step.
         low: least value.
-        high: greatest value, at which the count stops; for all formulas, a larger value would mean the same.
+        high: greatest value, at which the count stops; larger values would make no difference to any formula.
         about: meaning in words, for `stlc compile` and generated code.
     """
 

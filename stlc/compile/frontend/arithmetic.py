@@ -82,7 +82,8 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         scope: receives findings.
 
     Returns:
-        The converted numbers, and a template: the number 0 in the common unit. The caller replaces its value.
+        The converted numbers, and a template for the result: the number 0 in the common unit. The caller
+        replaces the 0.
 
     Raises:
         Failed: the units do not agree (E203).
@@ -118,7 +119,7 @@ def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
 
 
 def rebased(number: Number, unit: Unit) -> Number:
-    """Return `number` converted to `unit`, whose zero point may differ: 20 degC becomes 293.15 K."""
+    """Return `number` converted to `unit`, which has the same dimensions: 20 degC becomes 293.15 K."""
     shift = number.unit.offset - unit.offset
     if not shift:
         return replace(number, unit=unit)
@@ -144,9 +145,10 @@ def absolute(number: Number) -> Number:
 
 
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
-    """Return `number` converted to `unit`, a unit of the same dimensions.
+    """Return `number` converted to `unit`, which has the same dimensions, with a check.
 
-    `place` is the source location for the error.
+    A temperature difference cannot be converted to a temperature in degC. `place` is the source location for
+    the error.
 
     Raises:
         Failed: `number` is a temperature difference, and `unit` has an offset, such as degC (E203).
@@ -167,7 +169,7 @@ def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diag
 
 
 def too_large(span: Span | None) -> Diagnostic:
-    """Return E005 for a number that exceeds the range of double precision."""
+    """Return the error E005 for a number that exceeds the range of double precision."""
     return Diagnostic(
         "E005",
         "this number is beyond double precision",
@@ -208,8 +210,8 @@ def _units(
 ) -> tuple[tuple[Number, ...], Number]:
     """Convert the arguments of a function as its unit rule (`Function.rule`) requires.
 
-    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
-    caller replaces its value.
+    Return the converted arguments, and a template for the result: the number 0 in the unit of the function's
+    result. The caller replaces the 0.
     """
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
@@ -247,8 +249,8 @@ Agreed = tuple[tuple[Number, ...], Number]
 def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
     """Convert all arguments of a function to one unit (unit rule `same`).
 
-    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
-    caller replaces its value.
+    Return the converted arguments, and a template for the result: the number 0 in the unit of the function's
+    result. The caller replaces the 0.
     """
     name, verb = function.name, _verb(function)
     if name in ("normal", "truncnorm"):
@@ -279,8 +281,9 @@ def _sense(args: Sequence[Number]) -> Sense:
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
     """True if the result of a function is a temperature difference.
 
-    This is so if a difference is multiplied or divided by a plain number. It is also so for a root or power
-    whose result is in kelvin, such as `sqrt(x)` with x in K^2. `unit` is the unit of the result.
+    There are two cases. First, a temperature difference multiplied or divided by a plain number. Second, a
+    root or power whose result is in kelvin, such as `sqrt(x)` with x in K^2. `unit` is the unit of the
+    result.
     """
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
@@ -293,7 +296,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """True for a temperature in degC multiplied or divided by a plain number, as in a mean."""
+    """True if a temperature in degC is multiplied or divided by a plain number, as in `0.5 * temp`."""
     points = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in points]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
@@ -304,12 +307,12 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
     """Convert numbers, some of them temperatures in degC, to a common unit.
 
-    The common unit is kelvin if one of the numbers is a temperature difference. Otherwise it is the unit of
-    the numbers that are not constant; if these have different units, or if all numbers are constant, it is
-    degC.
+    If one of the numbers is a temperature difference, the common unit is kelvin. Otherwise, if there are
+    varying numbers and all of them have the same unit, that is the common unit. In all other cases, it is
+    degC. `what` names the operator or function for the message.
 
-    Return the converted numbers, and a template: the number 0 in the common unit. The caller replaces its
-    value.
+    Return the converted numbers, and a template for the result: the number 0 in the common unit. The caller
+    replaces the 0.
     """
     points = [arg for arg in args if arg.unit.offset]
     measured = [arg for arg in args if not arg.bare]
@@ -333,10 +336,10 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
 
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
-    """Convert the operands of a sum or difference in which a temperature in degC takes part.
+    """Convert the operands of a sum or difference, one or both of which are temperatures in degC.
 
-    Return the converted operands, and a template: the number 0 in the unit of the result. The caller replaces
-    its value.
+    Return the converted operands, and a template for the result: the number 0 in the unit of the result. The
+    caller replaces the 0.
     """
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
@@ -361,11 +364,11 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
     """Convert the operands of `left - right`, where `right` is a temperature in degC.
 
-    The result of the subtraction is a temperature difference. There is one exception: if it is open whether
-    `right` is a temperature or a difference (`Number.sense` is `open`), the result may be a temperature too.
+    The result of the subtraction is a temperature difference. There is one exception: if `right` may be
+    either a temperature or a difference (`Number.sense` is `open`), the result may be either, too.
 
-    Return the converted operands, and a template: the number 0 in the unit of the result. The caller replaces
-    its value.
+    Return the converted operands, and a template for the result: the number 0 in the unit of the result. The
+    caller replaces the 0.
     """
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
@@ -379,10 +382,10 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
     """Convert the arguments of `normal` and `truncnorm` to one unit.
 
-    Mean and bounds may be temperatures; the standard deviation is a difference.
+    Mean and bounds may be temperatures in degC; the standard deviation is a temperature difference.
 
-    Return the converted arguments, and a template: the number 0 in the unit of the function's result. The
-    caller replaces its value.
+    Return the converted arguments, and a template for the result: the number 0 in the unit of the function's
+    result. The caller replaces the 0.
     """
     middle, deviation, *ends = args
     places = [middle, *ends]
@@ -403,9 +406,10 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
 
 
 def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
-    """Return `arg`, the argument of a magnitude such as `abs`; it must not be a temperature in degC.
+    """Return `arg`, the argument of a function such as `abs`, which takes no temperatures in degC.
 
-    A number that may be a temperature or a difference (`Number.sense` is `open`) counts as a difference.
+    If `arg` is in degC, but may be a temperature difference (`Number.sense` is `open`), it is returned as a
+    difference in kelvin. A number in any other unit is returned unchanged.
 
     Raises:
         Failed: the argument is a temperature in degC (E203).
@@ -428,7 +432,7 @@ def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
 
 
 def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
-    """Return E203 for a temperature in degC where an amount is needed.
+    """Return the error E203 for a temperature in degC where an amount is needed.
 
     An amount is needed in `abs(x)`, for example. `what` names the operator or function for the message.
     """
@@ -445,7 +449,7 @@ def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
 
 
 def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 for a difference compared with a temperature: `abs(temp - 21 degC) <= 0.5 degC`.
+    """Return the error E203 for a difference compared with a temperature: `abs(temp - 21 degC) <= 0.5 degC`.
 
     `what` names the operator or function for the message.
     """
@@ -483,7 +487,7 @@ def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
 
 
 def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
-    """Return E203 for the number `bare`, which has no unit: it could be in `unit` (degC) or in kelvin."""
+    """Return the error E203 for `bare`, a number without a unit: it may be in `unit` (degC) or in kelvin."""
     text, kelvin = (bare.span or span).text, unit.interval
     help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
     message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
@@ -549,7 +553,10 @@ def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope
 
 
 def _op(name: str, args: Sequence[Number]) -> ir.Num:
-    """Return the IR node of a function applied to numbers; neutral operands, as in `x + 0`, are dropped."""
+    """Return the IR node of the function `name` applied to `args`, simplified if possible.
+
+    For example, `x + 0` becomes `x`, and `x ^ 2` becomes `square(x)`.
+    """
     nums = tuple(arg.num for arg in args)
     match name, nums:
         case ("add", (num, ir.Const(0.0))) | ("add", (ir.Const(0.0), num)) | ("sub", (num, ir.Const(0.0))):
@@ -593,10 +600,10 @@ def _fold(function: Function, args: Sequence[Number], template: Number, scope: S
 
 
 def _whole(function: Function, args: Sequence[Number], template: Number) -> bool:
-    """True if the result of a function is an integer for all values of these arguments.
+    """True if the result of a function is an integer, whatever values its arguments take.
 
-    `template` has the unit of the result. `floor` and other roundings act on SI values, which need not be
-    integers in this unit.
+    `template` has the unit of the result. `floor` and other roundings give an integer in SI units. In another
+    unit, this result need not be an integer: 1500 m is 1.5 km.
     """
     if function.integral:
         return template.unit.ratio == 1
@@ -612,7 +619,11 @@ def _verb(function: Function) -> str:
 
 
 def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
-    """Return E203 for two units that do not agree, with the locations of both sides and a suggestion."""
+    """Return the error E203 for two numbers whose units do not agree.
+
+    The error shows the locations of both numbers and suggests a correction. `what` is a verb for the message,
+    such as "add", or the name of a function.
+    """
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(
@@ -716,7 +727,7 @@ def norm(vector: VectorValue, span: Span, scope: Scope) -> Number:
 
 
 def total(items: Sequence[Number], span: Span, scope: Scope) -> Number:
-    """Return the sum of at least one number."""
+    """Return the sum of `items`, which contains at least one number."""
     return reduce(lambda a, b: apply("add", (a, b), span, scope), items)
 
 

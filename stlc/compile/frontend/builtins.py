@@ -1,4 +1,4 @@
-"""Function calls: built-in functions, regions, values of neighbouring samples, functions of the system."""
+"""Function calls: built-in functions, regions, values at other samples, functions of a system."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ _SECOND = SYMBOLS["s"]
 def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of a function that reads other samples, such as `next`, `shift` or `rise`.
 
-    The call has as many arguments as the function takes.
+    The caller has already checked the number of arguments.
 
     Raises:
         Failed: an argument is not a formula (E201) or has a wrong type (E205).
@@ -239,8 +239,8 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
     """Return `number`, one component of a vector, shifted in time by `delay`.
 
-    A number such as `if c then p else q`, with bools p and q, also has a form as a formula
-    (`Number.formula`). This formula is shifted too.
+    A number such as `if c then p else q`, with bools p and q, can also be used as a formula. This formula is
+    stored in `Number.formula`, and is shifted too.
     """
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)

@@ -109,8 +109,9 @@ def _pred(
 def _compared(*sides: Number) -> Unit:
     """Return the unit in which the robustness of a comparison is reported.
 
-    Sides without a unit are ignored if another side has a unit. Of the remaining sides, the first one that is
-    not constant gives the unit; if all are constant, the first one does.
+    `sides` are the numbers that are compared. If some of them have a unit, those without a unit are ignored.
+    Of the remaining numbers, the first one that varies gives the unit. If all of them are constant, the first
+    one does.
     """
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
@@ -184,7 +185,10 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
 
 
 def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
-    """Check that a side with an enum type is compared with the same enum, or with the number of a member.
+    """Check that `a` and `b` can be compared if one or both of them have an enum type.
+
+    If both have an enum type, it must be the same enum. If only one has, the other must be a constant that
+    stands for a member of the enum.
 
     Raises:
         Failed: the enums differ, or no member has this number (E205).
@@ -206,7 +210,7 @@ def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
 
 
 def in_set(item: Operand, members: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """Return `item in {1, 2}`: equality with one of the members."""
+    """Return the formula `item in {m, n}`, which means `item == m or item == n`."""
     equals = tuple(_equality(item, member, span, span, scope) for member in members)
     return equals[0] if len(equals) == 1 else typed.Logic(span, "or", equals)
 

@@ -1,4 +1,4 @@
-"""Declarations of a file: names, columns (name, unit and range) of signals, functions of the system."""
+"""Declarations of a file: names, signals with their units and ranges, functions of a system."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_d
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
-    """Report E101 for every name in the body of a macro that is not declared."""
+    """Report the error E101 for every name in the body of a macro that is not declared."""
     functions = {*callable_names(), *sampler_names()}
     for name, called in _free(entry.body, frozenset(entry.formals)):
         if name.name in scope.entries or (name.name in BUILT_IN and not name.quoted):
@@ -86,7 +86,7 @@ _EXTERN_KINDS: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
 def external(item: ast.Extern, interface: Interface | None, about: str, scope: Scope) -> External:
-    """Return the function that an `extern fn` declares; `about` describes it in messages.
+    """Return the function that an `extern fn` declares; `about` describes the function in messages.
 
     Raises:
         Failed: an invalid type (E101) or vector size (E005), or a function that the system lacks (E107).
@@ -248,7 +248,10 @@ def _members(labels: Labels) -> str:
 
 
 def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Interface) -> Diagnostic:
-    """Return E103 for a signal that the system lacks, with the signal that may be meant."""
+    """Return the error E103 for a signal that the system lacks.
+
+    The error suggests a signal of the system: one with a similar name, or the only one with the same unit.
+    """
     names = interface.signature.names
     near = closest(column.name, names)
     alike = [c.name for c in interface.signature.columns if c.unit.text and c.unit == column.unit]
@@ -381,7 +384,7 @@ def declare(
         spec: syntax tree of the file.
         interface: interface of the system, or None.
         overrides: expression that replaces the value of a constant or parameter, by its name.
-        scope: receives the findings; its names are not used.
+        scope: receives the findings. Names that are already in the scope are not used.
     """
     _check_twice(spec, scope)
     builder = _EntryBuilder(interface, overrides, scope)
@@ -411,7 +414,7 @@ def _keyword(item: ast.Item) -> str:
 
 
 def _check_twice(spec: ast.Spec, scope: Scope) -> None:
-    """Report E102 for a value, type, requirement or import that is declared twice."""
+    """Report the error E102 for a value, type, requirement or import that is declared twice."""
     spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}, "file": {}}
     for written in spec.imports:
         if written.alias is not None:

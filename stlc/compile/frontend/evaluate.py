@@ -113,7 +113,7 @@ def _is_bool(value: Value) -> bool:
 def _choice_of_formulas(
     expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope
 ) -> typed.Formula:
-    """Return the formula `(cond and yes) or (not cond and no)`."""
+    """Return the formula `(cond and yes) or (not cond and no)`; `branches` are `yes` and `no`."""
     yes = as_formula(branches[0], expr.yes, Expectation("`then`"), scope)
     no = as_formula(branches[1], expr.no, Expectation("`else`"), scope)
     first = typed.Logic(expr.yes.span, "and", (cond, yes))
@@ -178,7 +178,7 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
 
 @lru_cache(maxsize=256)
 def _measured(value: Fraction, unit_text: str) -> Number | None:
-    """Return a number with a unit, or None if it exceeds the range of double precision.
+    """Return `value` with the unit `unit_text`; None if the number exceeds the range of double precision.
 
     Raises:
         ValueError: the unit is unknown.
@@ -609,8 +609,8 @@ def _timed(
 def _expansion(op: str) -> ast.Expr:
     """Return the formula by which the temporal operator `op` is defined, in terms of `p` and `q`.
 
-    The formula has no intervals. If the operator has no definition, the formula is the operator itself:
-    `p until q`.
+    The formula has no intervals. A basic operator such as `until` has no definition in terms of others; for
+    it, the formula is `p until q`.
     """
     plain = f"p {op} q" if op in BINARY_TEMPORAL else f"{op} p"
     return parse_expr(Source(f"expansion of {op}", OPERATORS[op].expansion or plain))

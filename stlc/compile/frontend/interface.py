@@ -1,4 +1,7 @@
-"""Interface of a system: the data that the compiler needs without loading it."""
+"""Interface of a system: the data about a system that the compiler needs.
+
+The compiler works with this interface alone. It does not need to load the system.
+"""
 
 from __future__ import annotations
 

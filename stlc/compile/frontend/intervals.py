@@ -57,7 +57,7 @@ def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) ->
 
 
 def out_of_place(span: Span) -> Diagnostic:
-    """Return E311 for `T`, `dt` or a number of steps outside of an interval or delay."""
+    """Return the error E311 for `T`, `dt` or a number of steps outside of an interval or delay."""
     message = f"`{span.text}` is only known inside the interval of a temporal operator"
     return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
 
@@ -184,7 +184,10 @@ def interval(
 
 
 def _sign(value: TimeExpr) -> int:
-    """Return -1 if a time is negative for every time step and horizon, 0 if it is zero, else 1."""
+    """Return -1 if a time is negative for every time step and horizon, 0 if it is zero, else 1.
+
+    A time such as `T - 1 s`, whose sign depends on the horizon, gives 1.
+    """
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0
@@ -219,6 +222,9 @@ def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], bo
 
 
 def _shown(value: TimeExpr, expr: ast.Expr) -> str:
-    """Return the source text of an interval bound, without its sign."""
+    """Return the source text of `expr`, an interval bound with the value `value`.
+
+    If `value` is negative, the minus sign is removed from the text.
+    """
     text = expr.span.text.strip()
     return text.removeprefix("-").strip() if _sign(value) < 0 else text

@@ -96,7 +96,7 @@ def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
 
 
 def cycle(entry: Definition, scope: Scope) -> Diagnostic:
-    """Return E105 for a definition that refers to itself, directly or through others."""
+    """Return the error E105 for a definition that refers to itself, directly or through others."""
     start = scope.open.index(entry.name)
     chain = " -> ".join((*scope.open[start:], entry.name))
     note = (f"{chain}",) if len(scope.open) - start > 1 else ()
@@ -104,7 +104,7 @@ def cycle(entry: Definition, scope: Scope) -> Diagnostic:
 
 
 def too_big(meter: Meter, span: Span) -> Diagnostic:
-    """Return E005 for an expression that is too large or too deeply nested when expanded."""
+    """Return the error E005 for an expression that is too large or too deeply nested when expanded."""
     if meter.nodes > MAX_NODES:
         message = f"this expands to more than {MAX_NODES:,} operations"
         help_ = ("definitions are written out where they are used, and quantifiers are unrolled",)

@@ -63,7 +63,10 @@ def library_of(spec: ast.Spec) -> dict[str, str]:
 
 
 def spec_sha256(text: str, library: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a specification and its imports, in hexadecimal digits."""
+    """Return the SHA-256 of a specification and its imports, in hexadecimal digits.
+
+    `text` is the text of the specification; `library` contains the text of each imported file by its key.
+    """
     return sha256(text + dumps(dict(sorted(library.items())))) if library else sha256(text)
 
 

@@ -1,4 +1,4 @@
-"""Parameters (`param`), which are drawn once per trajectory, and `--set NAME=VALUE`."""
+"""Parameters (`param`), drawn once per trajectory, and values from the command line (`--set NAME=VALUE`)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def read_overrides(
 ) -> dict[str, ast.Expr]:
     """Return the expressions that `--set` gives to constants and parameters of a specification, by name.
 
-    Overrides of the system are skipped: names of its constants, states and parameters, and names with a dot.
+    Values for the system are skipped: those of its constants, states and parameters, and those whose name
+    contains a dot.
 
     Raises:
         UsageError: a name is unknown, or a value is not an expression (U101).
@@ -155,7 +156,9 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
 
 
 def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
-    """Return a randomly drawn number in the unit in which its column is stored.
+    """Return the distribution `number`, converted to the unit in which `column` is stored.
+
+    If the distribution is written without a unit, it is taken to be in `unit`, the declared unit.
 
     Raises:
         Failed: the number depends on a signal (E205), or has another unit than the column (E203).

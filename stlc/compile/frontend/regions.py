@@ -101,9 +101,10 @@ def triangles(corners: Sequence[VectorValue]) -> list[tuple[VectorValue, ...]]:
 
 
 def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
-    """True if corner `k` of a polygon can be cut off.
+    """True if a corner of a polygon can be cut off: the corner with the number `left[k]`.
 
-    The polygon must be convex at this corner, and the triangle cut off must contain no other corner.
+    The polygon must be convex at this corner, and the triangle cut off must contain no other corner. `plain`
+    are all corners of the original polygon. `left` are the numbers of the corners not yet cut off.
     """
     a, b, c = (plain[left[i % len(left)]] for i in (k - 1, k, k + 1))
     if turn(a, b, c) <= 0:

@@ -231,7 +231,8 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
     """Give each override without a unit the unit of the constant that it replaces.
 
-    The units are entered in `found`, which is changed in place.
+    For example, if the file has `const v = 3 m/s`, the override `v=4` means 4 m/s. The constants in `found`
+    are changed in place.
     """
     for item in spec.items:
         entry = found.entries.get(item.name)
@@ -277,7 +278,7 @@ def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
 
 
 def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope) -> None:
-    """Report E104 if a constant differs from the system's constant of the same name."""
+    """Report the error E104 if a constant differs from the system's constant of the same name."""
     if item.name not in interface.constants or value.constant is None:
         return
     theirs, unit = interface.constants[item.name]
@@ -362,7 +363,7 @@ def _requirements(
 
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
-    """Return the divisor of the robustness that `@scale` sets.
+    """Return the number by which the robustness of a requirement is divided, as given by the tag `@scale`.
 
     Raises:
         Failed: the divisor depends on a signal whose range is unknown (E205).

@@ -64,11 +64,11 @@ class Meter:
         self.deepest = max(self.deepest, self.level)
 
     def leave(self) -> None:
-        """Return to the parent of the current syntax node: one level up. The counted nodes are kept."""
+        """Return to the parent of the current syntax node, one level up; the number of nodes stays."""
         self.level -= 1
 
     def charge(self, cost: Cost) -> None:
-        """Count an expression again that was evaluated before; `cost` is its size and depth."""
+        """Count an expression once more, without evaluating it again; `cost` is its size and depth."""
         self.nodes += cost.nodes
         self.deepest = max(self.deepest, self.level + cost.levels)
 

@@ -57,7 +57,9 @@ T = TypeVar("T")
 
 
 def swept_distance(point: VectorValue, region: Region, span: Span, scope: Scope) -> Number:
-    """Return the least signed distance to a region along the segment from `point` to its next sample.
+    """Return the least signed distance to `region` along the path of `point` to the next sample.
+
+    The path is the straight segment between the positions of the point at the two samples.
 
     Raises:
         Failed: the point has another number of components (E205) or another unit (E203) than the region.
@@ -217,9 +219,10 @@ class _Sweep:
     # ------------------------------------------------------------------------ polygons
 
     def _edges(self, corners: Sequence[VectorValue]) -> list[Pair]:
-        """Return, for each edge of a polygon, the signed distances of the start and the end of the segment.
+        """Return, for each edge of a polygon, the signed distances of the segment's two ends to the edge.
 
-        A distance is positive to the left of the edge, which runs from one of the `corners` to the next.
+        A pair contains the distance of the start of the segment, then that of its end. An edge runs from one
+        of the `corners` to the next; distances are positive to the left of the edge.
         """
         found = []
         for start, stop in edges(corners):
@@ -255,7 +258,7 @@ class _Sweep:
     # ---------------------------------------------------------------------- arithmetic
 
     def at_ends(self, region: Region) -> Pair:
-        """Return the signed distances to a region of both ends of the segment."""
+        """Return the signed distances of the start and the end of the segment to a region."""
         now, then = self.ends
         return (
             signed_distance(now, region, self.span, self.scope),

@@ -128,7 +128,7 @@ def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
 
 
 def refuse_tags(tags: Sequence[ast.Tag], what: str, scope: Scope) -> None:
-    """Report E501 for tags on a declaration that takes none; `what` describes the declaration."""
+    """Report the error E501 for tags on a declaration that takes none; `what` describes the declaration."""
     for tag in tags:
         message = f"`@{tag.name}` says nothing about {what}"
         scope.report(Diagnostic("E501", message, tag.span, help=("tags stand before `require`",)))

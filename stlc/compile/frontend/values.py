@@ -141,7 +141,7 @@ class NormBall:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Region between two corners, component by component."""
+    """Box: region of the points whose components all lie between those of `lower` and `upper`."""
 
     lower: VectorValue
     upper: VectorValue
@@ -197,9 +197,9 @@ Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region
 
 
 def is_formula(value: Value) -> bool:
-    """True if a value is a formula whose robustness is more than a comparison of a bool with 1/2.
+    """True for a formula, and for `if c then p else q` with bools p and q; False for a bool signal.
 
-    A bool signal b is also a formula: b >= 1/2. For it, the result is False.
+    A bool signal b can be used as a formula too, but it only stands for `b >= 1/2`.
     """
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 

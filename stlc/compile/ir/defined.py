@@ -1,4 +1,7 @@
-"""Definedness of a formula on a finite trace, sample by sample (needs NumPy, unlike `support`)."""
+"""Samples of a finite trace at which a formula is defined.
+
+A formula is undefined at a sample if it needs values from outside the trace there.
+"""
 
 from __future__ import annotations
 

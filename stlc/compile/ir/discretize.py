@@ -223,7 +223,7 @@ def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
 
 
 def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
-    """Return E205 for a delay that is not a whole number of steps or exceeds `MAX_DELAY`, else None."""
+    """Return the error E205 if a delay is not a whole number of steps or exceeds `MAX_DELAY`, else None."""
     if steps.denominator != 1 and grid.dt is not None:
         low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
         message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"
@@ -237,6 +237,6 @@ def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | 
 
 
 def no_delay(message: str, span: Span | None) -> Diagnostic:
-    """Return E205, with `message`, for a `shift` by an invalid number of samples."""
+    """Return the error E205, with `message`, for a `shift` by an invalid number of samples."""
     help_ = ("shift(x, 2) is x two samples later, shift(x, -0.1 s) what it was a tenth of a second before",)
     return Diagnostic("E205", message, span, help=help_)

@@ -1,6 +1,6 @@
 """Intermediate representation (IR): numbers, and formulas in negation normal form with time in steps.
 
-The evaluators, the dynamics and all back ends read it. Nodes are immutable and compare by structure, so
+The evaluators, the dynamics and all back ends read the IR. Nodes are immutable and compare by structure, so
 common sub-expressions are found by equality.
 """
 
@@ -62,9 +62,9 @@ class Op:
 class Indicator:
     """Number that is 1 where a state formula holds, else 0.
 
-    In training, it is smoothed to `(1 + tanh(w rho)) / 2` (Meng and Fan 2023, Eq. 6). Here rho is the margin
-    of the formula, and w is `sharpness`. If `sharpness` is None, w is the default of the switch that
-    evaluates the number (`stlc.compile.semantics.switch`).
+    In training, the number is smoothed to `(1 + tanh(w rho)) / 2` (Meng and Fan 2023, Eq. 6). Here rho is the
+    margin of the formula, and w is `sharpness`. If `sharpness` is None, w has the default value of the
+    evaluator (`stlc.compile.semantics.switch`).
     """
 
     cond: Formula
@@ -212,9 +212,9 @@ class Truth:
 class Predicate:
     """Predicate with robustness `sign * num`; true iff the robustness is > 0 (`strict`) or >= 0.
 
-    Negation flips `sign` and `strict`, so `num` keeps the order of its operands. A `guard` is a predicate on
-    clocks and timers, states that the compiler adds to count time. Its robustness is +inf or -inf, so it
-    decides whether an enclosing formula holds, but not by how much.
+    Negation flips `sign` and `strict`, and leaves `num` as it is. A `guard` is a predicate on clocks and
+    timers, states that the compiler adds to count time. The robustness of a guard is +inf or -inf, so the
+    guard decides whether an enclosing formula holds, but not by how much.
     """
 
     num: Num
@@ -358,7 +358,8 @@ class Freeze:
 class AtStart:
     """Value of `body` at the first sample.
 
-    It expresses operators such as `always@[a, b]`, whose interval counts from the start of the mission.
+    The node is used for operators such as `always@[a, b]`, whose interval counts from the start of the
+    mission.
     """
 
     body: Formula

@@ -1,9 +1,11 @@
-"""The support of a formula: the samples that it reads (lookback, lookahead), and its signals.
+"""Samples and signals that a formula reads: its lookback, its lookahead, and the names of its signals.
 
-`fold` computes the value of an `Analysis` from the leaves upwards: the value of a node follows from those of
-its operands and from the offsets at which the node reads them (`ir.Operator.offsets`). Windows of the past
-are cut at the start of the trace, so they never require missing samples; a window "to the end" requires only
-its start.
+An `Analysis` assigns a value to every node of a formula. `fold` computes the values from the leaves upwards.
+The value of a node follows from the values of its operands, and from the offsets at which the node reads its
+operands (`ir.Operator.offsets`).
+
+Windows of the past are cut at the start of the trace. So they never require samples that do not exist. A
+window "to the end" requires only its first sample.
 """
 
 from __future__ import annotations
@@ -20,36 +22,49 @@ V = TypeVar("V")
 
 
 class Analysis(ABC, Generic[V]):
-    """Bottom-up analysis of a formula, with values of any type: one method per kind of node.
+    """Analysis of a formula that assigns a value, of any type, to every node of the formula.
 
-    Each method computes the value of a node from the values of its operands; `fold` applies the methods.
+    There is one method per kind of node. The method computes the value of a node from the values of the
+    operands. `fold` applies the methods from the leaves upwards.
     """
 
     @abstractmethod
     def predicate(self, num: ir.Num) -> V:
-        """Value of a predicate on the number `num`, or of the number `num` bound by `freeze`."""
+        """Return the value of a predicate on the number `num`.
+
+        The method is also called for a number that a `freeze` binds to a name.
+        """
 
     @abstractmethod
     def constant(self) -> V:
-        """Value of the formulas `true` and `false`."""
+        """Return the value of the formulas `true` and `false`."""
 
     @abstractmethod
     def over(self, parts: Sequence[V], offsets: Sequence[ir.Offsets]) -> V:
-        """Value of an operator whose operands have the values `parts`.
+        """Return the value of an operator whose operands have the values `parts`.
 
         Operand i is read at `offsets[i]`; the last offsets are the window of the operator.
         """
 
     @abstractmethod
     def at_start(self, body: V) -> V:
-        """Value of an `ir.AtStart` node; `body` is the value of its operand at the first sample."""
+        """Return the value of an `ir.AtStart` node, whose operand is evaluated at the first sample.
+
+        `body` is the value of the operand.
+        """
 
     def shift(self, body: V, node: ir.Shift) -> V:
-        """Value of the `ir.Shift` node `node`; `body` is the value of its operand, read at another sample."""
+        """Return the value of `node`, which reads its operand at another sample.
+
+        `body` is the value of the operand.
+        """
         return self.over((body,), node.offsets)
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
-        """Value of a `freeze`, from the values of its bound numbers and of its body."""
+        """Return the value of a `freeze`.
+
+        `bound` are the values of the numbers that it binds to names; `body` is the value of its body.
+        """
         parts = (body, *bound)
         return self.over(parts, (ir.NOW,) * len(parts))
 
@@ -140,10 +155,12 @@ class _Required(Analysis[_Needs]):
         return 0, 0, 0
 
     def over(self, parts: Sequence[_Needs], offsets: Sequence[ir.Offsets]) -> _Needs:
-        """Return the lookback, lookahead, and lookahead from the first sample that an operator requires.
+        """Return the samples that an operator requires: (lookback, lookahead, lookahead from the start).
 
-        The values of the operands are in `parts`. They are moved by the offsets at which the operator reads
-        its operands. A window without end requires only the sample nearest to now.
+        The third number is the lookahead of operators such as `always@[a, b]` inside, counted from the first
+        sample of the trace. `parts` contains the same three numbers for each operand. Lookback and lookahead
+        are shifted by the offsets at which the operator reads the operand. A window without end requires only
+        the sample nearest to now.
         """
         past = future = clocked = 0
         for (back, ahead, later), (first, last) in zip(parts, offsets, strict=True):

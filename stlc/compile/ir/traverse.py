@@ -180,7 +180,10 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """Return the key under which a compiled program takes a signal or a frozen value as input."""
+    """Return the name of the input of a compiled program that provides a signal or a frozen value.
+
+    A shifted signal is an input of its own; the name of this input contains the number of steps.
+    """
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name
@@ -256,7 +259,7 @@ def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until
 
 
 def absolute(formula: typed.Formula) -> bool:
-    """True if a formula has an operator such as `always@[a, b]`, timed from the start of the mission."""
+    """True if a formula has an operator whose interval counts from the mission's start (`always@[a, b]`)."""
     return any(map(on_clock, nodes(formula)))
 
 

@@ -51,10 +51,11 @@ class DelayedSignal(ir.ShiftedSignal):
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Interval of a temporal operator; `hi` None: to the end of the trace (`end`, `inf` or omitted).
+    """Interval of a temporal operator.
 
-    `clock` is "now" if the bounds are relative to the present sample, or "start" for an operator such as
-    `always@[a, b]`, whose interval counts from the start of the mission.
+    If `hi` is None, the interval extends to the end of the trace (written `end`, `inf`, or no interval at
+    all). `clock` is "now" if the bounds are relative to the present sample. It is "start" for an operator
+    such as `always@[a, b]`, whose interval counts from the start of the mission.
     """
 
     lo: Time
@@ -177,7 +178,7 @@ class Freeze(Node):
 class Recalled(Node):
     """Past operator rewritten with timers (added states that hold the time since an event).
 
-    The node stands under no negation.
+    The node never occurs inside a negation.
 
     Attributes:
         now: state formula that is equivalent to the operator at one instant. In it, tests of timers stand for
